@@ -2,7 +2,7 @@
 
 ``lw.height_field(name)`` makes a table of the heights at the points of a regular grid. The first row holds the points'
 x coordinates, and the first column their y coordinates. Heights between the points are interpolated on MuJoCo's
-triangles: each cell's diagonal runs from the corner with the smallest x and y to the corner with the largest.
+triangles. Each cell's diagonal runs from the corner with the smallest x and y to the corner with the largest.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
 """Check array indices while ``check_task`` runs instrumented copies of a task's functions.
 
-``report`` is (places, 3). Each of its rows belongs to one place in the source at which an array is indexed, and holds
-the number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining
-would increase compile times.
+``report`` is (places, 3). Each row belongs to one place in the source at which an array is indexed. It holds the number
+of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
+increase compile times.
 """
 
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import warp as wp
 
 MOST_ROUNDS = wp.constant(1_000_000)
-"""The number of iterations after which a ``while`` loop is reported as endless."""
+"""A ``while`` loop with more iterations is reported as endless."""
 
 
 @wp.func(inline=False)

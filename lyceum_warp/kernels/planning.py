@@ -11,15 +11,13 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""The random streams of the noise use this number instead of an episode's index, so they differ from the worlds'
-streams."""
+"""Replaces an episode's index in the random streams of the noise, which then differ from the worlds' streams."""
 DRAWS = wp.constant(-3)
-"""The stream keys of the samples use this number instead of an episode's index."""
+"""Replaces an episode's index in the stream keys of the samples."""
 
 _TILES = f"{__name__}.tiles"
 """The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,
-which holds the address of the tiles. Other kernels belong to a separate module, because ``graphs.capture`` serialises
-only kernels that use tiles."""
+which holds the address of the tiles. Therefore ``graphs.capture`` serialises these kernels."""
 
 
 @wp.func

@@ -1,8 +1,7 @@
 """Compute with unit quaternions in MuJoCo's order w, x, y, z, in Warp functions for tasks.
 
-The functions do not normalise their arguments, because MuJoCo's fields hold unit quaternions. Docstrings name the
-equivalent MuJoCo function. Warp's own quaternion functions have the order x, y, z, w and do not accept quaternions in
-MuJoCo's order.
+The functions do not normalise their arguments, because MuJoCo's fields hold unit quaternions. Warp's own quaternion
+functions do not accept quaternions in MuJoCo's order.
 """
 
 import warp as wp

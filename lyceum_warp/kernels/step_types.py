@@ -66,18 +66,17 @@ class TaskCode:
     """A task's structs and functions, and the functions that are generated from them.
 
     Without ``control``, actions are scaled and shifted to controls. Without ``evaluate``, the evaluation is the reward.
-    Without ``advance``, the memory does not change.
     """
 
-    module: str  # name of the task's Warp module
-    functions: Mapping[str, wp.Function]  # functions by name, including defaults
+    module: str
+    functions: Mapping[str, wp.Function]  # by name, including defaults
     written: Collection[str]  # names of the functions that the task defines
     World: Any
     Params: Any
-    Batch: Any  # struct of the task's fields in all worlds
-    Observations: Any  # struct of the observation groups
-    Shared: Any  # struct of the memory that worlds share, or None
-    Sums: Any  # struct of the sums over worlds, or None
+    Batch: Any  # the task's fields in all worlds
+    Observations: Any  # the observation groups
+    Shared: Any  # the memory that worlds share, or None
+    Sums: Any  # the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
     views: Mapping[Any, wp.Function]  # ``Kernels.views``
     copy_state: wp.Function  # copies the fields that steps change
@@ -86,9 +85,7 @@ class TaskCode:
     copy_observations: wp.Function
     finite_memory: wp.Function
     valid_model: wp.Function  # whether the model fields that the task writes are valid
-    terms: Mapping[
-        str, wp.Function
-    ]  # ``reward``, ``score`` and ``terminated`` of a task with terms; see ``binding.task_terms``
+    terms: Mapping[str, wp.Function]  # of a task with terms; see ``binding.task_terms``
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed

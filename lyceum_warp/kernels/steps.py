@@ -17,9 +17,9 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""The index of the substream from which ``event`` draws, within a step's random stream."""
+"""The substream from which ``event`` draws, within a step's random stream."""
 STARTUP = wp.constant(-1)
-"""The random stream of ``startup`` uses this number instead of an episode's index."""
+"""Replaces an episode's index in the random stream of ``startup``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ActKernels:
 
 
 def act_kernels(task: TaskCode) -> ActKernels:
-    """Make the kernels of ``ActKernels``, which call a task's functions."""
+    """Make the kernels of ``ActKernels``."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view, copy_state, valid_model = task.view, task.copy_state, task.valid_model
     control, advance, substep = (task.functions[name] for name in ("control", "advance", "substep"))
@@ -158,7 +158,7 @@ class BeginKernels:
 
 
 def begin_kernels(task: TaskCode) -> BeginKernels:
-    """Make the kernels of ``BeginKernels``, which call a task's functions."""
+    """Make the kernels of ``BeginKernels``."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
     initialize, randomize, startup, reject, event = (
@@ -248,7 +248,7 @@ class SharedKernels:
 
 
 def shared_kernels(task: TaskCode) -> SharedKernels:
-    """Make the kernels of ``SharedKernels``, which call a task's functions."""
+    """Make the kernels of ``SharedKernels``."""
     Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
     tally, share = task.functions["tally"], task.functions["share"]
     view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)

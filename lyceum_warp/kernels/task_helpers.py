@@ -77,7 +77,7 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
     return put(row, at, value, 0, value.shape[0])
 
 
-# define this overload last, because Warp uses the first one that fits
+# the last overload, because Warp uses the first one that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):

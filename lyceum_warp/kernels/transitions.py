@@ -17,8 +17,7 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
 OBSERVE = wp.constant(-1)
-"""The index of the substream for observation noise, within a step's random stream; ``advance`` draws from the stream
-itself."""
+"""The substream for observation noise, within a step's random stream. ``advance`` draws from the stream itself."""
 
 # indices of the parts of ``judge``; each observation group is one more part, from OBSERVE_FIRST
 ENDS = wp.constant(0)
@@ -40,7 +39,7 @@ class JudgeKernels:
 
 
 def judge_kernels(task: TaskCode) -> JudgeKernels:
-    """Make the kernels of ``JudgeKernels``, which call a task's functions."""
+    """Make the kernels of ``JudgeKernels``."""
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
     finite_group, copy_observations = task.finite_group, task.copy_observations
@@ -280,14 +279,14 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
 
 @dataclasses.dataclass(frozen=True)
 class RolloutKernels:
-    """Kernels for open-loop rollouts. A rollout stores the fields of all steps."""
+    """Kernels for open-loop rollouts, which store the fields of all steps."""
 
     judge_rows: wp.Kernel
     advance_rows: wp.Kernel | None
 
 
 def rollout_kernels(task: TaskCode) -> RolloutKernels:
-    """Make the kernels of ``RolloutKernels``, which call a task's functions.
+    """Make the kernels of ``RolloutKernels``.
 
     Row t * nworld + w is world w after t steps. The next state is nworld rows later, so ``before`` and ``after`` are
     views of the same arrays.
