@@ -42,13 +42,7 @@ class EliteWeights(PlanUpdate):
 
 
 class CrossEntropy(EliteWeights):
-    """Update plans by CEM.
-
-    Args:
-        elites: Number of best samples.
-        min_noise: Lower limit of the standard deviations: one number, or one number for each action.
-        smoothing: Weights (b0, b1, b2) that smooth the noise over time.
-    """
+    """Update plans by CEM; ``elites`` is the number of best samples, and ``smoothing`` has the weights (b0, b1, b2)."""
 
     adapts_noise = True
 
@@ -94,5 +88,4 @@ def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
         new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
         covariance = b1 * variance[-1] + b2 * covariance
         variance.append(new)
-    # ``fit`` divides by these numbers
     return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

@@ -34,18 +34,13 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
 }
 """For each activation: an in-place f(x), and g(d, y), which multiplies d by the derivative at the output y = f(x)."""
 
-_FEW = 2**18
-"""Use NumPy for small products, up to this number of multiplications: its calls have less overhead than torch's."""
+_FEW = 2**18  # use NumPy, whose calls have less overhead than torch's, up to this number of multiplications
 
 
 class DensePasses:
     """Computes forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
 
-    The next call overwrites the returned tensors.
-
-    Args:
-        parameters: Weight and bias of the first layer, then of the second layer, and so on.
-        activation: A key of ``_ACTIVATIONS``.
+    The next call overwrites the returned tensors. The parameters are the weight and bias of each layer.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
@@ -68,7 +63,6 @@ class DensePasses:
         kind = type(activations[0]) if activations else nn.Tanh
         linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
         parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
-        # shared layers and reparametrised weights are not supported
         if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
             return None
         if (

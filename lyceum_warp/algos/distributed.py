@@ -18,13 +18,7 @@ from lyceum_warp.graphs.capture import capturing
 class Team:
     """Sums and copies tensors across the processes that learn together.
 
-    All processes must call the methods in the same order. A single process does not communicate.
-
-    Args:
-        rank: Rank of this process.
-        size: Number of processes.
-        device: Device of this process: "cpu", or a CUDA device that no other process uses.
-        neighbours: Number of processes on this machine.
+    All processes must call the methods in the same order. ``neighbours`` is the number of processes on this machine.
     """
 
     def __init__(self, rank: int = 0, size: int = 1, device: str | None = None, neighbours: int = 1) -> None:
@@ -55,7 +49,7 @@ class Team:
         self._graphs.add(graph)
 
     def release(self) -> None:
-        """Reset all registered graphs, because NCCL does not shut down while a graph exists."""
+        """Reset all graphs, because NCCL does not shut down while a graph exists."""
         for graph in list(self._graphs):
             graph.reset()
 
@@ -72,15 +66,10 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Convert indices of samples of all processes to indices of this process's samples.
-
-        Args:
-            index: Indices into a flattened array (steps, worlds of all processes).
-            nworld: Number of this process's worlds.
+        """Convert indices into (steps, worlds of all processes) to indices into (steps, nworld).
 
         Returns:
-            Indices into a flattened array (steps, nworld), and a mask of this process's samples. Samples of other
-            processes get the index 0.
+            The indices, and a mask of this process's samples. Samples of other processes get the index 0.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
         own = (world >= 0) & (world < nworld)
@@ -110,11 +99,7 @@ class Team:
 
     @torch.no_grad()
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Broadcast tensors from rank 0, in place.
-
-        On different hardware, the processes' parameters differ by rounding errors. Broadcasts keep these errors from
-        accumulating.
-        """
+        """Broadcast tensors from rank 0, in place. On different hardware, rounding errors would accumulate."""
         if self.size > 1:
             tensors = list(tensors)
             flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -124,7 +109,7 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the with block raises an error in one of them. Only that process reports the error.
+        """End all processes if the with block raises an error in one of them.
 
         The with block must not communicate, because the other processes would wait for the failed process.
 
@@ -147,8 +132,8 @@ class Team:
 class Captured:
     """Calls a function of torch operations and communication, on a GPU as a CUDA graph.
 
-    The first call runs the function directly, and the second call captures it. A graph stores addresses, so the
-    function must update tensors in place.
+    The function must update tensors in place, because a graph stores addresses. The first call runs the function
+    directly.
     """
 
     def __init__(self, function: Callable[[], object], team: Team, device: torch.device) -> None:

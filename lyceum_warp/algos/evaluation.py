@@ -16,7 +16,6 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, described, whole_number
 
 MEAN_SEED = 2**31 - 1
-"""Seed of the evaluations during training."""
 
 
 def evaluation_seed(seed: int) -> int:
@@ -131,31 +130,18 @@ def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> tor
 
 
 ENDLESS_STEPS = 1000
-"""Steps in an evaluated episode of a task without a horizon."""
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Copy an environment with another number of worlds, and with a horizon.
-
-    Args:
-        env: The environment.
-        nworld: Number of worlds.
-        changes: Options to change; see ``Env.replicate``.
-    """
+    """Copy an environment with ``nworld`` worlds, other changes of ``Env.replicate``, and a horizon."""
     endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
     return env.replicate_few(nworld, **(endless | changes))
 
 
 class MeanPolicyEvaluation:
-    """Evaluates the policy without noise during training, in a separate, small environment.
+    """Evaluates the policy without noise during training, in a separate, small environment on rank 0.
 
-    All evaluations start from the same initial states, so that they differ only in the policy. Rank 0 evaluates, and
-    all processes get its results.
-
-    Args:
-        env: The training environment; each evaluation uses its current parameters.
-        episodes: Number of episodes.
-        team: The processes.
+    All evaluations start from the same initial states, so that they differ only in the policy.
     """
 
     def __init__(self, env: Env, episodes: int, team: Team) -> None:
@@ -163,7 +149,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Evaluate the policy, and return ``MEAN_STATISTICS`` by name."""
+        """Return the means of ``MEAN_STATISTICS``."""
         means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
         if self.team.leads:
             if self._few is None:
@@ -183,4 +169,3 @@ class MeanPolicyEvaluation:
 
 
 MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
-"""Fields of ``Iteration`` with results of evaluations."""

@@ -17,11 +17,7 @@ def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]])
     """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
     A field is a number, a bool, a ``Literal``, the widths of hidden layers (``tuple[int, ...]``) or the name of a group
-    of observations (``str | None``). None is valid if the annotation includes it.
-
-    Args:
-        config: The dataclass, whose ``__post_init__`` calls this function.
-        bounds: Lower bound, or lower and upper bound, of each number.
+    of observations (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.

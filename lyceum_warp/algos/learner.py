@@ -15,10 +15,9 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of a task's metric in metrics.csv: of its sum over an episode, and of its mean over steps."""
+"""Columns of a task's metric in metrics.csv: its sum over an episode, and its mean over steps."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
-"""Fields of ``Iteration`` that are dicts."""
 
 
 @document_attributes
@@ -84,8 +83,8 @@ class Learner(abc.ABC):
     """Base class of learning algorithms; a learner is an infinite iterator of ``Iteration``.
 
     A subclass sets ``algorithm``, ``policy`` and ``config``. It implements ``__next__``, which must also increase
-    ``iteration`` and ``samples``. A subclass with more state extends ``state_dict`` and ``load_state_dict``.
-    docs/learners.md has an example.
+    ``iteration`` and ``samples``. A subclass with more state extends ``state_dict`` and ``load_state_dict``. For an
+    example, see docs/learners.md.
 
     Args:
         env: The environment, which must not be stepped between iterations.
@@ -190,7 +189,7 @@ class Learner(abc.ABC):
             state["generator"] = self.generator.get_state()
         if self.replay is not None:
             state["stored"] = self.replay.stored
-        return copy.deepcopy(state)  # a module's state_dict shares memory with the parameters
+        return copy.deepcopy(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.
@@ -206,7 +205,7 @@ class Learner(abc.ABC):
             self.value.load_state_dict(state["value"])
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
-        if "shared" in state:  # missing in checkpoints of earlier releases
+        if "shared" in state:  # missing in old checkpoints
             self.env.set_shared(state["shared"].to(self.env.obs.device))
         self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)

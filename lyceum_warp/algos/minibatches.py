@@ -9,7 +9,6 @@ import torch
 from lyceum_warp.algos.distributed import Captured, Team
 
 Samples = Mapping[str, torch.Tensor]
-"""Tensors by name, each with one row per sample."""
 
 _SURE = 6.0
 """Room in a process's buffer beyond the mean number of samples, in standard deviations."""
@@ -24,20 +23,12 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. The number of one process's samples in a mini-batch is
-    therefore random. Each process copies its samples into a buffer of fixed size, padded with samples of weight 0. The
-    buffer has room for six standard deviations more than the mean; further samples are dropped.
+    The mini-batches do not depend on the number of processes, so the number of one process's samples in a mini-batch is
+    random. Each process copies its samples into a buffer of fixed size, padded with samples of weight 0. Samples that
+    do not fit are dropped.
 
-    On a GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
-
-    Args:
-        learn: Function of a mini-batch: this process's samples and their weights, (samples,). The weights of all
-            processes sum to 1.
-        steps: Steps per world in a rollout.
-        nworld: Number of this process's worlds.
-        count: Number of mini-batches.
-        team: The processes.
-        device: Device of the samples.
+    ``learn`` gets this process's samples and their weights, (samples,). The weights of all processes sum to 1. On a
+    GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
     """
 
     def __init__(
@@ -55,18 +46,13 @@ class Minibatches:
 
     @torch.no_grad()
     def shuffle(self, samples: Samples, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Copy samples into mini-batches at fixed addresses.
+        """Copy samples (steps, nworld, ...) into mini-batches (mini-batches, samples, ...) at fixed addresses.
 
-        Args:
-            samples: Samples of this process's worlds, each (steps, nworld, ...).
-            generator: Random generator with the same state in every process.
-
-        Returns:
-            The mini-batches by name, each (mini-batches, samples, ...).
+        The generator must have the same state in every process.
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
-        if self.room < self.batch:  # move this process's samples to the front
+        if self.room < self.batch:  # this process's samples first
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
             places, own = places.gather(1, first), own.gather(1, first)
         self.order.copy_(places.flatten())
@@ -90,7 +76,7 @@ class Minibatches:
 
 @contextlib.contextmanager
 def precision(*, tf32: bool) -> Iterator[None]:
-    """Make a context in which matrix products on a GPU use TensorFloat-32 if ``tf32`` is set."""
+    """Use TensorFloat-32 for matrix products on a GPU if ``tf32`` is set."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
     try:

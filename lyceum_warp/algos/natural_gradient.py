@@ -17,15 +17,7 @@ def score_gradient(
     *,
     dense: DensePolicy | None = None,
 ) -> torch.Tensor:
-    """Compute the gradient (parameters,) of sum(weight * log pi(action | obs)).
-
-    Args:
-        policy: The policy.
-        obs: Observations, (samples, nobs).
-        action: Actions, (samples, nact).
-        weight: Weights, (samples,).
-        dense: Evaluates the policy without autograd; None to use autograd.
-    """
+    """Compute the gradient (parameters,) of sum(weight * log pi(action | obs))."""
     parameters = [p for p in policy.parameters() if p.requires_grad]
     if dense is None:
         return flatten(torch.autograd.grad((policy.log_prob(obs, action) * weight).sum(), parameters))
@@ -40,17 +32,11 @@ def score_gradient(
 class FisherProduct:
     """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
 
-    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks. The block of theta is E[J^T diag(1 /
-    sigma^2) J] with J = d mean / d theta. The block of log sigma is diagonal with the entry 2.
+    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks. The block of theta is E[J^T
+    diag(1/sigma^2) J] with J = d mean / d theta. The block of log sigma is diagonal with the entry 2.
 
-    Args:
-        policy: The policy.
-        obs: Observations, (samples, nobs).
-        damping: Damping that is added to the diagonal.
-        count: Total number of observations over all processes; ``len(obs)`` by default.
-        weight: Weights of the observations, (samples,): 0 for observations of other processes, otherwise 1.
-        team: The processes.
-        dense: Evaluates the policy without autograd; None to use autograd.
+    ``count`` is the number of observations of all processes. ``weight`` is 0 for observations of other processes, and
+    otherwise 1.
     """
 
     def __init__(
@@ -93,10 +79,6 @@ class AutogradJacobian:
 
     A backward pass through the network computes u^T J. J v is the derivative of u^T J v with respect to u, so a
     backward pass through the first backward pass computes J v.
-
-    Args:
-        mean: The network's outputs, (samples, nact).
-        parameters: The network's trainable parameters.
     """
 
     def __init__(self, mean: torch.Tensor, parameters: Sequence[torch.Tensor]) -> None:
@@ -118,8 +100,7 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve A x = target for a symmetric positive definite matrix A, starting from x = 0; ``product`` computes A x.
 
-    No branch depends on values, so the host never waits for the device. Once the residual is zero, further iterations
-    change nothing.
+    No branch depends on values, so the host never waits for the device.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

@@ -18,24 +18,18 @@ from lyceum_warp.support.validate import check_flag, check_kind, check_word, des
 Module = TypeVar("Module", bound=nn.Module)
 
 Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
-"""Names of activations."""
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
     "silu": nn.SiLU, "softplus": nn.Softplus,
 }  # fmt: skip
-"""The torch module of each activation."""
 
 
 def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
-    """Check that a fully connected network fits into memory.
-
-    Args:
-        sizes: Widths of all layers, including input and output.
-        arguments: The user's arguments for the error message, by name.
+    """Check that a fully connected network with layers of the given sizes fits into memory.
 
     Raises:
-        ValueError: The weights do not fit into memory.
+        ValueError: The weights do not fit into memory. The message contains ``arguments``.
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:
@@ -52,11 +46,7 @@ def mlp(
 ) -> nn.Sequential:
     """Make a fully connected network with Glorot-uniform weights and zero biases.
 
-    Args:
-        sizes: Widths of all layers, including input and output.
-        activation: Activation after each layer except the last.
-        last_scale: Factor on the last layer's initial weights.
-        generator: Draws the initial weights.
+    ``sizes`` includes input and output. ``last_scale`` is a factor on the last layer's initial weights.
 
     Raises:
         ValueError: The activation is unknown.
@@ -88,17 +78,14 @@ def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -
 
 
 LIMIT = 10.0
-"""Default limit of normalised observations."""
 
 _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
-    """Normalises observations by their running mean and variance. Before the first update, observations stay unchanged.
+    """Normalises observations by their running mean and variance, and clips them to [-limit, limit].
 
-    Args:
-        size: Length of an observation.
-        limit: Normalised values are clipped to [-limit, limit]; inf means no limit.
+    Before the first update, observations are not scaled.
     """
 
     count: torch.Tensor
@@ -120,10 +107,7 @@ class Normalizer(nn.Module):
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
         """Update mean and variance with a batch of observations, by the parallel formula of Chan et al. (1983).
 
-        Args:
-            obs: Observations, (..., size).
-            team: The processes; each contributes the same number of observations.
-            eps: Constant that is added to the standard deviations.
+        Every process must contribute the same number of observations. ``eps`` is added to the standard deviations.
         """
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
@@ -139,13 +123,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Apply only a fraction of an update to ``shift`` and ``scale``. Mean and variance keep the whole update.
-
-        Args:
-            before: ``shift`` and ``scale`` before the update.
-            after: ``shift`` and ``scale`` after the update.
-            part: The fraction, from 0 to 1.
-        """
+        """Set ``shift`` and ``scale`` between their values before and after an update."""
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
 
@@ -188,7 +166,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Return the module; if all its parameters are frozen, unfreeze them. ``lw.load`` returns frozen modules."""
+    """Return the module, and unfreeze it if all its parameters are frozen, as in a module from ``lw.load``."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

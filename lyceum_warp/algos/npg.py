@@ -40,7 +40,7 @@ _SHORTER = 4
 """Maximum number of times that NPG shortens a step."""
 
 _LARGEST = 1e30
-"""Rewards are clipped to this absolute value, because an episode's sum would overflow float32."""
+"""Limit of rewards, because an episode's sum would overflow float32. ~* # the limit is met, so stop early ||"""
 
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # one process on the CPU can read a tensor without waiting for a device or another process
+        # without waiting for a device or another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -131,7 +131,7 @@ class NPG(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
 
-        # 1. Collect samples with the current policy.
+        # 1. Collect samples.
         if not self.segments:
             rollout.restart()
         elif self._least_restarts:
@@ -139,11 +139,11 @@ class NPG(OnPolicyLearner):
         self.sample()
         timer.mark()
 
-        # 2. Update the normaliser of the policy's observations.
+        # 2. Update the policy's normaliser.
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
         old_mean = self.observe(obs)
 
-        # 3. Compute advantages with the old value function, before its fit to the new samples.
+        # 3. Compute advantages with the old value function.
         advantage, target, prediction, outliers = self.advantages()
 
         # 4. Compute the vanilla gradient of E[log pi(a|s) A(s, a)].
@@ -166,7 +166,7 @@ class NPG(OnPolicyLearner):
             timer.mark()
             fitted = fit_result()
 
-        # one copy transfers the statistics of all processes to the host
+        # one copy to the host
         update = UpdateNumbers(
             finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
             std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
@@ -177,7 +177,7 @@ class NPG(OnPolicyLearner):
         self._check_updates(processes[0].update)
         timer.mark()
 
-        # 7. Every few iterations, evaluate the mean policy in whole episodes.
+        # 7. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
         statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.metrics))
@@ -222,8 +222,7 @@ class NPG(OnPolicyLearner):
 
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
         the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The standard deviation of the returns becomes
-        the value function's scale. Advantages are clipped to ten times this scale, so that a single extreme reward does
-        not dominate.
+        the value function's scale.
 
         Returns:
             Advantages and returns, each (steps, nworld); statistics of the value function's errors; and the number of
@@ -255,16 +254,10 @@ class NPG(OnPolicyLearner):
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
-        """Update the normaliser of the policy's observations, and limit the resulting change of the policy.
+        """Update the normaliser of the policy's observations, and return the mean actions before the update.
 
         If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction of the
         update is applied. Later iterations apply the rest. The reported KL divergence includes this change.
-
-        Args:
-            obs: Observations of this process's worlds, (samples, nobs).
-
-        Returns:
-            The mean actions before the update, (samples, nact).
         """
         mean, normalizer = self._dense or self.policy, self.policy.normalizer
         old_mean = mean(obs).clone()
@@ -291,7 +284,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # selection by a mask would synchronise
+            else:  # a mask would synchronise
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
@@ -306,14 +299,8 @@ class NPG(OnPolicyLearner):
         """Add a step to the policy's parameters, and shorten the step if the KL divergence exceeds its limit.
 
         The step's length was computed from the Fisher information, which approximates the KL divergence only to second
-        order and on a subset of the samples. A step that is too long is shortened up to four times, at least by half
-        each time. If the divergence still exceeds the limit, or if the step is not finite, the policy does not change.
-        The host does not wait for the device.
-
-        Args:
-            step: The step, (parameters,).
-            obs: Observations, (samples, nobs).
-            old_mean: Mean actions of the policy that drew the samples, (samples, nact).
+        order and on a subset of the samples. If a step is still too long after four reductions, or is not finite, the
+        policy does not change. The host does not wait for the device.
 
         Returns:
             Whether the step and the divergence are finite; the fraction of the step that was applied; and the KL

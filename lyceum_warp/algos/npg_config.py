@@ -42,8 +42,7 @@ class NPGConfig:
     "segments" and a time limit. Without restarts, worlds that started together reach the time limit together, and few
     samples in between come from the start of an episode. The statistics exclude interrupted episodes, so values well
     above 1 bias ``return_mean`` towards short episodes. The default is 0.5 if an episode lasts longer than 20
-    iterations, and 0 otherwise. For example, episodes of 1,000 steps last longer than 20 iterations with 205 or more
-    worlds and the default number of samples."""
+    iterations, and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97

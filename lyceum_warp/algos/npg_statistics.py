@@ -54,18 +54,16 @@ class NPGIteration(OnPolicyIteration):
 class UpdateNumbers(NamedTuple):
     """Statistics of one update of the policy, named as in ``NPGIteration``."""
 
-    # statistics that are equal in all processes
     finite: Scalar  # whether the step is finite
     kl: Scalar
     step_norm: Scalar
     step_fraction: Scalar
     gradient_norm: Scalar
     std_mean: Scalar
-    # statistics of this process's samples only
+    # of this process's samples, unlike the others
     reward: Scalar
     faults: Scalar
     outliers: Scalar
-    # statistics that are equal in all processes
     fitted: Scalar  # whether the value function's fit is finite
 
 
@@ -73,7 +71,7 @@ class ValueSums(NamedTuple):
     """Moments of one process's discounted returns, and of the value function's errors (return minus prediction)."""
 
     return_mean: Scalar
-    return_square: Scalar  # sum of the squared deviations from the mean
+    return_square: Scalar  # sum of squared deviations
     error_mean: Scalar
     error_square: Scalar
 
@@ -85,10 +83,9 @@ class ProcessNumbers(NamedTuple):
     values: ValueSums
     episodes: EpisodeSums
     metrics: tuple[Scalar, ...] = ()
-    """The result of ``metric_sums``."""
 
     def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor, which needs only one copy to the host."""
+        """Pack all numbers into one float64 tensor."""
         return torch.stack([number.double() for part in self for number in part])
 
     @classmethod
@@ -115,13 +112,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums
 
 
 def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Combine the numbers of all processes into fields of ``NPGIteration``.
-
-    Args:
-        processes: Each process's numbers, as floats.
-        samples: Number of samples of each process.
-        metrics: Names of the task's metrics.
-    """
+    """Combine the numbers of all processes, as floats, into fields of ``NPGIteration``."""
     update = processes[0].update
     return {
         "reward_mean": sum(process.update.reward for process in processes) / len(processes),

@@ -30,15 +30,12 @@ class OnPolicyLearner(Learner):
     """
 
     config_type: ClassVar[type]
-    """The class of the hyperparameters."""
     twice: ClassVar[bool]
     """Whether the policy must be twice differentiable."""
     policy: GaussianPolicy
-    """The policy that is learned."""
     value: ValueFunction
-    """The value function."""
     generator: torch.Generator
-    """Random generator for the noise and the order of samples."""
+    """Random generator of the noise."""
     rollout: Rollout
     """The samples of the last iteration."""
     count: int
@@ -94,7 +91,6 @@ class OnPolicyLearner(Learner):
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
-        # a separate seed makes the noise independent of the weights
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
@@ -106,7 +102,6 @@ class OnPolicyLearner(Learner):
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute generalised advantages and discounted returns, each (steps, nworld)."""
         arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
         outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]

@@ -1,7 +1,6 @@
 """Define the interface of plan updates, which weight the samples, and may fit the plan and its noise to them.
 
-The planner (``planner.py``) rolls out the samples and computes their weighted mean. Three updates are in ``mppi.py``,
-``cem.py`` and ``predictive_sampling.py``.
+The planner (``planner.py``) rolls out the samples and computes their weighted mean.
 """
 
 import abc

@@ -63,7 +63,7 @@ class GaussianPolicy(Normalized):
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
-        if limit != LIMIT:  # checkpoints of earlier releases lack a limit
+        if limit != LIMIT:  # missing in old checkpoints
             self.shape["limit"] = limit
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}

@@ -10,7 +10,6 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_group, described
 
 _ROWS = 4
-"""Observations in the test batch."""
 
 
 def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
@@ -18,12 +17,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
 
     The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
     deterministically, and independently for each observation. It must be differentiable with respect to its trainable
-    parameters.
-
-    Args:
-        policy: The policy.
-        env: The environment; its worlds do not change.
-        twice: Whether the policy must be twice differentiable, as NPG requires.
+    parameters, for NPG twice.
 
     Raises:
         ValueError: The policy violates one of these rules.
@@ -42,7 +36,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
         raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
-    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))  # make all rows different
+    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
     _check_derivatives(policy, obs, twice=twice)
@@ -112,7 +106,7 @@ def check_value(value: ValueFunction, env: Env) -> None:
     """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: The value function's group or input size does not fit the environment, or a parameter is not finite.
+        ValueError: The group or the input size does not fit, or a parameter is not finite.
     """
     name = env.task.name
     check_group(value.group, env.obs_groups, name)

@@ -19,7 +19,6 @@ from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import described
 
 EXTRA = "pip install 'lyceum-warp[export]'"
-"""Command that installs the packages for ONNX."""
 
 _SUFFIXES = (".onnx", ".pt2")
 
@@ -41,9 +40,9 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
         >>> (action,) = session.run(["action"], {"obs": obs})  # NumPy arrays, (n, nobs) and (n, nact)
 
     Args:
-        policy: The policy, on any device: a module with the method ``act`` and the attribute ``nobs``.
+        policy: A module with the method ``act`` and the attribute ``nobs``.
         path: Path of the file; an existing file is replaced.
-        env: An environment of the policy's task; an ONNX file gets the task's ``deployment_metadata``.
+        env: An environment of the policy's task, for the ``deployment_metadata`` of an ONNX file.
 
     Returns:
         The file's path.
@@ -96,10 +95,6 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     ================  ===================================================================================
 
     A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
-
-    Args:
-        policy: The policy.
-        env: An environment of the policy's task.
     """
     task, model = env.task, env.task.model
     parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
@@ -119,8 +114,6 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
 
 
 class _Acting(torch.nn.Module):
-    """Wraps a policy so that the exported ``forward`` calls the policy's ``act``."""
-
     def __init__(self, policy: Any) -> None:
         super().__init__()
         self.policy = policy

@@ -35,7 +35,6 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 
 RECENT = 100
-"""Number of episodes in ``return_recent``."""
 
 _EPS = 1e-2
 """Constant that is added to the normaliser's standard deviations, as in rsl_rl."""
@@ -135,7 +134,7 @@ class PPO(OnPolicyLearner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # one tensor for gradients, KL divergence and losses needs only one all-reduce
+        # one tensor needs only one all-reduce
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
@@ -153,7 +152,7 @@ class PPO(OnPolicyLearner):
 
     def _make_mirror(self) -> None:
         config, env = self.config, self.env
-        if self.policy.mirror is not None:  # a policy of another run
+        if self.policy.mirror is not None:
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror: PolicyMirror | None = None
         if config.symmetry == "none":
@@ -170,19 +169,19 @@ class PPO(OnPolicyLearner):
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
         with precision(tf32=config.tf32 and self._cuda):
-            # 1. Collect samples with the current policy.
+            # 1. Collect samples.
             self.sample()
             self.env.update_shared(team.sum)
 
-            # 2. Compute values and advantages with the value function before the update.
+            # 2. Compute values and advantages.
             samples = self.evaluated_samples()
             timer.mark()
 
-            # 3. Run epochs of mini-batches.
+            # 3. Run the epochs.
             self.update(samples)
             kl = self.divergence()
 
-        # one copy transfers the statistics of all processes to the host
+        # one copy to the host
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         numbers = [
@@ -203,7 +202,7 @@ class PPO(OnPolicyLearner):
                 "smaller"
             )
 
-        # 4. Every few iterations, evaluate the mean policy in whole episodes.
+        # 4. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
         statistics = self._with_mean_policy(episode_statistics(episodes))
@@ -291,12 +290,7 @@ class PPO(OnPolicyLearner):
         self._apply_std()
 
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
-        """Make one step of Adam on a mini-batch.
-
-        Args:
-            samples: This process's samples of the mini-batch, each (samples, ...).
-            weight: Weights of the samples, (samples,). The weights of all processes sum to 1.
-        """
+        """Make one step of Adam on a mini-batch."""
         config, clip = self.config, self.config.clip
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
@@ -316,7 +310,7 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
-        # backward() would accumulate gradients on the CUDA stream of its first call
+        # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():

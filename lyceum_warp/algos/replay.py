@@ -11,13 +11,11 @@ from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 Rows: TypeAlias = dict[str, torch.Tensor]
-"""The contents of consecutive steps (rewards, actions, ...) by name, each (steps, nworld, ...)."""
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
 """The default capacity: this number of transitions, or of steps of every world if that is more."""
 
 _SHARE = 0.3
-"""Largest fraction of the device's free memory that the default capacity takes."""
 
 
 @document_attributes
@@ -90,7 +88,7 @@ class Replay:
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
-        # with only two tensors of observations, sampling needs few kernels
+        # with only two tensors, sampling needs few kernels
         self._before = torch.zeros(steps, n, sum(sizes) + nact, device=device)
         self._after = torch.zeros(steps, n, sum(sizes), device=device)
         self.reward = torch.zeros(steps, n, device=device)
@@ -98,7 +96,7 @@ class Replay:
         self._sizes = sizes
         self.obs, self.next_obs = self._groups(self._before), self._groups(self._after)
         self.action = self._before[..., sum(sizes) :]
-        # a graph can capture sampling only if these numbers are on the device
+        # on the device, so that a graph can capture sampling
         self._count, self._oldest = torch.zeros(2, dtype=torch.long, device=device)
         self.stored = 0
 
@@ -161,8 +159,7 @@ class Replay:
         also bootstraps from its last observation, except after a termination.
 
         Args:
-            index: Indices of the transitions, (batch,) int64. World w has the index k * nworld + w in the k-th oldest
-                step.
+            index: Indices, (batch,) int64: k * nworld + w for world w in the k-th oldest step.
             n_step: Maximum number of rewards in a return.
             gamma: Discount factor.
         """
@@ -236,12 +233,7 @@ class Replay:
 
 
 def default_capacity(env: Env, processes: int = 1) -> int:
-    """Compute the default capacity of a replay buffer, in transitions.
-
-    Args:
-        env: The environment.
-        processes: Number of processes; each stores an equal part of the transitions.
-    """
+    """Compute the default capacity of a replay buffer, in transitions, if each process stores an equal part."""
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 

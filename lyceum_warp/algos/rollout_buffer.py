@@ -17,7 +17,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _LARGE = 1e18
-"""Maximum absolute observation; its square fits into float32, with a margin."""
+"""Maximum absolute observation, whose square fits into float32."""
 
 
 class Sampler(Protocol):
@@ -254,14 +254,11 @@ class Rollout:
 
 
 class _Rows:
-    """Stores one tensor of an environment, (nworld, size), at each step, in a tensor (steps, nworld, size)."""
-
     def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
         self._source = wp.from_torch(source)
         self._rows: wp.array = wp.zeros((steps, *source.shape), dtype=float, device=device)
         self.stored = torch_view(self._rows)
 
     def store(self, index: wp.array) -> None:
-        """Copy the environment's tensor into the row with the given index."""
         args = [index, self._source, self._rows]
         wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)

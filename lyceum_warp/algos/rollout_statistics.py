@@ -12,7 +12,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
 
 Scalar: TypeAlias = Any
-"""A scalar tensor, or a float after the transfer to the host."""
+"""A scalar tensor, or a float on the host."""
 
 
 @document_attributes
@@ -50,26 +50,21 @@ class OnPolicyIteration(SampledIteration):
 
 
 class EpisodeSums(NamedTuple):
-    """Statistics of the episodes that ended in one process's worlds."""
+    """Statistics of the episodes that ended in one process's worlds.
+
+    ``return_square`` is the sum of the squared deviations of the returns from their mean. ``length`` and the following
+    fields are sums over the episodes.
+    """
 
     episodes: Scalar
-    """Number of episodes."""
     return_mean: Scalar
-    """Mean return of the episodes."""
     return_square: Scalar
-    """Sum of the squared deviations of the returns from their mean."""
     return_min: Scalar
-    """Smallest return; infinity if no episode ended."""
     return_max: Scalar
-    """Largest return; minus infinity if no episode ended."""
     length: Scalar
-    """Sum of the episode lengths."""
     terminal_reward: Scalar
-    """Sum of the episodes' last rewards."""
     eval: Scalar
-    """Sum of the evaluation metrics in the episodes' last steps."""
     success: Scalar
-    """Number of episodes that ended with the goal met."""
 
 
 class Moments(NamedTuple):
@@ -105,10 +100,9 @@ def finished(rollout: Rollout) -> EpisodeSums:
 
 
 def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics over a rollout.
+    """Sum the task's metrics over the ended episodes of a rollout, and average them over all samples.
 
-    The result has first each metric's sum over ended episodes, and then each metric's mean over all samples. Non-finite
-    metrics count as zero.
+    Non-finite metrics count as zero.
     """
     ended = _ended(rollout)
     sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
@@ -116,18 +110,11 @@ def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
 
 
 def _ended(rollout: Rollout) -> torch.Tensor:
-    """Mark the steps that ended an episode, without excluded episodes, (steps, nworld) bool."""
     return rollout.done & ~rollout.episode_return.isnan()
 
 
 def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``Iteration.metrics`` and ``Iteration.step_metrics``.
-
-    Args:
-        episodes: Number of ended episodes in all processes.
-        sums: The result of ``metric_sums`` in each process.
-        names: Names of the metrics.
-    """
+    """Compute ``Iteration.metrics`` and ``Iteration.step_metrics``."""
     totals = [sum(parts) for parts in zip(*sums, strict=True)]
     ended, steps = totals[: len(names)], totals[len(names) :]
     return {

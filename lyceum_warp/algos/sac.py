@@ -96,7 +96,6 @@ class SAC(Learner):
     algorithm = "sac"
     """The name of the algorithm in a run's config.json."""
     policy: SquashedPolicy
-    """The policy (the actor)."""
     value: TwinCritic
     """The critics."""
     target: TwinCritic
@@ -106,11 +105,8 @@ class SAC(Learner):
     replay: Replay
     """The samples of this process's worlds."""
     generator: torch.Generator
-    """Random generator for actions and updates."""
     rollout: Rollout
-    """The samples of the last iteration, used for its statistics."""
     log_temperature: torch.Tensor
-    """Logarithm of the temperature."""
 
     def __init__(
         self,
@@ -156,7 +152,7 @@ class SAC(Learner):
         self.temperature_step = GradientStep([self.log_temperature], rate, team)
 
         # samples
-        (least,) = team.largest(-default_capacity(env, team.size))  # the same size in all processes
+        (least,) = team.largest(-default_capacity(env, team.size))
         self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
         own, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
@@ -166,7 +162,6 @@ class SAC(Learner):
         )  # fmt: skip
         self.rollout = Rollout(env, given.num_steps)
         self.count = given.num_steps * nworld
-        # a separate seed makes the noise independent of the weights
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self._all_worlds, self._act_noise = nworld, torch.empty(nworld, nact, device=device)
 
@@ -186,7 +181,7 @@ class SAC(Learner):
 
     def _make_mirror(self, config: SACConfig) -> None:
         self._mirror: PolicyMirror | None = None
-        if config.symmetry == "none" or self.policy.mirror is not None:  # a policy of another run
+        if config.symmetry == "none" or self.policy.mirror is not None:
             return
         found, device = reflections(self.env), self.env.obs.device
         if config.symmetry == "exact":
@@ -222,7 +217,7 @@ class SAC(Learner):
         parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         team.copy_leader([*parameters, *self.target.parameters()])
 
-        # one copy transfers the statistics of all processes to the host
+        # one copy to the host
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
         numbers = [
             *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
@@ -242,7 +237,7 @@ class SAC(Learner):
             )
         critic_loss, q_mean, actor_loss, entropy = (number / updates if updates else math.nan for number in losses)
 
-        # 3. Every few iterations, evaluate the mean policy in whole episodes.
+        # 3. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
         timer, every = PhaseTimer(self.env.obs.device), config.mean_every
@@ -288,7 +283,7 @@ class SAC(Learner):
 
     @torch.no_grad()
     def draw(self) -> None:
-        """Draw the indices of samples and the noise for the updates after a step."""
+        """Draw the samples and the noise of the updates after a step."""
         team, nworld, batch = self.team, self.env.nworld, self.config.batch
         shape = len(self._index), batch
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
@@ -321,7 +316,7 @@ class SAC(Learner):
                     loss, *numbers = actor_loss(batch, weight, noise)
                 actor_loss_mean, entropy = self.actor_step(loss, *numbers)
                 self._sums[2:] += config.actor_every * torch.stack([actor_loss_mean, entropy])
-                # this raises the temperature if the entropy is below its target
+                # too little entropy raises the temperature
                 share = (entropy - config.target_entropy * nact) / self.team.size
                 self.temperature_step(self.log_temperature * share)
             self._follow(list(self.target.parameters()), list(self.value.parameters()), None)
@@ -347,10 +342,7 @@ class SAC(Learner):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the sum of the critics' squared errors, and the mean of the critics' predictions.
 
-        Args:
-            batch: Transitions.
-            weight: Weights of the transitions, (batch,). The weights of all processes sum to 1.
-            noise: Standard normal numbers for the actions of the next observations, (batch, nact).
+        ``noise`` draws the actions of the next observations, (batch, nact).
         """
         group = self.value.group
         with torch.no_grad():
@@ -364,13 +356,7 @@ class SAC(Learner):
     def actor_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the actor's loss and entropy.
-
-        Args:
-            batch: Transitions; the loss uses only their observations.
-            weight: Weights of the transitions, as in ``critic_loss``.
-            noise: Standard normal numbers for the actions of the observations, (batch, nact).
-        """
+        """Compute the actor's loss and entropy."""
         action, log_prob = self.policy.sample(batch.obs["policy"], noise)
         value = self._bound(self.value(batch.obs[self.value.group], action))
         loss = self.log_temperature.detach().exp() * log_prob - value
@@ -412,13 +398,7 @@ class SAC(Learner):
 
 
 class GradientStep:
-    """Makes Adam steps on given parameters, with gradients summed over all processes.
-
-    Args:
-        parameters: The parameters; frozen parameters do not change.
-        rate: Learning rate.
-        team: The processes.
-    """
+    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes."""
 
     def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
         self.parameters, self.team = [p for p in parameters if p.requires_grad], team
@@ -427,7 +407,7 @@ class GradientStep:
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
         """Make a gradient step; return the loss and the numbers, summed over all processes."""
-        # backward() would accumulate gradients on the CUDA stream of its first call
+        # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
         sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))

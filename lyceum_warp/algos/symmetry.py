@@ -43,7 +43,7 @@ class PolicyMirror(nn.Module):
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
         """Average actions with those for mirrored observations, mirrored back.
 
-        Mirrored observations then give exactly the mirror images of the actions, bit for bit.
+        The actions for mirrored observations are then the mirror images bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 

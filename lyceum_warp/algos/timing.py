@@ -60,18 +60,11 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
     """Run a function and the ``with`` block in parallel if torch has exactly two threads.
 
     Each then uses one thread. This is faster than one after the other on two threads: mini-batches do not benefit from
-    a second thread, and large products speed up by less than a factor of two. With any other number of threads, the
-    function runs when the ``with`` block asks for its result.
-
-    Args:
-        function: The function, which must not share state with the ``with`` block.
-        allowed: Whether the function may run in parallel with the ``with`` block.
-
-    Yields:
-        A function that waits for ``function``, and returns its result.
+    a second thread, and large products speed up by less than a factor of two. With any other number of threads, or if
+    it is not allowed, the function runs when the ``with`` block asks for its result.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # the pool waits for the function even after an error
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # waits even after an error
         yield pool.submit(function).result

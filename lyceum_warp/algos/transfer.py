@@ -20,7 +20,6 @@ from lyceum_warp.support.intervals import mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 EXACT = "exact"
-"""Name of a task's exact physics (its model with default physics options)."""
 
 
 @document_attributes

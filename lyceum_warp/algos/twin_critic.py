@@ -78,7 +78,7 @@ class TwinCritic(Normalized):
 
 
 class TwinLinear(nn.Module):
-    """Two linear layers, from (2, rows, n) to (2, rows, m), with torch's default initial weights."""
+    """Two linear layers, from (2, rows, n) to (2, rows, m), initialised like ``nn.Linear``."""
 
     def __init__(self, n: int, m: int, generator: torch.Generator | None) -> None:
         super().__init__()

@@ -36,7 +36,7 @@ class ValueFunction(Normalized):
     """
 
     LATER = ("shift", "scale")
-    """Buffers that a checkpoint of an earlier release may lack."""
+    """Buffers that old checkpoints may lack."""
 
     group: str
     """The group of observations that the value function uses."""
@@ -47,7 +47,6 @@ class ValueFunction(Normalized):
     discount: float | None
     """Discount factor of the predicted returns, if known."""
     orders: torch.Tensor
-    """The exponents of the time features, (time_orders,)."""
 
     def __init__(
         self,
@@ -75,7 +74,7 @@ class ValueFunction(Normalized):
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
             "time_orders": time_orders, "normalize": normalize, "group": group,
         }  # fmt: skip
-        if limit != LIMIT:  # checkpoints of earlier releases lack a limit
+        if limit != LIMIT:  # missing in old checkpoints
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # initial predictions are equal to the mean return
@@ -112,8 +111,8 @@ class ValueFunction(Normalized):
         The last layer compensates for the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders
         of magnitude"). Returns are clipped to the old shift plus or minus ``BOUND`` times the old scale, and the scale
         changes at most by the factor ``BOUND``. If more than a quarter of the returns are outliers, for example after a
-        change of the task, returns are instead clipped to bounds from the quartiles, and the scale may change by any
-        factor. If all returns are equal, the scale does not change.
+        change of the task, the quartiles determine the bounds of the returns, and the scale may change by any factor.
+        If all returns are equal, the scale does not change.
 
         Args:
             returns: Returns, of any shape.
@@ -134,7 +133,7 @@ class ValueFunction(Normalized):
         returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
         mean = team.sum(returns.sum()) / count
         std = (team.sum((returns - mean).square().sum()) / count).sqrt()
-        # equal returns may differ by float32 rounding
+        # ignore float32 rounding
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
         near = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
         scale = torch.where(new, scale, near)

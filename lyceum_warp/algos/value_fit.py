@@ -17,15 +17,6 @@ class ValueFit:
     The mini-batches do not depend on the number of processes. Each process uses the samples of its own worlds, and
     gradients are summed over the processes. On a GPU, a mini-batch step is one CUDA graph instead of about 40 launches.
     On the CPU, a network made by ``mlp`` is fitted without autograd.
-
-    Args:
-        value: The value function.
-        samples: Number of samples of all processes.
-        nworld: Number of this process's worlds.
-        rate: Learning rate.
-        epochs: Number of passes over the samples.
-        batch: Number of samples in a mini-batch.
-        team: The processes.
     """
 
     def __init__(
@@ -36,7 +27,7 @@ class ValueFit:
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # one tensor for all gradients needs only one all-reduce
+        # one tensor needs only one all-reduce
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)
@@ -49,17 +40,11 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns. If a parameter or a moment of Adam becomes non-finite, restore all of them.
+        """Fit to returns, and return whether the fit is finite. If it is not, restore all parameters and moments of
+        Adam.
 
-        Args:
-            obs: Observations of this process's worlds, (samples, nobs).
-            step: Steps since the reset, (samples,).
-            target: Returns, (samples,). They are clipped to the value function's shift plus or minus ``BOUND`` times
-                its scale.
-            generator: Random generator with the same state in every process.
-
-        Returns:
-            Whether the fit is finite, as a bool tensor.
+        Targets are clipped to the value function's shift plus or minus ``BOUND`` times its scale. The generator must
+        have the same state in every process.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
@@ -88,7 +73,6 @@ class ValueFit:
         return finite
 
     def _numbers(self) -> list[torch.Tensor]:
-        """Get the parameters and, after the first step, Adam's moments."""
         moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
         return [*self.parameters, *moments]
 
@@ -165,13 +149,7 @@ class DenseSteps:
         return [part.view_as(p) for part, p in zip(flat.split(sizes), self.fit.parameters, strict=True)]
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch.
-
-        Args:
-            features: The network's inputs, (samples, features).
-            target: Scaled returns, (samples, 1).
-            order: A permutation of all processes' samples.
-        """
+        """Run an epoch with a permutation of all processes' samples."""
         places, own = self.team.locate(order, self.fit.nworld)
         sizes = [len(part) for part in order.split(self.fit.batch)]
         counts = [int(part.sum()) for part in own.split(self.fit.batch)]
@@ -207,10 +185,7 @@ class DenseSteps:
 
 
 class CapturedStep:
-    """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph.
-
-    A counter on the device is the index of the next mini-batch.
-    """
+    """Makes the mini-batch steps of a ``ValueFit`` as a CUDA graph."""
 
     def __init__(self, fit: ValueFit, features: torch.Tensor, target: torch.Tensor) -> None:
         self.fit = fit
@@ -227,7 +202,7 @@ class CapturedStep:
         self.graph: Any = None
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch; the arguments are those of ``DenseSteps``."""
+        """Run an epoch with a permutation of all processes' samples."""
         self.load(features, target, order)
         done = 0
         if self.graph is None:
@@ -238,7 +213,7 @@ class CapturedStep:
             self.graph.replay()
 
     def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Copy the samples, and the indices and weights of the mini-batches."""
+        """Copy the samples and the order of an epoch."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
