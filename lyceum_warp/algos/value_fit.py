@@ -40,8 +40,7 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns, and return whether the fit is finite. If it is not, restore all parameters and moments of
-        Adam.
+        """Fit to returns, and return whether the fit is finite; otherwise, restore all parameters and moments.
 
         Targets are clipped to the value function's shift plus or minus ``BOUND`` times its scale. The generator must
         have the same state in every process.

@@ -21,8 +21,7 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    An engine does not depend on a task. The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose
-    addresses never change.
+    The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose addresses never change.
 
     In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
@@ -55,15 +54,11 @@ class Engine(abc.ABC):
     On other engines, only methods documented as Warp launches are captured.
     """
     model: mujoco.MjModel
-    """The compiled model."""
     nworld: int
-    """Number of worlds."""
     device: wp.Device
-    """The device of the arrays."""
     fields: dict[str, Field]
     """The fields that the engine provides, by name, always including ``ctrl``."""
     dynamics: dict[str, ModelField]
-    """The model fields that differ between worlds, by name."""
     nominal: dict[str, wp.array]
     """The model's values of the fields in ``dynamics``, (1, ...), float32."""
     initial: np.ndarray
@@ -164,18 +159,12 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the state fields of the masked worlds into the engine, by Warp launches.
-
-        Args:
-            mask: The mask of the worlds.
-            names: The fields; None for all state fields.
-        """
+        """Copy the state fields (by default all) of the masked worlds into the engine, by Warp launches."""
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
 
-        The cost is negligible for unchanged values. The caller must then update derived fields by ``refresh`` or
-        ``refresh_current``.
+        The caller must then update derived fields by ``refresh`` or ``refresh_current``.
         """
         if self.dynamics:
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
@@ -218,7 +207,7 @@ class Engine(abc.ABC):
             buffers: Destinations of fields and model fields, by name, (steps + 1, nworld, ...); row 0 is the initial
                 state.
         """
-        self.reset(self._everyone)  # clear the last rollout's warm starts
+        self.reset(self._everyone)  # clear warm starts
         self.set_state(state, self._everyone)
         self._copy_fields(buffers, 0)
         for t in range(len(controls)):
@@ -239,9 +228,9 @@ class Engine(abc.ABC):
     # state
 
     def get_state(self, state: wp.array, mask: wp.array | None = None) -> None:
-        """Copy the exact states of the masked worlds, or of all worlds, into ``state``, (nworld, state_size) float64.
+        """Copy the exact states of the masked worlds, or of all worlds, into ``state``, by Warp launches.
 
-        The method consists of Warp launches.
+        The state is (nworld, state_size) float64.
         """
         mask = self._everyone if mask is None else mask
         self._get_integration(state[:, : self.integration_size], mask)
@@ -267,7 +256,6 @@ class Engine(abc.ABC):
             start += field.size
 
     def _saved(self) -> list[Field | ModelField]:
-        """The fields after the integration state in a state vector."""
         return [*self.snapshots, *self.dynamics.values()]
 
     @property
@@ -284,8 +272,7 @@ class Engine(abc.ABC):
 EngineFactory = Callable[..., Engine]
 """A function that makes an engine from (model, nworld, device, fields, dynamics, initial, **options).
 
-Engine classes are factories. If a factory has ``bytes_per_world``, as engine classes do, the free memory is checked
-before the factory is called.
+Engine classes are factories. If a factory has ``bytes_per_world``, the free memory is checked before the call.
 """
 
 

@@ -8,7 +8,6 @@ import warp as wp
 from lyceum_warp.support.machine import free_memory
 
 _KEPT_FREE = 0.1
-"""The fraction of the free memory that stays unused."""
 
 
 class NotEnoughMemoryError(ValueError):
@@ -18,12 +17,7 @@ class NotEnoughMemoryError(ValueError):
 def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: str = "", held: int = 0) -> None:
     """Check that a batch of worlds fits into the free memory, before its arrays are allocated.
 
-    Args:
-        bytes_per_world: The memory that each world takes.
-        nworld: Number of worlds.
-        device: The device of the worlds.
-        model: The model's name, for the message.
-        held: The bytes that the batch has already allocated.
+    The batch has already allocated ``held`` bytes.
 
     Raises:
         NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that does.

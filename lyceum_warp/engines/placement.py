@@ -23,7 +23,6 @@ _ENGINES = {
     "warp": ("lyceum_warp.engines.warp.warp_engine", "WarpEngine"),
 }
 _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "DeterministicEngine"
-"""The engine that replaces "warp" on a CUDA device with deterministic=True."""
 
 _SAMPLES_PER_CORE = 40
 """The C engine plans faster than an H100 with fewer samples per CPU core than this. Measured on 16 cores, the
@@ -65,12 +64,7 @@ def find_device(device: str | None) -> wp.Device:
 
 
 def engine_name(engine: str | EngineFactory, device: str | wp.Device | None) -> str:
-    """Return the name of an engine; "auto" becomes "warp" on a CUDA device and "mujoco" on the CPU.
-
-    Args:
-        engine: A name, "auto", or an engine class or factory.
-        device: A device or its name; this machine need not have the device.
-    """
+    """Return the name of an engine; "auto" becomes "warp" on a CUDA device and "mujoco" on the CPU."""
     if callable(engine):
         return str(getattr(engine, "name", getattr(engine, "__name__", engine)))
     if engine == "auto":
@@ -121,8 +115,7 @@ def bytes_per_world(
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """Return the options to change for an environment with few worlds, such as that of an evaluation.
 
-    On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds. With the engine "auto", few
-    worlds therefore run on the C engine.
+    On a GPU, few worlds take nearly as long as thousands. With the engine "auto", they therefore run on the C engine.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 
@@ -130,7 +123,7 @@ def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device 
 def options_for_plant(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
     """Return the options to change for a world that a planner controls in real time.
 
-    On a GPU, the world's steps would wait for the planner's launches. The world therefore runs on the C engine.
+    On a GPU, the world's steps would wait for the planner's launches.
     """
     name = device.alias if isinstance(device, wp.Device) else device
     on_gpu = engine in ("auto", "warp") and find_device(name).is_cuda
@@ -141,17 +134,9 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the options to change for a planner's worlds.
+    """Return the options to change for a planner's worlds, one for each sample.
 
-    With engine="auto" on a GPU, the engine depends on the number of samples.
-
-    Args:
-        engine: The requested engine.
-        device: The requested device.
-        nthread: Number of threads of the C engine; None for all cores.
-        samples: Number of samples, each in a world.
-        spec: A function that returns the planner's model; called only if the choice depends on the noslip solver.
-        solver: The option ``solver`` of the planner's physics.
+    With engine="auto" on a GPU, the engine depends on the number of samples and on the noslip solver.
 
     Raises:
         ValueError: This machine has no such device.
@@ -211,6 +196,5 @@ def _options_of(factory: EngineFactory) -> list[str] | None:
 
 
 def _model_name(model: mujoco.MjModel) -> str:
-    """Return the model's name; empty if its file has none."""
     name = model.names[: model.names.index(b"\0")].decode(errors="replace")
     return "" if name == "MuJoCo Model" else name

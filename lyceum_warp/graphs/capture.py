@@ -23,7 +23,6 @@ from lyceum_warp.support.arrays import part_of_worlds
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
-"""Functions to call in order."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,9 +99,9 @@ class Graphs:
 SECONDS_A_THREAD = 5e-4
 """Minimum work per thread in seconds; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Number of timed calls. Only the fastest call counts, because other programs may slow some calls down."""
+"""Number of timed calls. Only the fastest counts, because other programs may slow calls down."""
 _CAPTURING = threading.RLock()
-"""Controllers and viewers use environments in separate threads, but only one thread may capture at a time."""
+"""Only one thread may capture at a time, but controllers and viewers use environments in separate threads."""
 separate_captures()
 separate_tiles()
 
@@ -126,8 +125,8 @@ def capturing() -> Iterator[None]:
 class _Graph:
     """Captures functions that consist of launches, in one graph, or in one graph per thread if they take long.
 
-    The first call runs the functions directly, and loads their modules. The second call captures the functions. If
-    there are workers, the first replays are timed, and the shortest time determines how many threads share the work.
+    The first call runs the functions directly, and loads their modules. If there are workers, the first replays are
+    timed, and the shortest time determines how many threads share the work.
     """
 
     def __init__(

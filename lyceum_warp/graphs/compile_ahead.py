@@ -33,11 +33,8 @@ class Built:
 def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> Built:
     """Compile the uncached kernels that a function launches, and report progress on stderr.
 
-    Args:
-        function: Function that consists of launches. It runs without its kernels, so its arrays may contain garbage
-            afterwards.
-        device: Device on which the kernels will run.
-        purpose: Purpose of the kernels for the report, such as "hopper".
+    The function runs without its kernels, so its arrays may contain garbage afterwards. ``purpose``, such as "hopper",
+    is part of the report.
     """
     with rehearse() as rehearsal:
         function()
@@ -53,7 +50,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
             for future in concurrent.futures.as_completed(futures):
                 report(*future.result())
         finally:
-            pool.shutdown(cancel_futures=True)  # after an error or Ctrl-C
+            pool.shutdown(cancel_futures=True)
     return Built(len(missing), len(wanted) - len(missing), time.perf_counter() - start)
 
 
@@ -64,7 +61,6 @@ def _load(module: Any, block: int, device: wp.Device) -> tuple[str, float]:
 
 
 def _block(device: wp.Device, block: int | None) -> int:
-    """Get the block size of a launch, which is always 1 on the CPU."""
     return 1 if device.is_cpu else block or 256
 
 

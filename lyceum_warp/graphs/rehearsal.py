@@ -20,7 +20,7 @@ class Rehearsal:
         """Modules and block sizes (None for Warp's default) in launch order."""
 
     def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
-        """Add a kernel's module to the list."""
+        """List a kernel's module."""
         # empty launches load no module, and generic kernels are compiled for argument types
         if np.prod(dim) and not kernel.is_generic:
             self.modules[kernel.module, block_dim] = None

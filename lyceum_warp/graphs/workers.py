@@ -14,8 +14,6 @@ class Workers:
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
         """Call functions that release Python's GIL in parallel, and wait until all functions have returned.
 
-        The caller's thread runs the first of at most ``nthread`` functions.
-
         Raises:
             BaseException: Any exception that a function raised; all other functions have ended.
         """

@@ -8,7 +8,6 @@ from mujoco.batch import Batch, SimulationError
 log = logging.getLogger(__name__)
 
 _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
-"""Errors are counted as warnings of this type."""
 
 
 class ErrorsAsWarnings:

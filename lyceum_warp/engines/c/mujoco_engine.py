@@ -42,20 +42,16 @@ from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.validate import whole_number
 
 _BATCH_BYTES = 150
-"""The bytes that ``Batch`` stores per world for warnings, a status and an error message."""
+"""The bytes that ``Batch`` stores per world."""
 
 _MOST_MASKS = 16
-"""The maximum number of masks whose NumPy views are cached; an environment has fewer masks."""
 
 
 class MujocoEngine(Engine):
     """Steps worlds in float64 in ``mujoco.batch.Batch``, and copies the batch's fields to float32 arrays.
 
-    Args:
-        model, nworld, fields, dynamics: See ``Engine``.
-        device: Must be the CPU.
-        initial: The initial state for ``reset``, rounded to float32; None for the model's initial state.
-        nthread: Threads of the pool; 0 for all cores.
+    The device must be the CPU, and the initial state is rounded to float32. The number of threads is ``nthread``; 0
+    means all cores.
 
     Raises:
         ValueError: The device is not the CPU, or ``nthread`` is negative.
@@ -106,15 +102,14 @@ class MujocoEngine(Engine):
         computed = [field for field in self._derived if field.refresh > Stage.NONE]
         positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
         self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether a separate call of ``forward`` must compute derived fields after the substeps."""
+        """Whether a separate call of ``forward`` computes derived fields."""
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
         """The fields to copy before the call of ``forward``, because the call may use the MjData of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """The fields of ``_before_stage`` that ``forward`` computes in part, such as the sensors of early stages."""
+        """The fields of ``_before_stage`` that ``forward`` computes in part, such as early sensors."""
         self._last = [field for field in shown if field not in self._before_stage]
-        """The fields to copy at the end of a step."""
         # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
         self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
@@ -134,7 +129,7 @@ class MujocoEngine(Engine):
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """Return a mask's memory as a NumPy array, cached because creating a view takes longer than reading it."""
-        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so the id stays unique
+        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive
             return kept[1]
         view: np.ndarray = mask.numpy()
         if len(self._masks) < _MOST_MASKS:
@@ -148,7 +143,7 @@ class MujocoEngine(Engine):
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
-                continue  # rounding would shift the time stamps of delayed sensor samples
+                continue  # this would shift the time stamps of delayed sensors
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
@@ -217,7 +212,7 @@ class MujocoEngine(Engine):
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy the masked worlds' fields into float32 arrays; ``early`` skips sensors of the acceleration stage."""
-        with np.errstate(over="ignore"):  # a world with a fault may hold numbers outside the range of float32
+        with np.errstate(over="ignore"):  # in worlds with faults
             for field in fields:
                 target, source = self._copies[field.name]
                 where: Any = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))

@@ -30,13 +30,8 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 class NativeRollout:
     """Rolls out the worlds of a batch, and leaves the final states in the batch.
 
-    Args:
-        batch: The worlds; ``bind`` must not have been called on this batch.
-        steps: Number of steps in the horizon.
-        nstep: Number of substeps in a step.
-        fields: The fields to copy into buffers.
-        snapshots: The fields that follow the integration state in a state vector.
-        dynamics: The model fields that follow the snapshots.
+    ``bind`` must not have been called on this batch. The snapshots and then the model fields follow the integration
+    state in a state vector.
     """
 
     def __init__(
@@ -57,11 +52,10 @@ class NativeRollout:
         self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
-        """The columns of the state vector that hold a field's initial value."""
         self.final: dict[str, np.ndarray] = {}
-        """The final values of the fields that a forward pass must compute."""
+        """The results of a forward pass for the final states."""
         self.rows: dict[Any, np.ndarray] = {}
-        """Buffers of the state's components and the derived fields, with one row per substep."""
+        """The native rollout's outputs, with one row per substep."""
         column = batch.nstate
         for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
@@ -85,10 +79,7 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, *given: Any) -> None:
-        """Roll out the worlds with the state, the controls and the buffers of ``Engine.rollout``.
-
-        The final states and the warnings stay in the batch.
-        """
+        """Roll out the worlds with the arguments of ``Engine.rollout``. Warnings stay in the batch."""
         if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
             self._given, (start, held, arrays) = given, given
             # making views of Warp arrays takes longer than filling them
@@ -106,7 +97,7 @@ class NativeRollout:
         if self.stage > Stage.NONE:
             with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
-        with np.errstate(over="ignore"):  # a world with a fault may hold numbers outside the range of float32
+        with np.errstate(over="ignore"):  # in worlds with faults
             for field in self.fields:
                 self._copy(field, state, buffers[field.name])
 
@@ -114,7 +105,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the row of the first substep holds the values before the step
+            # the first substep's row is from before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

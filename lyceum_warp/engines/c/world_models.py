@@ -35,13 +35,8 @@ class WorldModels:
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
-        """Write values, and recompute the constants of the worlds in which any value changed.
-
-        Args:
-            values: The values of model fields by name, (nworld, size) float32.
-            mask: The mask of the worlds; None for all worlds.
-        """
-        if mask is not None and 1 not in mask.tobytes():  # faster than mask.any()
+        """Write values, and recompute the constants of the worlds in which any value changed."""
+        if mask is not None and 1 not in mask.tobytes():  # fast
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]

@@ -16,13 +16,7 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. One callback runs after collision detection, the other between the creation and the solution of constraint
-    rows.
-
-    Args:
-        model: MuJoCo Warp's model, whose callbacks this class sets.
-        data: MuJoCo Warp's data.
-        between: A function that each callback calls before it sorts.
+    rows. Each callback calls ``between`` before it sorts.
 
     Raises:
         ValueError: The model has flexes, or MuJoCo Warp's contacts have an unknown field.
@@ -46,7 +40,7 @@ class CanonicalOrder:
         for name in order.Rows.vars:  # type: ignore[attr-defined]
             array = getattr(data.efc, name)
             setattr(self._rows, name, array)
-            if name == "J" and model.is_sparse:  # entries of a sparse Jacobian do not move
+            if name == "J" and model.is_sparse:
                 array = wp.empty((0, 0, 0), dtype=float)
             elif name != "jtdaj_nblock":
                 array = wp.empty_like(array)

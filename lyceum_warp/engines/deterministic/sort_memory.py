@@ -37,7 +37,7 @@ class Scratch(Reserve):
 
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
-        """Return a context in which captured launches allocate from the shared memory."""
+        """Return a context in which captured launches use this memory."""
         self.open()
         with wp.ScopedAllocator(self.device, self):
             yield
@@ -60,22 +60,15 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """The scratch memory that worlds need, and the largest possible number of worlds."""
+    """The scratch bytes of any number of worlds, and the largest number of worlds for which Warp can make buffers."""
 
     fixed: int
-    """The bytes that do not depend on the number of worlds."""
     each: int
-    """Bytes per world."""
     most: int
-    """The largest number of worlds whose buffers Warp can make."""
 
     @classmethod
     def probe(cls, capture: Callable[[int], Scratch]) -> "ScratchSizes":
-        """Extrapolate from the scratch memory measured for two numbers of worlds.
-
-        Args:
-            capture: A function that captures a step of a number of worlds, and returns the scratch memory.
-        """
+        """Extrapolate from the scratch memory measured for two numbers of worlds."""
         few, more = (capture(nworld) for nworld in _PROBED)
         fixed, each = _line(few.peak, more.peak)
         fixed_buffer, each_buffer = _line(few.largest, more.largest)
@@ -87,6 +80,5 @@ class ScratchSizes:
 
 
 def _line(few: int, more: int) -> tuple[int, int]:
-    """Compute fixed bytes and bytes per world from the bytes for two numbers of worlds."""
     each = -(-(more - few) // (_PROBED[1] - _PROBED[0]))
     return max(0, few - _PROBED[0] * each), each

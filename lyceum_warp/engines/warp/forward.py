@@ -19,7 +19,6 @@ from lyceum_warp.support.arrays import launch_rows
 from lyceum_warp.support.upstream import forward_functions
 
 Part = Callable[[mjw.Model, mjw.Data], None]
-"""A part of a forward pass, for every world of a Data."""
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
 """The first parts of substeps and forward passes, which depend only on positions."""
@@ -36,7 +35,7 @@ def forward(model: mjw.Model, data: mjw.Data) -> None:
 
 
 def inertia(model: mjw.Model, data: mjw.Data) -> None:
-    """Compute the inertia matrix, including the armature of tendons and of their actuators."""
+    """Compute the inertia matrix, with the armature of tendons and of their actuators."""
     mjw.crb(model, data)
     forward_functions()["smooth"].tendon_armature(model, data)
 
@@ -196,13 +195,6 @@ class PartialForward:
 
     A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. The masked worlds' states
     are therefore copied into the group, in as many batches as necessary.
-
-    Args:
-        rows: Holds MuJoCo Warp's model of the group, and copies the model fields of the group's worlds into it.
-        data: MuJoCo Warp's data of all worlds.
-        group: MuJoCo Warp's data of the group.
-        states: A buffer for the integration states of all worlds, (nworld, integration size), float32.
-        static: Computes the poses of static geoms, which a forward pass does not compute.
     """
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
@@ -217,13 +209,7 @@ class PartialForward:
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
     ) -> None:
-        """Compute the masked worlds' fields, by Warp launches only.
-
-        Args:
-            mask: The mask of the worlds, (nworld,) bool.
-            forward: A function that computes the fields of a Data.
-            targets: Destinations of the fields (nworld, ...) by their names in MuJoCo Warp's Data.
-        """
+        """Compute fields in the masked worlds by ``forward``, and copy them into the targets, by Warp launches only."""
         group = self._group
 
         def work() -> None:
@@ -246,11 +232,11 @@ class PartialForward:
 
         with wp.ScopedDevice(self._device):
             self._run(mask, work)
-            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # the first column of a state is the time
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # the time
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
-        """Call ``work`` for each group of masked worlds, with their states and model fields in the scratch worlds."""
+        """Call ``work`` for each group of masked worlds."""
         model, group = self._rows.model, self._group
 
         def turn() -> None:

@@ -51,13 +51,8 @@ def group_size(nworld: int, device: wp.Device) -> int:
 class Turns:
     """Copies the masked worlds into a group and back, one group at a time, by Warp launches only.
 
-    Args:
-        nworld: Number of worlds.
-        size: Number of worlds in the group.
-        device: The device of the worlds.
-        loop: Whether ``run`` loops over as many groups as the mask needs. If False, the group must have room for every
-            world, and ``run`` processes it even if the mask is empty. Deterministic launches require ``loop=False``,
-            because they cannot allocate within a graph's loop.
+    If ``loop`` is False, the group must have room for every world. Deterministic launches require this, because they
+    cannot allocate within a graph's loop.
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
@@ -94,22 +89,21 @@ class Turns:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
 
     def give(self, source: wp.array, target: wp.array) -> None:
-        """Copy the group's rows, (size, ...), back into the rows of all worlds, (nworld, ...)."""
+        """Copy the group's rows (size, ...) back into the rows of all worlds (nworld, ...)."""
         rows = flat(source)
         if rows.size:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the bits of the group's rows, (size,), to the bits of the same worlds, (nworld,)."""
+        """Add the bits of the group's rows to the bits of the same worlds."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
 class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph allocates from the device, counts the bytes, and reserves the same number. A graph allocates
-    from the reserve. Graphs share the reserve, because they never run at the same time. On the CPU, nothing is
-    reserved.
+    A run outside a graph counts the bytes, and reserves them. Graphs share this memory, because they never run at the
+    same time.
     """
 
     def __init__(self, device: wp.Device) -> None:
@@ -123,7 +117,7 @@ class Arena(Reserve):
 
     @contextlib.contextmanager
     def __call__(self) -> Iterator[None]:
-        """Return a context for launches: captures use the reserved memory; other runs count and reserve the bytes."""
+        """Return a context for launches; captures use the reserved memory."""
         if self.device.is_cpu:
             yield
             return

@@ -25,13 +25,12 @@ _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
 elements, so a probe may miss many contacts. The second pair is MuJoCo Warp's default."""
 
-_FIRST = 32
-"""The maximum number of worlds whose initial states are checked."""
+_FIRST = 32  # number of worlds that are checked
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
 _CONTACTS = set("geom_margin geom_gap geom_size geom_pos geom_quat pair_margin pair_gap body_pos body_quat".split())
-"""Model fields that affect the number of constraints or contacts and may be randomized."""
+"""Model fields that affect the number of constraints or contacts."""
 
 _known: dict[str, tuple[int, int]] = {}
 
@@ -79,13 +78,7 @@ def warn_of_little_room(
 ) -> None:
     """Log a warning if worlds start with more contacts or constraints than the capacities allow.
 
-    Args:
-        model: The compiled model.
-        states: Integration states of worlds, (n, integration size); the first 32 are checked.
-        fields: The model fields that differ between worlds.
-        values: The values of ``fields`` by name, (n, ...).
-        nconmax: Contact capacity per world, on average.
-        njmax: Constraint capacity of each world.
+    ``values`` are the model fields of the worlds. ``nconmax`` is an average over the worlds.
     """
     own = copy.copy(model)
     data = mujoco.MjData(own)
@@ -123,7 +116,6 @@ def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> muj
 
 
 def _inactive(model: mujoco.MjModel) -> int:
-    """Count the constraint rows that inactive equality constraints would add."""
     every = copy.copy(model)
     every.eq_active0[:] = True
     return _equalities(every) - _equalities(model)

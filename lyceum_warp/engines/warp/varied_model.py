@@ -43,7 +43,7 @@ OUTPUTS = {
     ),
     Constants.INERTIAL: "dof_invweight0 body_invweight0 tendon_invweight0 actuator_acc0".split(),
 }
-"""The constants that ``mujoco_warp.set_const`` computes, by group."""
+"""The constants that ``mujoco_warp.set_const`` computes."""
 
 _GEOM_BOUNDS = {"geom_aabb", "geom_rbound"}
 
@@ -106,16 +106,10 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """Make the model of a group of worlds.
+    """Make the model of a group of worlds, which has its own rows of the given fields.
 
-    The group's model has its own rows of the fields that differ between worlds, and shares all other fields. With the
-    model of all worlds, MuJoCo Warp would read row w for world w of the group, which belongs to another world.
-
-    Args:
-        whole: The model of all worlds.
-        names: The fields with one row per world.
-        size: Number of worlds in the group.
-        own: Additional fields to copy, because the group writes them.
+    With the model of all worlds, MuJoCo Warp would read row w for world w of the group, which belongs to another world.
+    The group also gets copies of the fields ``own``, because it writes them.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
@@ -143,7 +137,7 @@ class ModelRows:
                 turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
-        """Copy the group's rows of the given fields back into the model of all worlds."""
+        """Copy the group's rows of the given fields back."""
         for name in names:
             if name in self._pairs:
                 source, group = self._pairs[name]
@@ -161,16 +155,8 @@ class ModelConstants:
     """Recomputes constants in the worlds whose fields changed since the last call.
 
     The constants are computed in a small group of worlds with a separate Data, because ``mujoco_warp.set_const``
-    overwrites the kinematics.
-
-    Args:
-        model: The compiled model.
-        put: MuJoCo Warp's model, with one row per world in the fields and in the derived constants.
-        fields: The fields that differ between worlds and from which constants are derived.
-        static: The static geoms, around which tendons may wrap; ``mujoco_warp.set_const`` does not compute their poses.
-        nworld: Number of worlds.
-        device: The device of the worlds.
-        loop: See ``Turns``.
+    overwrites the kinematics. Tendons may wrap around static geoms, whose poses ``mujoco_warp.set_const`` does not
+    compute.
     """
 
     def __init__(

@@ -289,7 +289,7 @@ class WarpEngine(Engine):
 
     def _forward_group(self, model: mjw.Model, group: mjw.Data) -> None:
         self._forward(None, self.reset_stage, group, model)
-        self._forward(self._shared, self.reset_stage)  # the next step skips these parts
+        self._forward(self._shared, self.reset_stage)
 
     def _refresh(self, mask: wp.array) -> None:
         with self._histories_kept():
@@ -304,7 +304,7 @@ class WarpEngine(Engine):
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """Make a forward pass of the restarting worlds alone; return None if this is impossible or saves nothing."""
+        """Make a forward pass of the restarting worlds alone, unless this is impossible or saves nothing."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -339,7 +339,6 @@ class WarpEngine(Engine):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Return a context that explains how to fix a model that MuJoCo Warp does not support."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
