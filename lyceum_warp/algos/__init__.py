@@ -1,1 +1,1 @@
-"""Learn by NPG, PPO or SAC, and plan by sampling: one module for each algorithm, and modules that they share."""
+"""Learn by NPG, PPO or SAC, and plan by sampling."""

@@ -1,13 +1,13 @@
 """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
 CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). The
-noise has a standard deviation s_t for each element of the plan. The n best samples (the elites) u_t^1, ..., u_t^n
+noise has a standard deviation s_t for each element of the plan. The n best samples u_t^1, ..., u_t^n, the elites,
 determine the next plan and the next noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-The covariance is diagonal, as in hydrax, judo and MuJoCo MPC. If the noise is smoothed over time, s_t is its standard
-deviation before smoothing: the elites' standard deviation is divided by ``spread``.
+The covariance is diagonal, as in hydrax, judo and MuJoCo MPC. Smoothing changes the standard deviation of the noise by
+the factor ``spread``. Therefore s_t is divided by this factor.
 """
 
 from collections.abc import Sequence
@@ -42,7 +42,13 @@ class EliteWeights(PlanUpdate):
 
 
 class CrossEntropy(EliteWeights):
-    """Update plans by CEM; ``elites`` is the number of best samples, and ``smoothing`` has the weights (b0, b1, b2)."""
+    """Update plans by CEM.
+
+    Args:
+        elites: Number of best samples.
+        min_noise: Lower limit of the standard deviations: one number, or one number for each action.
+        smoothing: Weights (b0, b1, b2) that smooth the noise over time.
+    """
 
     adapts_noise = True
 
@@ -75,10 +81,10 @@ class CrossEntropy(EliteWeights):
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
-    """Compute the standard deviation of smoothed standard normal noise in each step, (count,).
+    """Compute the standard deviation of smoothed noise in each step, (count,).
 
-    The smoothed noise is e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). Its variance v_t, and the covariance c_t of e_t and
-    e_(t-1), satisfy
+    Standard normal noise n_t is smoothed to e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). The variance v_t of e_t, and the
+    covariance c_t of e_t and e_(t-1), satisfy
 
         v_t = b0^2 + b1^2 v_(t-1) + b2^2 v_(t-2) + 2 b1 b2 c_(t-1),    c_t = b1 v_(t-1) + b2 c_(t-1)
     """

@@ -32,7 +32,8 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""For each activation: an in-place f(x), and g(d, y), which multiplies d by the derivative at the output y = f(x)."""
+"""For each activation: a function that applies it in place, and a function that multiplies by its derivative in
+place."""
 
 _FEW = 2**18  # use NumPy, whose calls have less overhead than torch's, up to this number of multiplications
 
@@ -117,7 +118,7 @@ class DensePasses:
         """Compute J^T u at the last inputs for u (rows, outputs), and write it into ``out``."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # longer rows make the product faster
+            # the product with the longer rows is faster
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:

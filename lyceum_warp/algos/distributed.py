@@ -1,4 +1,4 @@
-"""Distribute learning over processes, each of which steps its own worlds and applies the same update.
+"""Distribute learning over processes, which step different worlds and apply the same updates.
 
 Every process generates the random numbers of all worlds, and uses those of its own worlds. The number of processes
 therefore affects only the rounding of sums.
@@ -99,7 +99,10 @@ class Team:
 
     @torch.no_grad()
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
-        """Broadcast tensors from rank 0, in place. On different hardware, rounding errors would accumulate."""
+        """Broadcast tensors from rank 0, in place.
+
+        Processes on different hardware would drift apart by rounding errors.
+        """
         if self.size > 1:
             tensors = list(tensors)
             flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -130,7 +133,7 @@ class Team:
 
 
 class Captured:
-    """Calls a function of torch operations and communication, on a GPU as a CUDA graph.
+    """Calls a function of torch operations and communication. On a GPU, a CUDA graph replays the function.
 
     The function must update tensors in place, because a graph stores addresses. The first call runs the function
     directly.

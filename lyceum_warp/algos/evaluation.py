@@ -19,7 +19,7 @@ MEAN_SEED = 2**31 - 1
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed from a training seed, so that their initial states differ."""
+    """Derive an evaluation's seed from a training seed. Their initial states differ."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -133,7 +133,7 @@ ENDLESS_STEPS = 1000
 
 
 def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
-    """Copy an environment with ``nworld`` worlds, other changes of ``Env.replicate``, and a horizon."""
+    """Copy an environment for an evaluation; for ``changes``, see ``Env.replicate``."""
     endless = {} if env.horizon else {"horizon": ENDLESS_STEPS}
     return env.replicate_few(nworld, **(endless | changes))
 

@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Columns of a task's metric in metrics.csv: its sum over an episode, and its mean over steps."""
+"""Prefixes of columns in metrics.csv, for a metric's sum over an episode and for its mean over steps."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 
@@ -155,7 +155,7 @@ class Learner(abc.ABC):
     def best_by(self) -> str:
         """The field of ``Iteration`` that selects the best policy and is compared with a run's target return.
 
-        "mean_return" is the return of the policy after the update, without noise; "return_mean" is the return of the
+        "mean_return" is the return of the policy after the update, without noise. "return_mean" is the return of the
         policy before the update, with noise. The default is "mean_return", or "return_mean" if the configuration has
         ``mean_every=0``.
         """

@@ -11,7 +11,7 @@ from lyceum_warp.algos.distributed import Captured, Team
 Samples = Mapping[str, torch.Tensor]
 
 _SURE = 6.0
-"""Room in a process's buffer beyond the mean number of samples, in standard deviations."""
+"""A process's buffer has room for this many standard deviations more than the mean number of its samples."""
 
 
 def room(batch: int, team: Team) -> int:
@@ -23,9 +23,9 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes, so the number of one process's samples in a mini-batch is
-    random. Each process copies its samples into a buffer of fixed size, padded with samples of weight 0. Samples that
-    do not fit are dropped.
+    The mini-batches do not depend on the number of processes. A process therefore has a different number of samples in
+    each mini-batch. It copies them into a buffer of fixed size, padded with samples of weight 0. Samples that do not
+    fit are dropped.
 
     ``learn`` gets this process's samples and their weights, (samples,). The weights of all processes sum to 1. On a
     GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.
@@ -52,7 +52,7 @@ class Minibatches:
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
-        if self.room < self.batch:  # this process's samples first
+        if self.room < self.batch:  # put this process's samples first
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
             places, own = places.gather(1, first), own.gather(1, first)
         self.order.copy_(places.flatten())

@@ -69,7 +69,7 @@ class FisherProduct:
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:
-            # this term is not a sum over samples, so each process adds an equal share
+            # this term is not a sum over samples, so each process adds a share
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 

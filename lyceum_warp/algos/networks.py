@@ -29,7 +29,7 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
     """Check that a fully connected network with layers of the given sizes fits into memory.
 
     Raises:
-        ValueError: The weights do not fit into memory. The message contains ``arguments``.
+        ValueError: The weights do not fit into memory.
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:
@@ -46,7 +46,7 @@ def mlp(
 ) -> nn.Sequential:
     """Make a fully connected network with Glorot-uniform weights and zero biases.
 
-    ``sizes`` includes input and output. ``last_scale`` is a factor on the last layer's initial weights.
+    ``sizes`` includes the input and the output. ``last_scale`` is a factor on the last layer's initial weights.
 
     Raises:
         ValueError: The activation is unknown.

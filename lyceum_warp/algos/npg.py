@@ -40,7 +40,7 @@ _SHORTER = 4
 """Maximum number of times that NPG shortens a step."""
 
 _LARGEST = 1e30
-"""Limit of rewards, because an episode's sum would overflow float32. ~* # the limit is met, so stop early ||"""
+"""Rewards are clipped to this limit, so that the sum of an episode fits into float32."""
 
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # without waiting for a device or another process
+        # needs no wait for a device or another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -271,7 +271,7 @@ class NPG(OnPolicyLearner):
                 square = (old_mean - mean(obs)).square()
                 kl = 0.5 * (square * torch.exp(-2 * self.policy.log_std)).sum(-1).mean()
                 kl = self.team.sum(kl) / self.team.size
-                if self._reads_numbers and kl <= limit:  # the limit is met, so stop early
+                if self._reads_numbers and kl <= limit:
                     break
                 part = torch.where(kl <= limit, part, part * (limit / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5))
             normalizer.interpolate(before, after, part)
@@ -298,9 +298,9 @@ class NPG(OnPolicyLearner):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Add a step to the policy's parameters, and shorten the step if the KL divergence exceeds its limit.
 
-        The step's length was computed from the Fisher information, which approximates the KL divergence only to second
-        order and on a subset of the samples. If a step is still too long after four reductions, or is not finite, the
-        policy does not change. The host does not wait for the device.
+        The Fisher information approximates the KL divergence only to second order, and on a subset of the samples. If a
+        step is still too long after four reductions, or is not finite, the policy does not change. The host does not
+        wait for the device.
 
         Returns:
             Whether the step and the divergence are finite; the fraction of the step that was applied; and the KL
@@ -328,7 +328,7 @@ class NPG(OnPolicyLearner):
         fraction = finite.float()
         for _ in range(_SHORTER):
             kl = measured(fraction)
-            if self._reads_numbers and kl <= limit:  # the limit is met, so stop early
+            if self._reads_numbers and kl <= limit:
                 break
             factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)

@@ -60,7 +60,7 @@ class UpdateNumbers(NamedTuple):
     step_fraction: Scalar
     gradient_norm: Scalar
     std_mean: Scalar
-    # of this process's samples, unlike the others
+    # of this process only
     reward: Scalar
     faults: Scalar
     outliers: Scalar
@@ -133,7 +133,7 @@ def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence
 
 
 def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute the statistics of the value function; each process has ``samples`` samples."""
+    """Compute the statistics of the value function, with ``samples`` samples from each process."""
     n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
     _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2

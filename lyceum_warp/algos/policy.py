@@ -83,7 +83,7 @@ class GaussianPolicy(Normalized):
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:
-        """Make the policy symmetric: average its actions with those for mirrored observations, mirrored back.
+        """Make the policy symmetric, by averaging over each observation and its mirror image.
 
         Args:
             reflections: The reflections of ``obs`` and ``action`` (``algos.symmetry.reflections``).

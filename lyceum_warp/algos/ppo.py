@@ -325,10 +325,7 @@ class PPO(OnPolicyLearner):
             self._losses += self._sums[-3:]
 
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
-        """Append the mirror images of samples.
-
-        An image has the same density under the mirrored policy as the original sample under the policy.
-        """
+        """Append the mirror images of samples. An image keeps the density of its original."""
         assert self._mirror is not None
         images = dict(samples)
         for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
@@ -362,7 +359,7 @@ class PPO(OnPolicyLearner):
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
-        """Get the returns of the episodes that ended in all processes, ordered by step."""
+        """Get the returns of the ended episodes of all processes, ordered by step."""
         ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
         ended = self.team.gather(ended.T).T
         found: list[float] = ended[~ended.isnan()].tolist()

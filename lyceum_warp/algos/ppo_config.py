@@ -29,16 +29,16 @@ class PPOConfig:
     epochs: int = 5
     """Number of passes over an iteration's samples."""
     minibatches: int = 4
-    """Number of mini-batches of equal size per epoch. The remaining samples are not used."""
+    """Number of mini-batches per epoch, all of the same size. Samples that are left over are not used."""
     gamma: float = 0.99
     """Discount factor."""
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1. If clip_value_loss is set, it is also the range of values
-    around the old values."""
+    """Clipping range of the probability ratio around 1. With clip_value_loss, predicted values are clipped to the same
+    range around the old predictions."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of the errors of the prediction and of the clipped prediction."""
+    """Whether the value loss is the larger of two errors: of the prediction and of the clipped prediction."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01

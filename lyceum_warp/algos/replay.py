@@ -88,7 +88,7 @@ class Replay:
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
-        # with only two tensors, sampling needs few kernels
+        # two tensors, so that sampling needs few kernels
         self._before = torch.zeros(steps, n, sum(sizes) + nact, device=device)
         self._after = torch.zeros(steps, n, sum(sizes), device=device)
         self.reward = torch.zeros(steps, n, device=device)
@@ -114,7 +114,7 @@ class Replay:
         """Step the environment, and store the transition of every world.
 
         Args:
-            action: Actions to copy into ``env.action`` before the step, (nworld, nact).
+            action: Actions, (nworld, nact), by default those in ``env.action``.
 
         Raises:
             ValueError: The action has the wrong shape or type.
@@ -233,7 +233,7 @@ class Replay:
 
 
 def default_capacity(env: Env, processes: int = 1) -> int:
-    """Compute the default capacity of a replay buffer, in transitions, if each process stores an equal part."""
+    """Compute the default capacity, in transitions, of each process's replay buffer."""
     wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
     return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 

@@ -48,7 +48,7 @@ class Rollout:
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     step: torch.Tensor
-    """Number of steps since the reset, before each step, (steps, nworld)."""
+    """Number of steps between the reset and each step, (steps, nworld)."""
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
@@ -209,8 +209,7 @@ class Rollout:
     def explain_not_finite(self) -> str:
         """Describe in one sentence the first number that is infinite, NaN or too large for float32, and a remedy.
 
-        A task's rewards and observations can be too large, but never infinite or NaN, because the environment treats
-        such values as faults.
+        The environment treats infinite or NaN rewards and observations as faults, so only large ones occur.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):

@@ -289,7 +289,7 @@ class SAC(Learner):
         random: dict[str, Any] = dict(generator=self.generator, device=self._index.device)
         index = torch.randint(self.replay.count * nworld * team.size, shape, **random)
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
-        # as in Minibatches, move this process's samples to the front, and drop those without room
+        # as in Minibatches, put this process's samples first, and drop those that do not fit
         if team.size > 1:
             index, own = team.locate(index, nworld)
             first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
@@ -340,10 +340,7 @@ class SAC(Learner):
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the sum of the critics' squared errors, and the mean of the critics' predictions.
-
-        ``noise`` draws the actions of the next observations, (batch, nact).
-        """
+        """Compute the sum of the critics' squared errors, and the mean of the critics' predictions."""
         group = self.value.group
         with torch.no_grad():
             action, log_prob = self.policy.sample(batch.next_obs["policy"], noise)
@@ -406,7 +403,7 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step; return the loss and the numbers, summed over all processes."""
+        """Make a gradient step, and return the sums of the loss and the numbers over all processes."""
         # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]

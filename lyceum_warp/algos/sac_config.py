@@ -76,7 +76,7 @@ class SACConfig:
     """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to reach
     it. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Limit of the absolute value of actions without bounds in the task."""
+    """Bound of the absolute values of actions, if the task sets no bounds."""
     hidden: tuple[int, ...] | None = None
     """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
     256 256."""

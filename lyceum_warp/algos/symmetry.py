@@ -41,9 +41,9 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Average actions with those for mirrored observations, mirrored back.
+        """Average each action with the mirror image of the action for the mirrored observation.
 
-        The actions for mirrored observations are then the mirror images bit for bit.
+        The actions for mirrored observations are then mirror images bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 

@@ -121,12 +121,12 @@ def transfer(
     physics: bool = True,
     progress: Callable[[int, int], object] | None = None,
 ) -> Transfer:
-    """Play and compare pairs of episodes, on both engines and with each of the task's physics options.
+    """Compare a policy's results between the engines, and between physics options, on pairs of episodes.
 
     The Warp engine is compared with the C engine, both with the environment's physics options. On the C engine, the
     task's exact physics is compared with its other sets of physics options, and with the environment's set. Both
     episodes of a pair have equal initial states, randomized model fields, pushes and commands. The intervals of returns
-    and lengths use Student's t over the pairs; the interval of the terminated fraction uses Agresti and Min's method.
+    and lengths use Student's t over the pairs. The interval of the terminated fraction uses Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
@@ -136,8 +136,8 @@ def transfer(
         margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction
             of the mean absolute return or mean length in the first simulation. For terminations, it is an absolute
             difference of fractions.
-        device: Device of the Warp engine. The default is the environment's GPU, or else another GPU, or else the CPU,
-            on which Warp's kernels may take minutes to compile.
+        device: Device of the Warp engine. The default is a GPU, preferably the environment's. Without a GPU, it is the
+            CPU, where Warp's kernels may take minutes to compile.
         warp: Whether to play episodes on the Warp engine.
         physics: Whether to play episodes with each set of physics options of the task. If False, play only with the
             environment's physics options and with the exact physics.

@@ -142,7 +142,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Set ``fault`` in the masked worlds from their states, and from overflows and warnings since the last call.
+        """Find the faults of the masked worlds since the last call, and write them into ``fault``.
 
         The method consists of Warp launches on every engine.
         """
@@ -170,10 +170,10 @@ class Engine(abc.ABC):
             raise NotImplementedError(f"the {self.name} engine does not let model fields differ between worlds")
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        """Advance only the masked worlds by ``nstep`` substeps from their committed states, and update state fields.
+        """Advance only the masked worlds by ``nstep`` substeps, and update state fields.
 
-        The time of the masked worlds is then 0, and the caller must update derived fields by ``refresh``. No bit of any
-        other world changes.
+        The time of these worlds is then 0. The caller must update derived fields by ``refresh``. No bit of any other
+        world changes.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 

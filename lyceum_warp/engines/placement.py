@@ -25,7 +25,7 @@ _ENGINES = {
 _DETERMINISTIC = "lyceum_warp.engines.deterministic.deterministic_engine", "DeterministicEngine"
 
 _SAMPLES_PER_CORE = 40
-"""The C engine plans faster than an H100 with fewer samples per CPU core than this. Measured on 16 cores, the
+"""With fewer samples per CPU core than this, the C engine plans faster than an H100. Measured on 16 cores, the
 break-even points are 27 samples per core on adroit_pen without noslip, 41 on reach and 58 on half_cheetah
 (bench/README.md)."""
 

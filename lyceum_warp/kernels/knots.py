@@ -1,9 +1,9 @@
 """Interpolate plans from spline knots, and move the knots forward in time.
 
-With K knots over a horizon of H steps, the distance between knots is H / K steps, on a grid that is fixed in time. The
-horizon moves over the grid, so the plan keeps the actions of its remaining steps. MuJoCo MPC calls this a sliding plan.
-Positions on the grid are whole numbers: knots are H units apart, and steps are K units apart. The phase is the distance
-from the last knot before the horizon to the horizon's first step, from 0 to H - 1 units.
+With K knots over a horizon of H steps, the knots are H / K steps apart. They stay fixed in time while the horizon
+moves, so the plan keeps the actions of its remaining steps. MuJoCo MPC calls this a sliding plan. Positions are whole
+numbers in units of 1 / K steps: knots are H units apart, and steps are K units apart. The phase is the distance from
+the last knot before the horizon to the horizon's first step, from 0 to H - 1 units.
 """
 
 import math

@@ -11,9 +11,9 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""Replaces an episode's index in the random streams of the noise, which then differ from the worlds' streams."""
+"""Stands for the episode in the random streams of the noise, which thus differ from the worlds' streams."""
 DRAWS = wp.constant(-3)
-"""Replaces an episode's index in the stream keys of the samples."""
+"""Stands for the episode in the stream keys of the samples."""
 
 _TILES = f"{__name__}.tiles"
 """The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,

@@ -85,7 +85,7 @@ class TaskCode:
     copy_observations: wp.Function
     finite_memory: wp.Function
     valid_model: wp.Function  # whether the model fields that the task writes are valid
-    terms: Mapping[str, wp.Function]  # of a task with terms; see ``binding.task_terms``
+    terms: Mapping[str, wp.Function]  # see ``binding.task_terms``
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed

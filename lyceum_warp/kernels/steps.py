@@ -19,7 +19,7 @@ ALL_FAULTS = wp.constant(int(FAULTS))
 EVENT = wp.constant(-2)
 """The substream from which ``event`` draws, within a step's random stream."""
 STARTUP = wp.constant(-1)
-"""Replaces an episode's index in the random stream of ``startup``."""
+"""Stands for the episode in the random stream of ``startup``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,7 +236,7 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
 
 
 UNIT = wp.constant(2.0**20)
-"""Sums over worlds are whole multiples of 1 / UNIT, so that they do not depend on the order of the worlds."""
+"""Sums over worlds are multiples of 1 / UNIT, so that they do not depend on the order of the worlds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,8 +297,7 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
     """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """For each struct, the function that makes it. The function of World takes a batch and a world's index; the
-    functions of observation structs take a row."""
+    """The functions that make the structs: of World from a batch and a world's index, of observations from a row."""
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

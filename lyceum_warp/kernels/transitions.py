@@ -19,7 +19,7 @@ NAN = wp.constant(int(Done.NAN))
 OBSERVE = wp.constant(-1)
 """The substream for observation noise, within a step's random stream. ``advance`` draws from the stream itself."""
 
-# indices of the parts of ``judge``; each observation group is one more part, from OBSERVE_FIRST
+# the parts of ``judge``; from OBSERVE_FIRST on, each observation group is a part
 ENDS = wp.constant(0)
 GAIN = wp.constant(1)
 METRICS = wp.constant(2)

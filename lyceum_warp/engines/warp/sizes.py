@@ -106,7 +106,7 @@ def warn_of_little_room(
 
 
 def _with_friction_losses(model: mujoco.MjModel, varied: Collection[str]) -> mujoco.MjModel:
-    """Copy a model, and give every joint and tendon friction loss if the task randomizes friction losses."""
+    """Copy a model, with friction loss in every joint and tendon if the task randomizes friction loss."""
     if names := _FRICTION.intersection(varied):
         model = copy.copy(model)
         for name in names:
