@@ -94,4 +94,5 @@ def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
         new = b0 * b0 + b1 * b1 * variance[-1] + b2 * b2 * variance[-2] + 2 * b1 * b2 * covariance
         covariance = b1 * variance[-1] + b2 * covariance
         variance.append(new)
+    # positive, because ``fit`` divides by these numbers
     return np.sqrt(np.maximum(variance[:count], np.finfo(np.float32).tiny))

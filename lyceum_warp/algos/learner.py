@@ -189,7 +189,7 @@ class Learner(abc.ABC):
             state["generator"] = self.generator.get_state()
         if self.replay is not None:
             state["stored"] = self.replay.stored
-        return copy.deepcopy(state)
+        return copy.deepcopy(state)  # state_dict() shares memory with the parameters
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.

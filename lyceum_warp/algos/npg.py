@@ -97,7 +97,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # needs no wait for a device or another process
+        # reading a number must not wait for a device or another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -284,7 +284,7 @@ class NPG(OnPolicyLearner):
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
             if self.team.size == 1:
                 obs = obs[subset]
-            else:  # a mask would synchronise
+            else:  # selection by a mask would synchronise
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(

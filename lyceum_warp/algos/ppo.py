@@ -116,7 +116,7 @@ class PPO(OnPolicyLearner):
                 f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
                 "worlds or fewer mini-batches"
             )
-        # with NPG's last layer near zero, the adaptive learning rate would be much too high at first
+        # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._make_mirror()
@@ -134,7 +134,7 @@ class PPO(OnPolicyLearner):
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # one tensor needs only one all-reduce
+        # with one tensor, one all-reduce suffices
         sizes = [p.numel() for p in self._parameters]
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):

@@ -88,7 +88,7 @@ class Replay:
         self.steps = steps = -(-whole_number("capacity", capacity, low=1, high=2**62) // n)
         self.nbytes = each * steps * n
         check_fit(each * steps, n, env.device, model=f"{steps} steps in a replay buffer")
-        # two tensors, so that sampling needs few kernels
+        # only two tensors, so that sampling needs few kernels
         self._before = torch.zeros(steps, n, sum(sizes) + nact, device=device)
         self._after = torch.zeros(steps, n, sum(sizes), device=device)
         self.reward = torch.zeros(steps, n, device=device)

@@ -108,7 +108,7 @@ class SquashedPolicy(Normalized):
         return mean, _LOWEST + 0.5 * (_HIGHEST - _LOWEST) * (1.0 + torch.tanh(spread))
 
     def _outputs(self, obs: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # even under autocast
+        return self.network(self.normalizer(obs)).float().chunk(2, dim=-1)  # float32 even under autocast
 
     def act(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute actions without noise, (..., nact)."""

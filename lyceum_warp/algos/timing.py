@@ -66,5 +66,5 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # waits even after an error
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # the pool waits even after an error
         yield pool.submit(function).result

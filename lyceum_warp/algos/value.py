@@ -77,7 +77,7 @@ class ValueFunction(Normalized):
         if limit != LIMIT:  # missing in old checkpoints
             self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
-        # initial predictions are equal to the mean return
+        # at first, predict the mean return
         self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))

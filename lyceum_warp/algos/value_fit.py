@@ -27,7 +27,7 @@ class ValueFit:
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # one tensor needs only one all-reduce
+        # with one tensor, one all-reduce suffices
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
         for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
             parameter.grad = part.view_as(parameter)

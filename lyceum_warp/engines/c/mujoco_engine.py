@@ -129,7 +129,7 @@ class MujocoEngine(Engine):
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """Return a mask's memory as a NumPy array, cached because creating a view takes longer than reading it."""
-        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive
+        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask, and thus its id
             return kept[1]
         view: np.ndarray = mask.numpy()
         if len(self._masks) < _MOST_MASKS:
@@ -212,7 +212,7 @@ class MujocoEngine(Engine):
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy the masked worlds' fields into float32 arrays; ``early`` skips sensors of the acceleration stage."""
-        with np.errstate(over="ignore"):  # in worlds with faults
+        with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
             for field in fields:
                 target, source = self._copies[field.name]
                 where: Any = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))

@@ -97,7 +97,7 @@ class NativeRollout:
         if self.stage > Stage.NONE:
             with ErrorsAsWarnings(batch):
                 batch.forward(stage=self.stage)
-        with np.errstate(over="ignore"):  # in worlds with faults
+        with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
             for field in self.fields:
                 self._copy(field, state, buffers[field.name])
 
@@ -105,7 +105,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the first substep's row is from before the step
+            # the first substep's row has the values before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

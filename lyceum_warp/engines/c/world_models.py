@@ -36,7 +36,7 @@ class WorldModels:
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
         """Write values, and recompute the constants of the worlds in which any value changed."""
-        if mask is not None and 1 not in mask.tobytes():  # fast
+        if mask is not None and 1 not in mask.tobytes():  # faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
         derive = self._stale[worlds]

@@ -232,7 +232,7 @@ class PartialForward:
 
         with wp.ScopedDevice(self._device):
             self._run(mask, work)
-            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # the time
+            launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # column 0 is the time
             mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:

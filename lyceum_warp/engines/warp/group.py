@@ -25,7 +25,7 @@ class Reserve:
 
     def add_block(self, size: int) -> None:
         """Allocate a block of at least ``size`` bytes."""
-        rows = aligned(max(size, 1)) // _ALIGNED  # an axis has fewer than 2**31 elements
+        rows = aligned(max(size, 1)) // _ALIGNED  # two axes, because an axis has fewer than 2**31 elements
         with wp.ScopedAllocator(self.device, self.below):
             self.blocks.append(wp.empty((rows, _ALIGNED), dtype=wp.uint8, device=self.device))
 

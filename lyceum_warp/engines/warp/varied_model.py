@@ -181,7 +181,7 @@ class ModelConstants:
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
             self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
-            # with the bits of a NaN that no computation produces, all worlds count as changed at first
+            # no computation produces a NaN with these bits, so all worlds count as changed at first
             self._applied = [wp.full_like(given, -1) for given in self._given]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)
