@@ -21,7 +21,8 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose addresses never change.
+    The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose addresses never change. A mask,
+    (nworld,) bool, selects the worlds to which a method applies.
 
     In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
     ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls

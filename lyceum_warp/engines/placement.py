@@ -30,7 +30,8 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""Further CPU cores do not count. They were not measured, and only the rollouts of a plan run on several cores."""
+"""CPU cores beyond this number do not count. They were not measured, and only the rollouts of a plan run on several
+cores."""
 
 _NOSLIP = 6
 """The noslip solver, which is slow on a GPU, raises the break-even point by this factor."""
@@ -134,7 +135,7 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the options to change for a planner's worlds, one for each sample.
+    """Return the options to change for the worlds of a planner's samples.
 
     With engine="auto" on a GPU, the engine depends on the number of samples and on the noslip solver.
 

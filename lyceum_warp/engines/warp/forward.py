@@ -91,7 +91,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""The parts that each part needs, in order. Collisions and constraints are missing. ``fwd_velocity`` includes
+"""The parts that each part needs, in order, without collisions and constraints. ``fwd_velocity`` includes
 ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
