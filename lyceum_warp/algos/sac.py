@@ -106,7 +106,9 @@ class SAC(Learner):
     """The samples of this process's worlds."""
     generator: torch.Generator
     rollout: Rollout
+    """The samples of the last iteration."""
     log_temperature: torch.Tensor
+    """Logarithm of the temperature."""
 
     def __init__(
         self,
