@@ -1,7 +1,7 @@
 """Follow a training run: show its newest policy in separate worlds.
 
-The viewer only reads the run's files. A run therefore gives the same numbers with and without a viewer. The viewer may
-run on another machine that shares the folder.
+The viewer only reads the run's files, so it does not change the training. It may run on another machine that shares
+the folder.
 """
 
 import contextlib
@@ -61,7 +61,6 @@ class Follower:
         return read_checkpoint(self.run.policy_file(), self.device, parts=("iteration", "policy"))
 
     def _stamp(self) -> tuple[int, int, int] | None:
-        """Read attributes of the policy's file that change when the file is replaced."""
         try:
             found = os.stat(self.run.policy_file())
         except OSError:
@@ -96,8 +95,8 @@ def wait_for_run(folder: Path, *, seconds: float) -> Run:
 class RunViewer:
     """Shows a run while it trains, in another process: ``with lw.RunViewer(folder): lw.train(npg, folder)``.
 
-    The process waits for the folder, and shows the run's newest policy in separate worlds on the CPU, at a lower
-    priority than the training. The viewer ends when ``close`` is called, when the ``with`` block ends, or when this
+    The viewer runs on the CPU at a lower priority than the training. It waits for the folder, and then shows the run's
+    newest policy in separate worlds. It ends when ``close`` is called, when the ``with`` block ends, or when this
     program ends. Closing the viewer's window does not end the training.
 
     Args:
@@ -108,19 +107,19 @@ class RunViewer:
     def __init__(self, folder: str | Path, **options: Any) -> None:
         self.folder = Path(folder)
         job = json.dumps({"folder": str(self.folder.absolute()), "options": options})
-        # a subprocess, because multiprocessing would import the caller's program again
+        # not multiprocessing, which would import the caller's program again
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-c", "from lyceum_warp.cli.view import attached; attached()"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, process_group=0,
         )  # fmt: skip
         threading.Thread(target=self._print, daemon=True).start()
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # if the process has already ended, it has printed the reason
+        with contextlib.suppress(OSError):  # a process that has ended has printed the reason
             self._process.stdin.write(job + "\n")
             self._process.stdin.flush()
 
     def _print(self) -> None:
-        """Print the viewer's output through this process, so that a live progress display stays below the output."""
+        """Print the viewer's output here, because a live progress display must stay below it."""
         assert self._process.stdout is not None
         for line in self._process.stdout:
             print(line, end="", flush=True)

@@ -1,6 +1,6 @@
 """Define the messages between the session process, which owns the worlds, and the window process, which draws them.
 
-Messages are pickled dataclasses. The window process never loads torch or Warp, so this module imports NumPy only.
+Messages are pickled dataclasses. This module imports only NumPy, because the window process never loads torch or Warp.
 """
 
 import dataclasses
@@ -11,7 +11,7 @@ import numpy as np
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
 WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
-"""The number of a world, or a rule that selects one; "best" and "worst" compare the returns of unfinished episodes."""
+"""The number of a world, or a rule that selects one. "best" and "worst" compare the returns of unfinished episodes."""
 
 MOST_GHOSTS = 32
 """The maximum number of other worlds, and of other episodes, that are drawn at once."""
@@ -23,7 +23,7 @@ BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 """Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""The maximum number of curve points, and of messages, in a frame that includes those of skipped frames."""
+"""The most curve points and messages in one frame, including those of skipped frames."""
 
 
 # messages to the window
@@ -31,23 +31,20 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What does not change during a session: title, model, modes, controllers, episodes and names of curves."""
+    """The constants of a session."""
 
     title: str
-    """The title of the window."""
     model: bytes
     """The model, as ``mujoco.mj_saveModel`` writes it."""
     nworld: int
     modes: tuple[Mode, ...]
-    """The available modes; the session starts in the first mode."""
+    """The available modes. The session starts in the first one."""
     controllers: tuple[str, ...]
     episodes: tuple[str, ...]
-    """The names of the saved episodes."""
     curves: tuple[str, ...]
     """The names of the live curves: "reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
-    """For a robot that the user can drive: the largest forward velocity (m/s), lateral velocity (m/s) and yaw rate
-    (rad/s)."""
+    """The largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s) that the user can command."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,13 +61,13 @@ class Pose:
 
 @dataclasses.dataclass(frozen=True)
 class Ghost:
-    """A ghost: an additional pose to draw, for example of another world."""
+    """An additional pose to draw, for example of another world."""
 
     pose: Pose
     colour: tuple[float, float, float, float] | None
-    """Red, green, blue and opacity, from 0 to 1; None for the model's own colours."""
+    """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """By how much the ghost is moved in x and y, in metres."""
+    """Shift of the ghost in x and y, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,12 +85,11 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of worlds to draw as ghosts, at most ``MOST_GHOSTS``: those with the next numbers after the displayed
-    world's."""
+    """The number of other worlds to draw, at most ``MOST_GHOSTS``."""
     grid: bool = False
-    """Whether to draw the other worlds side by side in a grid, in the model's colours."""
+    """Whether to draw the other worlds side by side in a grid."""
     episodes: int = 0
-    """The number of episodes to draw as ghosts: those after the displayed episode in the list, at the same step."""
+    """The number of other episodes to draw, at the same step."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
     plan: bool = True
@@ -107,35 +103,30 @@ class Status:
     mode: Mode
     controller: str | None
     episode: int | None
-    """Index of the episode in playback."""
     world: int
     step: int
-    """Step within the episode."""
     steps: int
-    """The length of the episode in playback; otherwise the task's horizon, or 0 if there is none."""
+    """The length of the episode in playback. Otherwise the task's horizon, or 0 without a horizon."""
     time: float
     """Simulated seconds since the start of the episode."""
     paused: bool
     speed: float
-    """The desired speed, in simulated seconds per second."""
+    """Simulated seconds per second."""
     measured_speed: float
-    """The measured speed; NaN while paused."""
+    """NaN while paused."""
     plan_ms: float
-    """The duration of the controller's last call in milliseconds; NaN before the first call."""
+    """The duration of the controller's last call in milliseconds. NaN before the first call."""
     backwards: bool
-    """Whether the playback runs backwards."""
     video: str | None
-    """The name of the current video; None if there is none."""
     ghosts: SetGhosts = SetGhosts()
-    """The ghosts that are drawn."""
     command: tuple[float, float, float] | None = None
     """The command of a walking robot: forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
-    """Whether the user drives the robot; otherwise, the task chooses the command."""
+    """Whether the user drives the robot. Otherwise the task chooses the command."""
     planner: tuple[tuple[str, float], ...] = ()
-    """The planner's settings that the user can change, as names and values."""
+    """The planner's settings that the user can change."""
     params: tuple[tuple[str, float], ...] = ()
-    """The task's parameters that the user can change, as names and values."""
+    """The task's parameters that the user can change."""
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
@@ -150,21 +141,22 @@ class Frame:
     state: np.ndarray
     """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]
-    """The world's model fields that differ from the model, by MuJoCo's names."""
+    """Model fields that differ between this world and the model."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
     """The paths of the planner's samples, (samples, points, 3), in metres."""
     best: int | None = None
-    """The index of the best sample."""
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 2 + curves). The columns are the simulated time in seconds, 1 if the episode
-    ended (otherwise 0), and a value for each curve."""
+    """New points of the curves, (points, 2 + curves).
+
+    The columns are the simulated time in seconds, 1 at the end of an episode, and a value for each curve.
+    """
     messages: tuple[str, ...] = ()
-    """New messages: why episodes ended, faults, and why commands were refused."""
+    """Why episodes ended, faults, and why commands were refused."""
     files: tuple[str, ...] = ()
-    """The absolute paths of new videos, pages and pictures, which the page offers for download."""
+    """The absolute paths of new videos, pages and pictures, for the page's download links."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:
@@ -189,9 +181,9 @@ class SetMode:
 
     mode: Mode
     controller: str | None = None
-    """The name of the controller; None keeps the current one."""
+    """None keeps the current controller."""
     episode: int | None = None
-    """The index of the episode; None keeps the current one."""
+    """None keeps the current episode."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,12 +205,12 @@ class SetSpeed:
     """Change the speed."""
 
     speed: float
-    """The speed in simulated seconds per second, from 1/16 to 16."""
+    """Simulated seconds per second, from 1/16 to 16."""
 
 
 @dataclasses.dataclass(frozen=True)
 class StepBy:
-    """Pause, and make ``steps`` steps; a negative number steps back."""
+    """Pause, and make ``steps`` steps. A negative number steps back."""
 
     steps: int
 
@@ -248,13 +240,13 @@ class Reset:
 class Perturb:
     """Push bodies, move a free body while paused, or move a mocap body at any time.
 
-    Forces act until the next ``Perturb``; forces of zero end the push.
+    Forces act until the next ``Perturb``. Forces of zero end the push.
     """
 
     forces: np.ndarray
     """Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6) float64."""
     qpos: np.ndarray | None = None
-    """Positions, (nq,) float64, which take effect only while paused."""
+    """Positions, (nq,) float64. They take effect only while paused."""
     mocap_pos: np.ndarray | None = None
     """Positions of mocap bodies, (nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
@@ -266,8 +258,7 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). If None, the task chooses the
-    commands again."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None lets the task choose again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -284,7 +275,7 @@ class SetVideo:
     """Start a video, or end it."""
 
     camera: dict[str, Any] | None
-    """The attributes of the ``mujoco.MjvCamera``; None ends the video."""
+    """The attributes of the ``mujoco.MjvCamera``. None ends the video."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -297,7 +288,7 @@ class TakePicture:
 
 @dataclasses.dataclass(frozen=True)
 class Close:
-    """End the session. Closing the page does not end the session, because the page can be opened again."""
+    """End the session. Closing the page does not end it, because the page can be opened again."""
 
 
 Command: TypeAlias = (
@@ -315,9 +306,8 @@ class Opening:
 
     scene: Scene
     host: str
-    """The address on which the page is served."""
     port: int | None
-    """The port of the page; None for the first free port from 8080."""
+    """None means the first free port from 8080."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -327,7 +317,6 @@ class Opened:
     address: str
     """The page's address with its token."""
     instructions: tuple[str, ...] = ()
-    """Lines to print."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -27,32 +27,30 @@ def view(
 ) -> "BackgroundView | None":
     """Show worlds, controllers and episodes on a page in a browser, until the user quits.
 
-    ``lw.view(env)`` shows worlds without a controller; ``lw.view(env, controllers={"policy": policy, "mppi": plan})``
-    adds controllers to switch between; ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play
-    back. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
+    For example, ``lw.view(env, controllers={"policy": policy, "mppi": plan})`` adds two controllers to switch between,
+    and ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play back. Without either, the
+    worlds move passively. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
-    controller of one world acts in a copy of the displayed world. The copy runs in real time, like the world in
+    controller of one world acts in a copy of the displayed world. The copy runs in real time, as in
     ``lw.control_async``, and all other worlds wait. Afterwards, the displayed world gets the copy's state. If ``env``
-    is one world on the CPU without automatic resets, no copy is made.
+    is one world on the CPU without automatic resets, it is not copied.
 
     Args:
         env: The worlds, on any engine and device.
         controllers: Controllers by name. A policy, such as the result of ``lw.load``, maps observations (nworld, nobs)
             to actions (nworld, nact). A controller of one world is called with a state and an observation; see
             ``lw.Controller``.
-        episodes: Episodes to play back: one, a sequence, or a mapping from names to episodes. An episode is a
-            trajectory, the file of a trajectory, or a tensor of states (steps + 1, state_space.size) in the format of
-            ``env.get_state()``.
+        episodes: One episode, a sequence, or a mapping from names to episodes. An episode is a trajectory, the file of
+            a trajectory, or a tensor of states (steps + 1, state_space.size) in the format of ``env.get_state()``.
         seed: The seed of a random reset at the start; by default there is no reset.
         paused: Whether to start paused.
-        host: The address on which the page is served. The default is the loopback address, which other machines cannot
-            reach.
+        host: The address on which the page is served. Other machines cannot reach the default, the loopback address.
         port: The port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second, and return a sequence of new messages.
-        block: Whether the call returns only when the user quits. If False, a thread steps the worlds, and the caller
-            must not use them until the view is closed. The default is False in a notebook, which then shows the page
-            and a link to it.
+        block: Whether the call returns only when the user quits. If False, a thread steps the worlds. The caller must
+            not use them until the view is closed. The default is False in a notebook, which then shows the page and
+            a link to it.
 
     Returns:
         The running view, or None if the call blocks.
@@ -84,16 +82,18 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
   link.before(frame);
 }}
 </script>"""
-"""The HTML of a notebook's output: the embedded page, and a link to the page. Only Chromium-based browsers let an
-embedded page share memory between threads, which studio needs. These browsers send the viewer's cookie only if the page
-has the same host name as the notebook."""
+"""The HTML of a notebook's output.
+
+Studio shares memory between threads. In an embedded page, only Chromium-based browsers allow this. They send the
+viewer's cookie only if the page has the notebook's host name.
+"""
 
 
 class BackgroundView:
-    """A view that steps its worlds in a thread; ``lw.view`` returns it if ``block`` is False.
+    """A view that steps its worlds in a thread. ``lw.view`` returns it if ``block`` is False.
 
-    A notebook shows the page as the output of the cell, and a link that opens the page in a separate tab. If the
-    notebook is served by another machine, or the browser is Firefox or Safari, only the link is shown.
+    In a notebook, the output of the cell is the page and a link to it. In Firefox and Safari, and in a notebook served
+    by another machine, it is only the link.
     """
 
     def __init__(self, session: Session, window: Window) -> None:
@@ -105,11 +105,11 @@ class BackgroundView:
 
     @property
     def is_open(self) -> bool:
-        """Whether it runs."""
+        """Whether the view runs."""
         return self._thread.is_alive()
 
     def close(self) -> None:
-        """End the view, and leave the worlds in their last state. A second call does nothing."""
+        """End the view, and leave the worlds in their last state."""
         self._window.close()
         self._thread.join()
 
@@ -127,7 +127,7 @@ def in_notebook() -> bool:
 
 
 def opened(scene: Scene, **place: Any) -> Window:
-    """Open a window, and print the address of its page. See ``Window``."""
+    """Open a window, and print the address of its page."""
     window = Window(scene, **place)
     for line in window.instructions:
         print(line, flush=True)

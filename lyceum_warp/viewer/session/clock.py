@@ -31,29 +31,28 @@ from lyceum_warp.viewer.session.window_process import Window
 from lyceum_warp.viz import NoVideoError
 
 _FPS = 30.0
-"""The maximum number of frames per second."""
+"""Maximum frames per second."""
 _LAG = 0.25
-"""The maximum lag of the worlds behind the wall clock, in seconds; the worlds do not catch up a longer lag."""
+"""Maximum lag of the worlds behind the wall clock, in seconds. They do not catch up a longer lag."""
 _IDLE = 0.5
-"""The seconds between two frames of a paused view in which nothing changes."""
+"""Seconds between two frames of a paused view in which nothing changes."""
 _CHECK = 0.5
-"""The seconds between two calls of the watchers."""
+"""Seconds between two calls of the watchers."""
 
 Watcher = Callable[[], Sequence[str]]
-"""A function that returns new messages; called about twice a second."""
+"""Returns new messages. It is called about twice a second."""
 
 
 class Session:
     """Show worlds in a window.
 
-    A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world controls the
-    plant, a single world that runs in real time; the session then handles commands and frames only while the plant
-    waits for its next step.
+    A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world runs in real
+    time in the plant, a single world. While the plant runs, commands and frames are handled between its steps.
 
     Args:
         env: The worlds.
         controllers: See ``lw.view``.
-        watchers: Functions that return messages; called about twice a second.
+        watchers: See ``lw.view``.
         shown: ``episodes``, ``seed`` and ``paused``; see ``Stage``.
 
     Raises:
@@ -79,7 +78,7 @@ class Session:
 
     @torch.no_grad()
     def run(self, window: Window) -> None:
-        """Run until the window is closed; close the window and the session even after an exception."""
+        """Run until the window is closed. An exception closes the window and the session."""
         self._window = window
         now = time.perf_counter()
         self._next_frame = self._next_check = now
@@ -101,7 +100,6 @@ class Session:
                     self._give_up_control(error)
 
     def _tick(self) -> None:
-        """Make the steps that are due, show a frame, and wait."""
         stage, now = self.stage, time.perf_counter()
         if stage.paused:
             self._next_step = now
@@ -123,7 +121,6 @@ class Session:
             time.sleep(min(wake - now, POLL))
 
     def _poll(self) -> None:
-        """Carry out the window's commands, and call the watchers twice a second."""
         assert self._window is not None
         if not self._window.is_open():
             self._waiting.append(Close())
@@ -138,7 +135,6 @@ class Session:
                     self.stage.frames.say(message)
 
     def _show_when_due(self, now: float) -> None:
-        """Show a frame if one is due; while nothing changes in a paused view, frames are due less often."""
         assert self._window is not None
         stage, videos = self.stage, self.stage.videos
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
@@ -159,12 +155,12 @@ class Session:
     # real time
 
     def _by_the_clock(self) -> bool:
-        """Whether a controller of one world is in use and its plant is to run in real time."""
+        """Whether a controller of one world is in use and its plant runs in real time."""
         stage = self.stage
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
     def _run_plant(self) -> None:
-        """Run the plant until the episode ends, or until the user gives a command that needs the plant's state."""
+        """Run the plant until the episode ends, or until a command needs the plant's state."""
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()
@@ -176,15 +172,13 @@ class Session:
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
-        """Update the statistics after a step of the plant."""
         self.stage.live.stepped()
         self.stage.steps += 1
-        # a plant that is late or runs fast does not wait between its steps, so nothing else calls `_work`
+        # the plant's waits call `_work`, but a late or fast plant never waits
         if time.perf_counter() - self._last_work > 1 / _FPS:
             self._work()
 
     def _work(self) -> None:
-        """Carry out commands, and show a frame."""
         self._last_work = time.perf_counter()
         self._poll()
         self._show_when_due(self._last_work)
@@ -192,7 +186,7 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Carry out a command; if it fails, show the error's message to the user.
+        """Carry out a command. If it fails, show the error to the user.
 
         A command that needs the plant's state stops a plant that runs in real time.
         """
@@ -217,9 +211,9 @@ class Session:
             stage.live.expect_steps()
 
     def _calls_have_ended(self) -> bool:
-        """Show frames until no call of a controller is in progress; return whether the window is still open.
+        """Show frames until no controller is being called, and return whether the window is still open.
 
-        The first calls of a new controller may capture CUDA graphs, and no other controller may run during a capture.
+        The first calls of a new controller may capture CUDA graphs. No other controller may run during a capture.
         """
         while any(isinstance(each, WorldControl) and each.busy for each in self.stage.controllers.values()):
             if (window := self._window) is not None:
@@ -232,7 +226,6 @@ class Session:
         return True
 
     def _give_up_control(self, error: ControllerError) -> None:
-        """Pause, and deselect a controller that raised an exception."""
         stage = self.stage
         print("".join(traceback.format_exception(error.__cause__)), end="", file=sys.stderr, flush=True)
         stage.paused = stage.changed = True

@@ -11,7 +11,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
     """Carry out a command.
 
     Raises:
-        ValueError: The command names an unknown world, or perturbs a playback; the message is for the user.
+        ValueError: The command names an unknown world, or perturbs a playback. The message is for the user.
         NoVideoError: A video cannot be made.
         ControllerError: A controller raised an exception.
     """
@@ -70,7 +70,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 
 
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
-    """Change the mode, the controller or the episode. After a playback, the world continues from the state it shows."""
+    """Change the mode, the controller or the episode. After a playback, the world continues from its last state."""
     mode, controller = command.mode, command.controller
     if command.episode is not None:
         stage.playback.choose(command.episode)
@@ -83,7 +83,6 @@ def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
 
 
 def _perturb(stage: Stage, command: protocol.Perturb) -> None:
-    """Push bodies of the displayed world, or move bodies while paused."""
     given = {"mocap_pos": command.mocap_pos, "mocap_quat": command.mocap_quat}
     given["qpos"] = command.qpos if stage.paused else None
     parts = {name: value for name, value in given.items() if value is not None}

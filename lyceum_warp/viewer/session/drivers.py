@@ -20,7 +20,7 @@ MOST_SAMPLES = 24
 
 
 class ControllerError(Exception):
-    """Raised if a controller raises an exception, which becomes the ``__cause__``. The message has a single line."""
+    """Raised if a controller raises an exception, which becomes the ``__cause__``. The message is a single line."""
 
     def __init__(self, name: str, error: BaseException) -> None:
         text = next(iter(str(error).splitlines()), "")
@@ -38,7 +38,7 @@ class PlanView:
     samples: torch.Tensor
     """The actions of the copied samples, (horizon, samples, nact)."""
     best: int | None
-    """The index of the copied sample with the largest return; None without samples."""
+    """The index of the copied sample with the largest return. None without samples."""
 
 
 class PolicyControl:
@@ -86,7 +86,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world, in one control loop after another.
+    """Calls a controller of one world.
 
     Args:
         name: The controller's name in the viewer.
@@ -97,16 +97,15 @@ class WorldControl:
         self.name, self.seconds = name, float("nan")
         self.controller = controller
         self.plans = hasattr(controller, "actions")
-        """Whether the controller has plans to draw."""
         self._busy = threading.Lock()
         self._run = self.calls = 0
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The slice of the state that controllers see as zero, because it holds the forces of the user's push."""
+        """The part of the state with the forces of the user's push. Controllers see zeros there."""
 
     def new_run(self) -> "ControlRun":
-        """Return the controller for a new control loop; from now on, calls from earlier control loops fail."""
+        """Return the controller for a new control loop. Calls from earlier control loops fail from now on."""
         self._run += 1
         return ControlRun(self, self._run)
 
@@ -116,7 +115,7 @@ class WorldControl:
         return self._busy.locked()
 
     def reset(self) -> None:
-        """Reset the controller at once, or before the next call if a call is in progress.
+        """Reset the controller now, or after the call that is in progress.
 
         Raises:
             ControllerError: The controller raised an exception.
@@ -162,14 +161,14 @@ class WorldControl:
                 raise ControllerError(self.name, error) from error
 
     def look(self) -> PlanView | None:
-        """Return the plan that was copied since the last call, if any, and request a copy of the next plan."""
+        """Return the plan that was copied since the last call, and request a copy of the next plan."""
         seen, self._seen = self._seen, None
         self._wanted = True
         return seen
 
 
 class ControlRun:
-    """Wraps a controller for one control loop; has the controller's attributes and signature."""
+    """A controller in one control loop. It has the controller's attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number
@@ -185,7 +184,7 @@ class ControlRun:
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
-    """Copy the last plan of a controller to the CPU; return None for a controller without plans."""
+    """Copy the last plan of a controller to the CPU. Return None for a controller without plans."""
     plan = getattr(controller, "actions", None)
     if not isinstance(plan, torch.Tensor) or plan.ndim != 2:
         return None
@@ -193,7 +192,7 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
     samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
     sampled, returns = getattr(controller, "sampled", None), getattr(controller, "returns", None)
     if isinstance(sampled, torch.Tensor) and isinstance(returns, torch.Tensor) and sampled.shape[1] == len(returns):
-        # samples are drawn independently, so the first ones represent all
+        # samples are drawn independently, so the first ones represent all of them
         shown = torch.arange(min(MOST_SAMPLES, len(returns)), device=returns.device)
         shown[0] = returns.argmax()
         samples = sampled.index_select(1, shown).to("cpu", torch.float32)
@@ -247,7 +246,6 @@ def _is_policy(controller: Any) -> bool:
 
 
 def _on_device(policy: Any, env: Env) -> Any:
-    """Copy a policy to the worlds' device, unless it is already there."""
     if isinstance(policy, torch.nn.Module) and any(p.device != env.obs.device for p in policy.parameters()):
         return moved(policy, env)
     return policy

@@ -1,7 +1,7 @@
 """Replace the task's command for a walking robot, and draw arrows for commanded and measured velocities.
 
-A robot can be driven if its task has the memory in which a velocity task stores the command (see ``docs/velocity.md``).
-The robot's first joint must be the free joint of its base.
+The task must store its command like the velocity tasks (see ``docs/velocity.md``). The robot's first joint must be the
+free joint of its base.
 """
 
 import math
@@ -29,16 +29,18 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s); None if the task does
-        not have commands."""
+        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s).
+
+        None if the task has no commands.
+        """
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
         self.wanted: tuple[float, float, float] | None = None
-        """The user's command, or None if the task chooses the commands."""
+        """The user's command. If None, the task chooses."""
 
     def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
-        """Return the command in a state, (state_space.size,): forward velocity, lateral velocity and yaw rate."""
+        """Return the commanded forward velocity, lateral velocity and yaw rate in a state, (state_space.size,)."""
         if self.limits is None:
             return None
         velocity, target, controlled, standing, _ = (state[self._parts[name]] for name in _MEMORY)
@@ -59,7 +61,7 @@ class Driving:
             live.write(drawn_velocity=np.array(self.wanted), command_timer=np.array([_NEVER]), **none)
 
     def arrows(self, state: np.ndarray) -> tuple[Arrow, ...]:
-        """Make arrows above the base: horizontal arrows for velocities, and vertical arrows for yaw rates."""
+        """Make arrows above the base: horizontal ones for velocities, and vertical ones for yaw rates."""
         if (command := self.command(state)) is None:
             return ()
         qpos, qvel = state[self._parts["qpos"]], state[self._parts["qvel"]]

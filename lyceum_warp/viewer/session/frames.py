@@ -35,9 +35,7 @@ class FrameMaker:
 
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
         self.ghosts = SetGhosts()
-        """The ghosts that are drawn."""
         self.messages: list[str] = []
-        """The messages of the next frame."""
         self._env, self._curves, self._driving = env, curves, driving
         self._points: list[list[float]] = []
         self._seen_end = self._seen_fault = 0.0
@@ -47,7 +45,7 @@ class FrameMaker:
         self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
-        """Report only ends of episodes and faults that happen from now on."""
+        """Forget the ends of episodes and the faults so far, and report only later ones."""
         self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
@@ -60,15 +58,15 @@ class FrameMaker:
     def of_worlds(
         self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status], *, paused: bool
     ) -> Frame:
-        """Make a frame of the displayed world, and of other worlds as ghosts.
+        """Make a frame of the displayed world, with other worlds as ghosts.
 
         Args:
-            live: The worlds that are stepped: ``main``, or the plant, a copy of the displayed world of ``main``.
+            live: The worlds that are stepped: ``main``, or the plant, which is a copy of ``main``'s displayed world.
             main: All worlds.
             traces: The paths of a planner's samples.
-            status: A function that takes some fields of ``Status``, and returns a ``Status`` with all fields.
-            paused: Whether the session is paused. If so, the frame shows the present state; otherwise it may show the
-                state at the time of the previous frame.
+            status: A function that completes a ``Status``, given some of its fields.
+            paused: Whether the session is paused. If so, the frame shows the present state. Otherwise it may show the
+                state at the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -87,7 +85,7 @@ class FrameMaker:
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
         others, grid = rows.states[1:], self.ghosts.grid
-        if live is not main and shown:  # other worlds wait
+        if live is not main and shown:  # the other worlds do not move
             main.request(shown)
             waiting = main.take()
             others = others if waiting is None else waiting.states[1:]
@@ -133,7 +131,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report the end of an episode, and faults; ``plant_of`` is the world that a plant copies, or None."""
+        """Report the end of an episode, and faults. ``plant_of`` is the world that a plant copies."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))
@@ -146,7 +144,6 @@ class FrameMaker:
         self._seen_fault = max(self._seen_fault, rows.fault[0])
 
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        """Make ghosts of other worlds or episodes."""
         return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
@@ -166,7 +163,7 @@ class FrameMaker:
         return 2.2 * float(far[moving].max(initial=0.1))
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
-        """Make ghosts along a trajectory; the first states are the nearest to the present, and the most opaque."""
+        """Make ghosts along a trajectory. States near the present come first and are the most opaque."""
         return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:
@@ -192,7 +189,6 @@ class FrameMaker:
 
 
 def _following(index: int, number: int, count: int) -> list[int]:
-    """Return the indices of at most ``count`` worlds or episodes after the given one."""
     return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 

@@ -1,7 +1,7 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-The history, the returns and the points of the curves stay on the worlds' device. On a GPU, steps do not wait for the
-device, and the data of a frame are copied to the host asynchronously.
+History, returns and curves stay on the worlds' device. On a GPU, steps do not wait for the device, and frames are
+copied to the host asynchronously.
 """
 
 import dataclasses
@@ -15,19 +15,19 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Pose
 
 HISTORY_BYTES = 240 * 2**20
-"""The memory for the history of all worlds, in bytes."""
+"""Memory for the history of all worlds, in bytes."""
 PLANT_HISTORY_BYTES = 16 * 2**20
-"""The memory for the history of a plant (see ``plant.py``), in bytes."""
+"""Memory for the history of a plant (see ``plant.py``), in bytes."""
 HISTORY_STEPS = 2000
-"""The maximum number of steps in the history."""
+"""Maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # most curve points between two frames; further points overwrite the oldest
+_CURVE_ROWS = 512  # most curve points between two frames; later points overwrite the oldest
 
 
 class Past:
-    """A ring buffer that holds the states of all worlds before each of the most recent steps.
+    """A ring buffer with the states of all worlds before each recent step.
 
-    If the memory is too small for two states of all worlds, the buffer stays empty.
+    The buffer stays empty if the memory is too small for two states of all worlds.
 
     Args:
         env: The worlds.
@@ -42,19 +42,19 @@ class Past:
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
         self.pushed: list[int | None] = [None] * self.length
-        """The world that the user was pushing in each step, if any."""
+        """The world that the user was pushing in each step."""
         self.now = self.newest = self.oldest = 0
-        """Step numbers in the history: the present, the newest and the oldest step."""
+        """The numbers of the present, the newest and the oldest step in the history."""
 
     @property
     def behind(self) -> int:
         """The number of steps that can be undone."""
-        # the first step back stores the present state in place of the oldest state
+        # the first step back replaces the oldest state by the present one
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
     def ahead(self) -> int:
-        """The number of steps that were undone, and can be redone."""
+        """The number of undone steps that can be redone."""
         return self.newest - self.now
 
     def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
@@ -75,13 +75,12 @@ class Rows:
     """The data of a frame, copied to the host."""
 
     worlds: tuple[int, ...]
-    """The indices of the worlds; the displayed world comes first."""
+    """The indices of the worlds. The displayed world comes first."""
     states: np.ndarray
-    """The states of the worlds, (worlds, state_space.size) float64."""
+    """(worlds, state_space.size) float64."""
     back: np.ndarray
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
-    """The return of the displayed world's episode so far."""
     end: tuple[float, ...]
     """The last episode that ended in the displayed world: its last step, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
@@ -94,7 +93,7 @@ class Live:
     """Steps worlds, and keeps their history.
 
     Args:
-        env: The worlds, which start from their present state.
+        env: The worlds.
         limit: The maximum memory of the history in bytes.
     """
 
@@ -107,7 +106,6 @@ class Live:
         """The world that the user is pushing."""
         device, n = env.obs.device, env.nworld
         self.asynchronous = device.type != "cpu"
-        """Whether the data of a frame are copied to the host asynchronously."""
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
         self._clock = 0  # steps since the session began, except undone ones
@@ -124,7 +122,7 @@ class Live:
         self._number = torch.arange(n, device=device)
 
     def warm_up(self) -> None:
-        """Make the calls that the viewer needs, so that CUDA graphs are captured, and restore the state."""
+        """Capture the CUDA graphs that the viewer needs, and restore the state."""
         env = self.env
         before = env.get_state()
         mask = torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
@@ -138,11 +136,11 @@ class Live:
     # steps
 
     def step(self, act: Callable[[], None]) -> None:
-        """Make a step, or redo a step if steps were undone.
+        """Make a step, or redo an undone step.
 
         Args:
             act: A function that writes the actions of all worlds into ``env.action``. It is not called to redo a step,
-                because the next state is restored from the history.
+                which restores the next state from the history.
         """
         if self.past.ahead:
             self._move(1)
@@ -154,7 +152,7 @@ class Live:
         self._after_step()
 
     def expect_steps(self) -> None:
-        """Prepare for steps that a control loop makes on ``env``; ``stepped`` must be called after each of them."""
+        """Prepare for steps that a control loop makes on ``env``. Call ``stepped`` after each of them."""
         self.past.drop_ahead()
         self.env.get_state(out=self._state)
         self._before_step()
@@ -182,11 +180,11 @@ class Live:
         self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # without autoreset, ``done`` stays set after the episode, and the return must not grow
+        if not env.autoreset:  # ``done`` then stays set after the episode, and the return must not grow
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
-        # on a GPU, do not read the mask, because reading it waits for the device
+        # reading the mask would wait for the GPU
         if self.asynchronous or ended.any():
             self._note_ends(ended)
         values = [
@@ -207,7 +205,7 @@ class Live:
         if env.autoreset:
             self.returns.masked_fill_(ended, 0.0)
         fault = ended & ((reason & int(FAULTS)) != 0)
-        # gather does not wait for the device, unlike indexing with a tensor
+        # unlike indexing with a tensor, gather does not wait for the device
         first = torch.argmax(fault.to(torch.int8)).view(1)
         count = self._fault[3:] + fault.sum()
         now = torch.cat([made[:1], reason.gather(0, first).double(), first.double(), count])
@@ -230,7 +228,7 @@ class Live:
         return steps
 
     def forward(self, steps: int) -> None:
-        """Restore all worlds to a later state, after steps were undone."""
+        """Restore all worlds to a later state that was undone."""
         if steps := min(steps, self.past.ahead):
             self._move(steps)
 
@@ -300,7 +298,7 @@ class Live:
         return self.env.get_state()[self.world]
 
     def write(self, **parts: np.ndarray) -> None:
-        """Change parts of the displayed world's state, by their names in ``env.state_space``."""
+        """Change parts of the displayed world's state by their names in ``env.state_space``."""
         state = self.row()
         for name, value in parts.items():
             where = self.env.state_space.parts[name]
@@ -313,7 +311,8 @@ class Live:
         """Return the index of the chosen world. "best" and "worst" wait for the device.
 
         Args:
-            choice: An index; "next" or "previous"; "best" or "worst" by the return of the episode so far.
+            choice: An index, "next", "previous", "best" or "worst". The last two compare the returns of the current
+                episodes.
         """
         if isinstance(choice, int):
             return choice
@@ -347,7 +346,7 @@ class Live:
             self._event.record()
 
     def take(self) -> Rows | None:
-        """Wait for the requested data, and return them; return None if there was no request."""
+        """Wait for the requested data. Return None without a request."""
         if self._reading is None:
             return None
         (worlds, times, parts), self._reading = self._reading, None
@@ -360,13 +359,13 @@ class Live:
 
 
 def _index(numbers: Sequence[int], device: torch.device) -> torch.Tensor:
-    """Copy indices to a device, without waiting for it."""
+    """Copy indices to a device without waiting for it."""
     index = torch.tensor(numbers, dtype=torch.long)
     return index if device.type == "cpu" else index.pin_memory().to(device, non_blocking=True)
 
 
 def _to_host(part: torch.Tensor) -> torch.Tensor:
-    """Copy a tensor to the host; a copy from a GPU is asynchronous."""
+    """Copy a tensor to the host. A copy from a GPU is asynchronous."""
     if part.device.type == "cpu":
         return part.clone()
     host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)

@@ -14,7 +14,7 @@ Numbers = tuple[tuple[str, float], ...]
 
 
 def planner_numbers(controller: Any) -> Numbers:
-    """Return the settings of a planner that the user can change; other controllers have none."""
+    """Return the settings of a planner that the user can change. Other controllers have none."""
     if not isinstance(controller, Planner):
         return ()
     found = ((name, getattr(controller.config, name)) for name in _SETTINGS)
@@ -22,13 +22,13 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """Return those parameters of a task that are floats, including the weights of reward terms."""
+    """Return the task's parameters that are floats, including the weights of reward terms."""
     known = env.task.params
     return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
-    """Make a new planner with another value of a setting, because a planner's CUDA graphs contain its settings.
+    """Make a planner with a new value of a setting. A planner's CUDA graphs contain the old one.
 
     Raises:
         ValueError: The value is not valid.

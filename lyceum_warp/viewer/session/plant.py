@@ -11,19 +11,19 @@ from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 
 POLL = 0.005
-"""The seconds between two polls of the window's commands."""
+"""Seconds between two polls of the window's commands."""
 
 _RESERVE = 0.0015  # seconds before a step in which no other work may start
-_PART = 10_000  # maximum steps of a control loop, which stores all its states
-_WARM_UP = 3  # no other work runs during this many first calls, because they may capture CUDA graphs
+_PART = 10_000  # maximum steps of one control loop, which stores all its states
+_WARM_UP = 3  # the first calls may capture CUDA graphs, so no other work runs during them
 
 
 class InterruptedByCommand(BaseException):
-    """Raised to stop the plant, because a command of the user needs the plant's state."""
+    """Stops the plant because a command of the user needs its state."""
 
 
 def make_plant(main: Live) -> Live:
-    """Make the plant: a single world on the CPU, so that its steps do not wait for the GPU of a planner."""
+    """Make the plant: a single world on the CPU, where steps do not wait for a planner's GPU."""
     env, plant = main.env, main
     if env.nworld > 1 or env.autoreset or env.device.is_cuda:
         options = options_for_plant(env.options.engine, env.device)
@@ -49,7 +49,7 @@ def run_plant(
         live: The plant.
         control: Its controller.
         speed: Simulated seconds per second.
-        work: A function that is called while the plant waits for its next step; it may raise ``InterruptedByCommand``
+        work: A function that is called while the plant waits for its next step. It may raise ``InterruptedByCommand``
             to stop the plant.
         on_step: A function that is called after each step.
 
@@ -71,11 +71,11 @@ def run_plant(
 
 
 class _WorkingClock(Clock):
-    """A wall clock that calls ``work`` during the waiting times.
+    """A wall clock that calls ``work`` while it waits.
 
     Args:
-        work: A function that is called while the plant waits for its next step.
-        warm: Whether to call ``work`` also before the first plan is ready.
+        work: The function to call.
+        warm: Whether to call ``work`` before the first plan is ready.
     """
 
     def __init__(self, work: Callable[[], None], *, warm: bool) -> None:

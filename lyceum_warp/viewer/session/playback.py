@@ -21,13 +21,13 @@ class Episode:
 
     name: str
     states: np.ndarray
-    """The states, (steps + 1, state_space.size) float64."""
+    """(steps + 1, state_space.size) float64."""
     rewards: np.ndarray
-    """The rewards, (steps,), NaN if unknown."""
+    """(steps,), NaN if unknown."""
     evals: np.ndarray
-    """The evaluations, (steps,), NaN if unknown."""
+    """(steps,), NaN if unknown."""
     end: str = ""
-    """The reason for the end of the episode; empty if the episode did not end or the reason is unknown."""
+    """The reason for the end of the episode. Empty if it did not end or the reason is unknown."""
 
     @property
     def steps(self) -> int:
@@ -103,11 +103,11 @@ class Playback:
 
     @property
     def next_step(self) -> int:
-        """The next step in the direction of the playback; the last step is followed by the first again."""
+        """The next step in the direction of the playback. After the last step comes the first."""
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
     def choose(self, index: int) -> None:
-        """Show another episode, at the same step, or at the last step of a shorter episode."""
+        """Show another episode at the same step, or at the last step of a shorter episode."""
         self.index = index
         self.seek(self.step)
 

@@ -31,8 +31,8 @@ _OLD = 1.0  # seconds after which traces disappear
 class Stage:
     """Holds the worlds, controllers and episodes of a session.
 
-    Policies act in all worlds. A controller of one world, such as a planner, acts in a copy of the displayed world,
-    called the plant, while the other worlds wait. ``lw.view`` explains the arguments.
+    Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the displayed
+    world. Meanwhile the other worlds wait. ``lw.view`` explains the arguments.
 
     Raises:
         ValueError: An argument is invalid.
@@ -61,7 +61,6 @@ class Stage:
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
         self.dragging = False
-        """Whether the user is pushing a body."""
         self.changed = False
         """Whether the display has changed since the last frame."""
         self.driving = Driving(env)
@@ -77,7 +76,6 @@ class Stage:
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
         self.shown: Frame | None = None
-        """The last frame."""
         self.steps = 0
         """The number of steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
@@ -95,7 +93,7 @@ class Stage:
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
 
     def close(self) -> None:
-        """End the threads. A second call has no effect."""
+        """End the threads."""
         while self._threads:
             self._threads.popitem()[1].close()
 
@@ -127,7 +125,7 @@ class Stage:
             self.live.env.action.zero_()
 
     def _step_plant(self, current: WorldControl) -> None:
-        """Make one step of the plant, not in real time: the step waits for the controller."""
+        """Make one step of the plant. The step waits for the controller."""
         self.begin_due_episode()
         self.live.expect_steps()
         try:
@@ -165,7 +163,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End the push of a past state that was restored, before the worlds continue from this state."""
+        """End a push that came back with an undone state, before the worlds continue from there."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
@@ -193,20 +191,21 @@ class Stage:
         self._trace()
 
     def _trace(self) -> None:
-        """Begin to draw the plans of the controller in use."""
         current = self.control
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, by making a new planner, or change a task parameter in all worlds.
+        """Change a setting of the planner in use, or a task parameter in all worlds.
+
+        A new setting makes a new planner.
 
         Raises:
             ValueError: The value is not valid.
         """
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":
-            if not isinstance(self.control, WorldControl):  # the mode may have changed since the user gave the command
+            if not isinstance(self.control, WorldControl):  # the mode may have changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [self.control]
             self.control.controller = rebuilt_planner(self.control.controller, name, value)
@@ -220,7 +219,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world; end the user's push and driving in the previous world."""
+        """Show another world. The user's push and driving end in the previous world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:
@@ -267,7 +266,7 @@ class Stage:
         return frame
 
     def _traces(self) -> Traces | None:
-        """Return the newest traces, if traces are shown, and request new traces."""
+        """Return the newest traces and request new ones, unless traces are off."""
         thread, current = self._threads.get(str(self.controller)), self.control
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None

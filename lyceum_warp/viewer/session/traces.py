@@ -1,8 +1,8 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
-A planner does not store positions. This module rolls out the actions of some samples from the plan's initial state, in
-worlds with the planner's task, model and time step. If the task draws random numbers during an episode, the paths
-differ from the planner's, because these worlds draw other numbers.
+A planner does not store positions. This module rolls out some samples' actions from the plan's initial state. The
+worlds have the planner's task, model and time step. If the task draws random numbers during an episode, the paths
+differ from the planner's.
 """
 
 import dataclasses
@@ -37,9 +37,9 @@ class TracePoint:
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     """Choose the point of a robot whose path is drawn.
 
-    For a robot with an unactuated base, such as a hopper or a humanoid, the default is the centre of mass. For an arm,
-    the default is the last body in the longest chain of actuated bodies: the body's first site, or the body's centre of
-    mass if it has no site.
+    The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
+    for an arm is the last body in the longest chain of actuated bodies. The point is the body's first site, or its
+    centre of mass if it has no site.
 
     Args:
         model: The model.
@@ -91,11 +91,9 @@ class Traces:
     """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """The paths, (samples + 1, points, 3), in metres; the plan comes last."""
+    """(samples + 1, points, 3), in metres; the plan comes last."""
     best: int | None
-    """The index of the best sample."""
     final: Pose
-    """The final pose of the plan."""
     made: float
     """The time of the rollout, from ``time.perf_counter``."""
 
@@ -132,7 +130,7 @@ class TraceRollouts:
         """Roll out a plan."""
         env, count = self.env, view.samples.shape[1]
         self._put(view.state)
-        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # the worlds without a sample follow the plan
+        actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # worlds without a sample follow the plan
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
         env.set_state(self._states, check=False)
@@ -146,7 +144,7 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the planner's state into every world; parts of the state that the planner lacks stay unchanged."""
+        """Copy the planner's state into every world. Other parts of the state stay unchanged."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():
@@ -162,7 +160,7 @@ class TraceThread:
     """A thread that rolls out the newest plan, and sleeps between rollouts.
 
     Args:
-        rollouts: Makes the rollouts. From now on, only the thread may use this object.
+        rollouts: Makes the rollouts. From now on, only the thread may use it.
     """
 
     def __init__(self, rollouts: TraceRollouts) -> None:
@@ -184,13 +182,13 @@ class TraceThread:
         return self._newest
 
     def forget(self) -> None:
-        """Wait for any rollout in progress, and drop the traces."""
+        """Wait for a rollout in progress, and drop the traces."""
         self._view = None
         with self._working:
             self._newest = None
 
     def close(self) -> None:
-        """End the thread after any rollout in progress."""
+        """End the thread after a rollout in progress."""
         self._ending = True
         self._wake.set()
         self._thread.join()
@@ -205,7 +203,7 @@ class TraceThread:
                 view, self._view = self._view, None
                 if view is None:
                     continue
-                begun = time.thread_time()  # CPU time; on a busy machine, wall time would include other programs
+                begun = time.thread_time()  # CPU time, because wall time would include other programs
                 with self._working:
                     self._newest = self._rollouts(view)
                 self._rest((time.thread_time() - begun) / SHARE)

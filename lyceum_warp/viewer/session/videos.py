@@ -1,4 +1,4 @@
-"""Make videos, pictures and HTML pages of what the viewer shows; subprocesses render the videos and pictures."""
+"""Make videos, pictures and HTML pages of what the viewer shows. Subprocesses render the videos and pictures."""
 
 import contextlib
 import datetime
@@ -24,8 +24,8 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
-_MOST_WAITING = 4 * FPS  # maximum number of waiting poses, because the rendering subprocess starts slowly
-_PATIENCE = 120.0  # seconds for which the viewer finishes videos when it ends, unless a signal discards them
+_MOST_WAITING = 4 * FPS  # maximum number of waiting poses; the rendering subprocess starts slowly
+_PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
 class VideoTaker:
@@ -47,11 +47,11 @@ class VideoTaker:
         self._pictures: list[threading.Thread] = []
         self._done: list[str] = []  # messages about pictures and pages
         self.files: list[Path] = []
-        """The complete files, which the next frame reports to the window."""
+        """Complete files. The next frame reports them to the window."""
 
     @property
     def name(self) -> str | None:
-        """The name of the current video; None if there is none."""
+        """The name of the current video."""
         return None if self._running is None else self._running.out.name
 
     @property
@@ -60,7 +60,7 @@ class VideoTaker:
         return self._running is not None and (time.perf_counter() - self._start) * FPS >= self._running.added
 
     def begin(self, camera: dict[str, Any]) -> None:
-        """End the current video, and start another video.
+        """End the current video, and start another one.
 
         Args:
             camera: The attributes of the ``mujoco.MjvCamera``.
@@ -148,7 +148,7 @@ class VideoTaker:
 
     @contextlib.contextmanager
     def finishing(self, show: Callable[[str], object]) -> Iterator[None]:
-        """Finish all videos at the end of a ``with`` block, even after an exception, such as Ctrl-C.
+        """Finish all videos when the ``with`` block ends, even after an exception, such as Ctrl-C.
 
         A video that is incomplete after two minutes, or at a second Ctrl-C, is discarded.
 
@@ -178,7 +178,6 @@ def _numbers(pose: Pose) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _shot(frame: Frame, count: int) -> Shot:
-    """Convert a frame of the viewer to a shot, which fills ``count`` frames of a video."""
     paths = () if frame.traces is None else frame.traces
     lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
     lines += [(np.stack([arrow.start, arrow.end]), arrow.colour, 2 * _WIDTH) for arrow in frame.arrows]
@@ -197,7 +196,6 @@ def _camera(values: dict[str, Any]) -> mujoco.MjvCamera:
 
 
 def _completed(video: Recorder) -> str:
-    """Return a line about a video that is complete or has failed."""
     try:
         line = f"video: {video.close()}"
     except (NoVideoError, OSError) as error:

@@ -18,11 +18,11 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
 FRAME_TIME = 1 / 60
-"""The minimum time between two frames, in seconds."""
+"""Minimum time between two frames, in seconds."""
 OPENING_TIME = 60.0
-"""The maximum time until the process must report that the window is open, in seconds."""
+"""Maximum time until the window is open, in seconds."""
 CLOSING_TIME = 5.0
-"""The maximum time that the process may take to end, in seconds."""
+"""Maximum time that the process may take to end, in seconds."""
 
 _PROGRAM = """
 import sys
@@ -33,17 +33,17 @@ main(int(sys.argv[1]))
 
 
 class NoWindowError(OSError):
-    """Raised if the window cannot be opened, or ended with an error. The error's message gives the reason."""
+    """Raised if the window cannot be opened, or ended with an error. The message gives the reason."""
 
 
 class Window:
     """Shows frames in a window process, and collects the user's commands.
 
     The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
-    guard. The window process ends when this process ends, even by SIGKILL. Ctrl-C does not reach the window process.
+    guard. It ends when this process ends, even by SIGKILL. Ctrl-C does not reach it.
 
     Args:
-        scene: What does not change during the session.
+        scene: The constants of the session.
         host: The address on which the page is served; see ``lw.view``.
         port: The port of the page; see ``lw.view``.
 
@@ -72,10 +72,10 @@ class Window:
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,
-                process_group=0,  # its own process group, because a terminal sends Ctrl-C to a whole group
+                process_group=0,  # a terminal sends Ctrl-C to a whole process group
             )
         self.error: str | None = None
-        """The error that ended the window, if there was one."""
+        """The error that ended the window."""
         try:
             self._connection.send(protocol.Opening(scene, host, port))
             reply = self._connection.recv() if self._connection.poll(OPENING_TIME) else None
@@ -100,9 +100,9 @@ class Window:
             self._threads[-1].start()
 
     def show(self, frame: Frame) -> None:
-        """Send a frame, without waiting for the window.
+        """Send a frame without waiting for the window.
 
-        If the previous frame has not been sent yet, it is skipped; its curve points and messages move to the new frame.
+        A frame that has not been sent yet is skipped. Its curve points and messages move to the new frame.
         """
         with self._lock:
             self._pending = protocol.latest(self._pending, frame)
@@ -110,7 +110,7 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame now; if it cannot, the caller need not make a frame.
+        """Whether the window can draw another frame now. If not, the caller need not make one.
 
         The window draws about 60 frames per second while a page is open, and about 4 while none is.
         """
@@ -163,7 +163,6 @@ class Window:
         return lines[-1].strip() if lines else f"its process ended with code {code}"
 
     def _send(self) -> None:
-        """Send frames in a thread."""
         while True:
             self._wake.wait()
             if self._ended:
@@ -183,7 +182,6 @@ class Window:
             time.sleep(FRAME_TIME)
 
     def _receive(self) -> None:
-        """Receive replies in a thread."""
         closed = False
         try:
             while not self._ended:
