@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import positive_number
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FreeCamera:
-    """A camera that looks at a point or follows a body. The default values come from MuJoCo's default free camera."""
+    """A camera that looks at a point or follows a body. The defaults are those of MuJoCo's free camera."""
 
     lookat: tuple[float, float, float] | None = None
     """The point to look at, in metres. A camera that follows a body looks at the centre of mass of the body's
@@ -25,18 +25,19 @@ class FreeCamera:
     distance: float | None = None
     """The distance from the point ``lookat``, in metres."""
     azimuth: float | None = None
-    """The direction of the view around the vertical axis, in degrees; a camera at 0 looks along x, and at 90 along
-    y."""
+    """The direction of the view around the vertical axis, in degrees. 0 looks along x, and 90 along y."""
     elevation: float | None = None
-    """The direction of the view above the horizontal plane, in degrees; a camera at -90 looks straight down."""
+    """The direction of the view above the horizontal plane, in degrees. -90 looks straight down."""
     track: str | int | None = None
     """The name or the index of a body to follow."""
 
 
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
 """A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for a video's default.
-The default is the model's first tracking camera, or else its first camera that is fixed to the world, or else a camera
-that follows the first body."""
+
+The default is the model's first tracking camera. Without one, it is the first camera that is fixed to the world, or
+else a camera that follows the first body.
+"""
 
 FREE = "free"
 
@@ -68,7 +69,7 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
     """Parse a camera from command-line words.
 
     Args:
-        words: A name or an index; or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
+        words: A name, an index, or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
             Without words, the result is None.
 
     Raises:
@@ -97,7 +98,7 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
 
 
 def camera_names(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the model's cameras, in order; a camera without a name has the name ""."""
+    """Return the names of the model's cameras in order. A camera without a name has the name ""."""
     return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
 
 
@@ -110,8 +111,8 @@ def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
 
 
 def tracking_camera(model: mujoco.MjModel) -> int | None:
-    """Return the index of the model's first camera that follows a body, or None if there is no such camera."""
-    # convert to int, because MuJoCo's enums do not equal NumPy integers
+    """Return the index of the model's first camera that follows a body, or None."""
+    # MuJoCo's enums do not equal NumPy integers
     tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
     return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)
 

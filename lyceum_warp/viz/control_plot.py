@@ -18,8 +18,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     deadline.
 
     Args:
-        episodes: The episodes, at least one, all of the same task. The control period of the first episode is the
-            deadline.
+        episodes: Episodes of the same task, at least one. The first one's control period is the deadline.
         out: The PNG file.
         title: The title of the plot; by default task, engine and mode.
 
@@ -38,7 +37,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     _draw_outcomes(reward, evaluation, episodes)
     _draw_times(planning, age, episodes)
     _draw_histogram(histogram, episodes)
-    histogram.xaxis.set_major_formatter(LogFormatter())  # write plain numbers instead of powers of ten
+    histogram.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
     histogram.xaxis.set_minor_formatter(LogFormatter())
     finish_axes((reward, evaluation, planning, age, histogram))
     first = episodes[0]
@@ -71,7 +70,7 @@ def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory])
 def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
     dots = _line_style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
     for episode in episodes:
-        # skip the first plan, which loads kernels, because its time would dominate the scale
+        # skip the first plan: it loads kernels, and its time would dominate the scale
         planning.plot(episode.plan_starts[1:], 1000 * episode.plan_times[1:], **dots)
         age.plot(episode.times, 1000 * episode.ages, **dots)
     deadline = 1000 * episodes[0].period

@@ -22,7 +22,7 @@ from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds to wait for the subprocess to end, before it is killed
+_PATIENCE = 10.0  # seconds until a subprocess that does not end is killed
 
 
 def check_video() -> None:
@@ -36,14 +36,14 @@ def check_video() -> None:
 
 
 def libraries() -> list[str]:
-    """The values of MUJOCO_GL to try, in order; "" stands for MuJoCo's default."""
+    """The values of MUJOCO_GL to try, in order. "" stands for MuJoCo's default."""
     given = os.environ.get("MUJOCO_GL", "")
     others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
     return list(dict.fromkeys([given, *others] if given else others))
 
 
 class DrawingProcess:
-    """A context manager for a subprocess that renders poses; it uses the first graphics library that works.
+    """A context manager for a subprocess that renders poses with the first graphics library that works.
 
     Args:
         model: The model.
@@ -72,7 +72,7 @@ class DrawingProcess:
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
-        self._lock = threading.Lock()  # because other threads may call `abandon`
+        self._lock = threading.Lock()  # other threads may call `abandon`
         self._abandoned = False
 
     def __enter__(self) -> Self:
@@ -88,7 +88,7 @@ class DrawingProcess:
                 raise
             self._stop()
             failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # the graphics library is not the reason, so do not try another one
+            if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
             f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
@@ -131,7 +131,7 @@ class DrawingProcess:
         mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
         self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
         self._ends.enter_context(self._errors)
-        # with -P, modules beside render.py do not shadow packages
+        # -P: modules beside render.py must not shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
         with self._lock:
             if self._abandoned:
@@ -143,7 +143,7 @@ class DrawingProcess:
         self._send(self._job)
 
     def _send(self, message: Any) -> bool:
-        """Send a message; return False if the subprocess has ended."""
+        """Send a message, and return False if the subprocess has ended."""
         assert self._process is not None and self._process.stdin is not None
         try:
             pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
@@ -169,7 +169,6 @@ class DrawingProcess:
         return code, lines[-1].strip()[:160] if lines else f"it ended with code {code}"
 
     def _stop(self) -> None:
-        """End the subprocess if it runs, and delete its files."""
         with self._lock:
             process, self._process = self._process, None
         if process is None:

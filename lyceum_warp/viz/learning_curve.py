@@ -13,7 +13,7 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path:
     """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
 
-    If no episode has ended or was evaluated, the plot shows the mean reward per step instead of returns.
+    If no episode has a return, the plot shows the mean reward per step instead.
 
     Args:
         run: A run, or its folder.
@@ -43,7 +43,7 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path
     top, bottom = panels[:2]
     samples = _column(rows, "samples")
     middle, spread, quantity = _column(rows, "return_mean"), _column(rows, "return_std"), "return"
-    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):  # there are no returns to plot
+    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):
         middle, quantity = _column(rows, "reward_mean"), "reward of a step"
     low = [m - s for m, s in zip(middle, spread, strict=True)]
     high = [m + s for m, s in zip(middle, spread, strict=True)]
@@ -74,7 +74,6 @@ def _column(rows: Sequence[dict[str, float | None]], name: str) -> list[float]:
 
 
 def _draw_mean_policy(axes: Any, rows: Sequence[dict[str, float | None]], name: str) -> None:
-    """Draw a dot for each evaluation of the mean policy."""
     points = [(row["samples"], row[name]) for row in rows if row.get(name) is not None]
     if points:
         x, y = zip(*points, strict=True)

@@ -1,7 +1,7 @@
 """Write an episode as one HTML file: a scene that can be played and turned in any browser, without a server or network.
 
 The file holds the triangles of the visible geoms in body coordinates, and the bodies' poses in each frame. The script
-in ``page.html`` draws the triangles with WebGL. Textures are omitted, except for the floor's squares.
+in ``page.html`` draws them with WebGL. The only texture is the floor's squares.
 """
 
 import base64
@@ -19,7 +19,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 
-_GROUPS = 3  # the groups of geoms that MuJoCo shows by default
+_GROUPS = 3  # MuJoCo shows the first three groups of geoms by default
 _AROUND, _ALONG = 24, 12  # segments of a circle and of a half circle
 _RATE = 60  # maximum frames per second
 _FLOOR = 200.0  # half the side of an infinite floor, in m
@@ -33,8 +33,8 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     Args:
         env: The environment of the states.
         states: The states of one world, one row per step, (steps, state_space.size).
-        out: The file. The file is replaced when the page is complete.
-        camera: The initial camera, as in ``write_video``. The page's reader can turn the camera.
+        out: The file. It is replaced when the page is complete.
+        camera: The initial camera, as in ``write_video``. The reader can turn it.
 
     Returns:
         The file's path.
@@ -81,7 +81,7 @@ def write_poses(
         frames.append(np.concatenate([data.xpos, data.xquat], axis=1))
     vertices, indices, ranges = _triangles(model)
     _, fixed, tracked = (int(value) for value in camera[:3])
-    if fixed >= 0:  # a camera of the model has no point to look at, so the page looks at the whole model
+    if fixed >= 0:  # a camera of the model has no point to look at, so look at the whole model
         tracked, view = int(model.cam_bodyid[fixed]), model.stat.extent * 1.5
         camera = (0, -1, tracked, *model.stat.center, view, 120.0, -20.0)
     moving = np.flatnonzero(model.body_dofnum)
@@ -135,7 +135,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return a geom's red, green, blue and opacity, from its material unless the geom has its own colour."""
+    """Return a geom's red, green, blue and opacity. The material counts unless the geom has its own colour."""
     own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
     if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
         return own
@@ -143,7 +143,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's vertices, normals and triangles, in the geom's coordinates; None for a kind that is not drawn."""
+    """Make a geom's vertices, normals and triangles in the geom's coordinates. Return None if the kind is not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:
@@ -170,7 +170,6 @@ def _box(size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
-    """Make the vertices and the triangles of a height field."""
     rows, columns = model.hfield_nrow[field], model.hfield_ncol[field]
     x, y, top, _ = model.hfield_size[field]
     heights = model.hfield_data[model.hfield_adr[field] :][: rows * columns].reshape(rows, columns)
@@ -182,7 +181,7 @@ def _ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
-    """Make a surface from triangles; those that meet at less than 30 degrees share normals, to look smooth."""
+    """Make a surface from triangles. Triangles that meet at less than 30 degrees share normals, to look smooth."""
     corners = points[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)

@@ -27,7 +27,7 @@ class WorldPictures(DrawingProcess):
         self.env = env
 
     def __call__(self) -> list[np.ndarray]:
-        """Render a picture of each world, (height, width, 3) uint8; the first call starts the subprocess.
+        """Render a picture of each world, (height, width, 3) uint8. The first call starts the subprocess.
 
         Raises:
             NoVideoError: This machine cannot render.
@@ -41,5 +41,5 @@ class WorldPictures(DrawingProcess):
         return pictures
 
     def close(self) -> None:
-        """End the subprocess; a later call starts a new one."""
+        """End the subprocess. A later call starts a new one."""
         self._stop()

@@ -54,13 +54,13 @@ def policy_video(
 class Videos:
     """Writes a video of the mean policy every few iterations.
 
-    After an error, for example because the machine cannot draw, training continues without further videos.
+    After an error, for example because the machine cannot draw, training continues without videos.
 
     Args:
         learner: The algorithm.
-        folder: The folder of the videos; file names are numbers of iterations.
+        folder: The folder of the videos. File names are numbers of iterations.
         every: The number of iterations between two videos; 0 makes no videos.
-        seed: The seed of the initial state, which is the same for all videos.
+        seed: The seed of the initial state of all videos.
         camera: The camera; see ``write_video``.
         note: A function that is called with the message of an error.
         progress: A function that is called regularly while a video is made.

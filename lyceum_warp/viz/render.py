@@ -1,15 +1,14 @@
 """Draw poses into a video, or as single pictures: ``python render.py folder``.
 
-``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin: first a dict with ``size``,
-``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, then None. The folder holds the model,
-``model.mjb``. The program writes ``video.mp4``; if ``fps`` is None, it writes each picture into ``picture.raw``
-instead. The process prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the
-parent process has died; the program then deletes the folder.
+``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin. The first is a dict with
+``size``, ``fps``, ``camera`` and ``background``. A ``Shot`` for each picture and then None follow. The folder holds the
+model, ``model.mjb``. The program writes ``video.mp4``, or each picture into ``picture.raw`` if ``fps`` is None. It
+prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the parent process has
+died. The program then deletes the folder.
 
-MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. For each graphics
-library that it tries, ``drawing.py`` therefore starts a separate process. The program imports no module of the
-package. Exit code 3 means that the machine cannot draw with the chosen graphics library; the last line on stderr
-holds the reason.
+MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
+therefore starts a process for each graphics library that it tries. The program imports no module of the package. Exit
+code 3 means that the machine cannot draw with this graphics library. The last line on stderr then holds the reason.
 """
 
 import contextlib
@@ -27,22 +26,21 @@ CANNOT_DRAW = 3
 ABANDONED = 4
 
 VIDEO, PICTURE = "video.mp4", "picture.raw"
-"""The names of the output files. A picture has the shape (height, width, 3) and the type uint8."""
+"""The output files. A picture has the shape (height, width, 3) and the type uint8."""
 
 
 class Shot(TypedDict):
-    """What to draw in one frame, or in several successive frames."""
+    """What to draw in one or several successive frames."""
 
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """The arrays qpos, mocap_pos and mocap_quat."""
+    """qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """Values of fields that replace the model's values, by the fields' names."""
+    """Values that replace the model's values, by the fields' names."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
     """Additional poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
     """Lines, each with its points, (points, 3), its colour and its width in pixels."""
     frames: int
-    """Number of frames."""
 
 
 class Painter:
@@ -50,7 +48,7 @@ class Painter:
 
     Args:
         mujoco: The module.
-        model: The model, whose fields the painter changes.
+        model: The model. The painter changes its fields.
         size: The width and the height in pixels.
         camera: The camera's values.
     """
@@ -60,7 +58,7 @@ class Painter:
         width, height = size
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        # without a GPU, a finer shadow map would take half of a frame's time without a visible gain
+        # a finer shadow map would look the same, but without a GPU, it would take half of a frame's time
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(size))
         self.renderer = mujoco.Renderer(model, height, width)
         self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
@@ -117,7 +115,7 @@ class Painter:
 
 
 def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Set the values of a camera; ``cameras.camera_values`` returns such values."""
+    """Set the values of a camera, as returned by ``cameras.camera_values``."""
     view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
     view.lookat[:] = values[3:6]
     view.distance, view.azimuth, view.elevation = values[6:9]

@@ -10,7 +10,7 @@ LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
 
 def new_figure(purpose: str, width: float, height: float) -> Any:
-    """Make a figure without pyplot, so that it needs no display and shares no state with the user's figures.
+    """Make a figure without pyplot. It needs no display, and shares no state with the user's figures.
 
     Args:
         purpose: The plot's name, for the error message.

@@ -20,8 +20,8 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""The group of a curve, by the prefix of the curve's column in metrics.csv. mjlab also uses the name Episode_Metrics,
-for means per step."""
+"""The group of a curve, by the prefix of its column in metrics.csv. mjlab also uses Episode_Metrics for means per
+step."""
 
 _TAGS = {
     # names that rsl_rl uses
@@ -36,18 +36,18 @@ _TAGS = {
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""The name of a curve, by the curve's column in metrics.csv."""
+"""The name of a curve, by its column in metrics.csv."""
 
 
 class TensorBoard:
-    """Writes a run's iterations to files for TensorBoard; the horizontal axis counts iterations from 0.
+    """Writes a run's iterations to files for TensorBoard. The horizontal axis counts iterations from 0.
 
     Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has the same name, unit and
-    axis as there, so that runs can be overlaid: Train/, Loss/, Policy/, Perf/, Episode_Metrics/ and, if ``env`` is
-    given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/, episode/, mean_policy/,
-    policy/, value/, time/ and metrics/.
+    axis as there, so that runs can be overlaid. These curves are in the groups Train/, Loss/, Policy/, Perf/,
+    Episode_Metrics/ and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the
+    groups return/, episode/, mean_policy/, policy/, value/, time/ and metrics/.
 
-    Curves that the folder already has are continued; their values from the first new iteration on are replaced.
+    Curves that the folder already has are continued. Their values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -55,8 +55,7 @@ class TensorBoard:
         ...         board(it)
 
     Args:
-        folder: The folder, which is created if it does not exist. Pass this folder, or one above it, to ``tensorboard
-            --logdir``.
+        folder: The folder, which need not exist. Pass it, or one above it, to ``tensorboard --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
             time limit in seconds. Episode_Termination/NAME is the mean number of episodes, in all worlds, that the
             function NAME ends in one step.
@@ -90,7 +89,7 @@ class TensorBoard:
         self._write(Summary(value=values), iteration.iteration - 1)
 
     def close(self) -> None:
-        """Close the file. If another iteration is added later, a new file is opened."""
+        """Close the file. A later iteration opens a new file."""
         if self._file is not None:
             file, self._file = self._file, None
             file.close()
@@ -104,7 +103,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file without the writers of torch or TensorBoard, whose thread would hide the error of a full disk."""
+        """Open a file directly: the threads of torch's and TensorBoard's writers would hide the error of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
@@ -112,7 +111,7 @@ class TensorBoard:
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # makes TensorBoard discard earlier files' points from this step on
+        if number:  # make TensorBoard discard earlier files' points from this step on
             self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:
@@ -140,7 +139,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute the samples per second, not counting the time of evaluations; return {} if the times are unknown."""
+    """Compute the samples per second without the time of evaluations. Return {} if the times are unknown."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

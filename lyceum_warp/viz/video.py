@@ -1,4 +1,4 @@
-"""Write videos of states, rendered off-screen in a subprocess."""
+"""Write videos of states. A subprocess renders them off-screen."""
 
 import contextlib
 import math
@@ -26,7 +26,7 @@ Progress: TypeAlias = Callable[[int, int], object]
 
 _MAX_RATE = 60  # maximum frames per second, the rate of most screens
 _POSES = ("qpos", "mocap_pos", "mocap_quat")
-_KILLED = 5.0  # maximum seconds to wait for the thread to end after its subprocess was killed
+_KILLED = 5.0  # maximum seconds until the thread ends after its subprocess was killed
 
 
 def write_video(
@@ -39,18 +39,18 @@ def write_video(
     speed: float = 1.0,
     progress: Progress | None = None,
 ) -> Path:
-    """Render states into an mp4 file; model fields that differ between worlds are taken from the states.
+    """Render states into an mp4 file, with the model fields of their worlds.
 
-    The video has at most 60 frames per second; if time steps are shorter than frames, states are skipped. A subprocess
+    The video has at most 60 frames per second. If time steps are shorter than frames, states are skipped. A subprocess
     draws the video, without a display.
 
     Args:
         env: The environment of the states.
         states: The states of one world, one row per step, (steps, state_space.size).
-        out: The file. The file is replaced when the video is complete.
+        out: The file. It is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
-            MuJoCo's default free camera. The default is the model's first tracking camera, or else its first camera
-        that is fixed to the world, or else a camera that follows the first body.
+            MuJoCo's default free camera. The default is the model's first tracking camera. Without one, it is the first
+            camera that is fixed to the world, or else a camera that follows the first body.
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
         progress: A function that is called after each frame with the number of frames so far and the total number. The
@@ -80,7 +80,7 @@ def write_video(
 
 
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
-    """Yield a shot (the content of a frame) for each state.
+    """Yield the content of a frame for each state.
 
     Args:
         env: The environment of the states.
@@ -103,7 +103,7 @@ class Recorder:
     """Makes a video of shots that arrive one by one, for example from the viewer.
 
     Shots wait in a queue until a subprocess of low priority draws them, so ``add`` returns at once. If the queue is
-    full, further shots are dropped, and the last shot in the queue is displayed longer, so that the video keeps its
+    full, further shots are dropped. The last shot in the queue is then displayed longer, so that the video keeps its
     duration. The file is written when the video is complete. After ``cancel``, or if the program is killed,
     an older file of the same name is unchanged.
 
@@ -127,14 +127,14 @@ class Recorder:
         self.added = 0
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
-        """The number of frames that repeat an earlier shot, because their own shot was dropped."""
+        """The number of frames whose own shot was dropped, and which repeat an earlier one."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
         self._changed = threading.Condition()  # its lock also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
-        # instead of Thread.join, which in Python 3.11 marks the thread as stopped if a signal interrupts it
+        # instead of Thread.join: in Python 3.11, it marks the thread as stopped if a signal interrupts it
         self._done = threading.Event()
         threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
 
@@ -196,7 +196,6 @@ class Recorder:
             raise self._error
 
     def _draw(self) -> None:
-        """Draw shots from the queue in a thread."""
         try:
             with self._drawing as drawing:
                 while (shot := self._next()) is not None:

@@ -13,43 +13,41 @@ from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
-"""The available speeds, in simulated seconds per second."""
+"""Simulated seconds per second."""
 MANY_STEPS = 50
 """The number of steps that an arrow key with Shift makes."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Maps the panel's name of a key to studio's name, for keys whose names differ."""
+"""Keys whose names in the panel and in studio differ."""
 
 
 class Actions:
     """Stores the user's choices, and sends the corresponding commands.
 
     Args:
-        scene: What does not change during the session.
+        scene: The constants of the session.
         do: A function that sends a command to the session.
     """
 
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do
         self.frame: Frame | None = None
-        """The displayed frame; None before the first frame."""
+        """None before the first frame."""
         self.viewer: Any
-        """Studio's viewer, which is set when the window starts."""
+        """Studio's viewer. It is set when the window starts."""
         self.cameras: ViewCameras
-        """The cameras of the view, which are set when the window starts."""
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
         """The titles of the open windows."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
-        """Whether the list of messages must scroll down to a new message."""
         self._keys = key_table()
         self._steering = (0.0, 0.0, 0.0)  # the last command that the keys gave
 
     @property
     def status(self) -> Status:
-        """The session's status; available after the first frame."""
+        """The session's status. There is none before the first frame."""
         assert self.frame is not None
         return self.frame.status
 
@@ -87,7 +85,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Let the user drive, beginning with a velocity of 0, or let the task choose commands again."""
+        """Let the user drive, starting from a velocity of 0, or let the task choose commands again."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 
@@ -141,7 +139,6 @@ class Key:
     what: str
     action: Callable[["Actions"], None]
     repeat: bool = False
-    """Whether the key repeats while it is held."""
 
     @property
     def code(self) -> Any:
@@ -161,7 +158,7 @@ class Key:
 
 
 def key_table() -> list[Key]:
-    """The keys of the panel; browsers pass all of them on to the page."""
+    """List the keys of the panel. Browsers pass all of them on to the page."""
     return [
         Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
         Key("F2", "messages", lambda p: p.toggle_window("messages")),

@@ -1,7 +1,6 @@
 """Run the window process: receive frames, draw them with studio, and send commands.
 
-The process imports mujoco, NumPy, ``viewer/window`` and ``viewer/protocol.py``. Importing torch and Warp would cost
-seconds and hundreds of megabytes.
+The process does not import torch and Warp, which would cost seconds and hundreds of megabytes.
 """
 
 import contextlib
@@ -20,17 +19,17 @@ from lyceum_warp.viewer.window.proxy import Proxy
 from lyceum_warp.viewer.window.sockets import private_socket
 
 IDLE_TIME = 0.25
-"""The seconds between two frames while no page is open."""
+"""Seconds between two frames while no page is open."""
 NICE = 5
-"""The niceness of the window process: a low priority, because the session's planner may need every core."""
+"""A low priority, because the session's planner may need every core."""
 END_TIME = 3.0
-"""The maximum time that studio may take to end, in seconds."""
+"""Maximum time until studio ends, in seconds."""
 
 
 class WindowEnd:
     """The window's end of the connection to the session.
 
-    One thread receives frames, and the drawing thread takes the latest frame.
+    One thread receives frames, and the drawing thread takes the latest one.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -46,7 +45,7 @@ class WindowEnd:
             self._connection.send(reply)
 
     def take(self) -> Frame | None:
-        """Return the latest frame; None if it was already returned."""
+        """Return the latest frame, or None if it was already returned."""
         self._looked = time.monotonic()
         with self._lock:
             frame, self._frame = self._frame, None
@@ -71,7 +70,7 @@ class WindowEnd:
 
 
 def main(descriptor: int) -> None:
-    """Draw until the session or the user ends the window; ``descriptor`` is the connection to the session."""
+    """Draw until the session or the user ends the window. ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
     if hasattr(os, "nice"):  # not on Windows
         os.nice(NICE)

@@ -1,4 +1,4 @@
-"""Push the body that the mouse drags, or move the body while paused."""
+"""Push the body that the mouse drags, or move it while paused."""
 
 import threading
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Mouse:
         self._lock = threading.Lock()
 
     def drag(self, viewer: Any, *, paused: bool) -> None:
-        """Push the selected body while the mouse drags it, or move it if the session is paused.
+        """Push the selected body while the mouse drags it. If the session is paused, move it instead.
 
         Args:
             viewer: Studio's viewer.
@@ -49,14 +49,12 @@ class Mouse:
             self._end()
 
     def _end(self) -> None:
-        """Clear the applied force."""
         if self._pushed is not None:
             forces, self._pushed = np.zeros_like(self._pushed.forces), None
             self._do(Perturb(forces=forces))
 
 
 def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.MjvPerturb, paused: bool) -> Perturb:
-    """Compute the force or the new position from a drag."""
     data.xfrc_applied[:] = 0
     mujoco.mjv_applyPerturbPose(model, data, perturb, int(paused))
     if not paused:
@@ -71,5 +69,4 @@ def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.Mj
 
 
 def _rounded(push: Perturb) -> list[Any]:
-    """Round the numbers of a command, so that rounding errors do not make commands differ."""
     return [None if part is None else (part.round(9) + 0.0).tolist() for part in vars(push).values()]

@@ -15,19 +15,19 @@ from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
-"""The minimum time between two models that are sent to the browser, in seconds."""
+"""Minimum time between two models that are sent to the browser, in seconds."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
     """A plugin of studio that shows frames and sends commands.
 
     Args:
-        scene: What does not change during the session.
+        scene: The constants of the session.
         model: The scene's model.
         send: A function that sends a message to the session.
-        newest: A function that returns the latest frame; None if it was already returned.
+        newest: A function that returns the latest frame, or None if it was already returned.
         screen: The screen that runs the plugin.
-        opened: The message that is sent to the session when the window is open.
+        opened: The message to the session when the window is open.
         offer: A function that offers a file for download.
         limit: The maximum number of geoms for ghosts and traces.
     """

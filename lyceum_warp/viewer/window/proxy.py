@@ -1,6 +1,6 @@
 """Serve studio's page through a reverse proxy with access control.
 
-Studio's own server has no password. The server listens on a private socket (``sockets.py``), which refuses other
+Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other
 processes. The proxy forwards a request only if
 
 - the ``Host`` header is an address or a name of this machine (against DNS rebinding);
@@ -11,7 +11,7 @@ processes. The proxy forwards a request only if
 
 Browsers send a cookie to all ports of a host, including the servers of other users on the loopback address. The cookie
 is therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests
-addresses from the root of the host; a script from the proxy prefixes these addresses with the path.
+addresses from the root of the host. A script from the proxy prefixes these addresses with the path.
 
 aiohttp parses requests, and limits their headers to 128 lines of 8 KiB. The proxy runs in a thread.
 """
@@ -38,16 +38,17 @@ from yarl import URL
 from lyceum_warp.viewer.window.sockets import public_sockets
 
 HEAD_SECONDS = 10.0
-"""The timeout for a request's headers, and for idle connections, in seconds."""
+"""Timeout for a request's headers and for idle connections, in seconds."""
 WRITE_SECONDS = 60.0
-"""The timeout for a client that does not read, in seconds."""
+"""Timeout for a client that does not read, in seconds."""
 UNCHECKED = 128
-"""The maximum number of connections that have not sent the secret; above it, the oldest ones are closed."""
+"""Maximum number of connections that have not sent the secret. Above it, the oldest ones are closed."""
 MESSAGE_BYTES = 2**20
-"""The maximum size of a WebSocket message from a browser, in bytes."""
+"""Maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
-"""The seconds without input after which the page in control counts as closed or hidden. An open page sends input with
-every frame."""
+"""The page in control counts as hidden after this many seconds without input. An open page sends input with every
+frame.
+"""
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -57,8 +58,9 @@ PROTECTION = {
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for SharedArrayBuffer
     "Document-Isolation-Policy": "isolate-and-require-corp",  # the same in notebooks, for Chromium
 }
-"""The headers of every response. These headers stop other sites from reading or embedding the response, and from
-getting its address. Pages of this machine that know the token, such as notebooks, may embed a response."""
+"""The headers of every response. They stop other sites from reading or embedding the page, or from getting its address.
+Pages of this machine that know the token, such as notebooks, may embed it.
+"""
 SCRIPT = """<script>
 (() => {
   const path = location.pathname.slice(0, location.pathname.indexOf("/", 1));
@@ -109,9 +111,11 @@ SCRIPT = """<script>
   } catch {}
 })();
 </script>"""
-"""The script that the proxy inserts into studio's page. The script prefixes requested addresses with the secret path,
-gives control to the visible tab while other tabs wait, starts with the browser's theme, shows links to new files, and
-keeps the title."""
+"""The script that the proxy inserts into studio's page.
+
+It prefixes requested addresses with the secret path, and gives control to the visible tab while other tabs wait. It
+starts with the browser's theme, shows links to new files, and keeps the title.
+"""
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
 _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
@@ -125,8 +129,8 @@ _SocketEnd = web.WebSocketResponse | aiohttp.ClientWebSocketResponse
 class Proxy:
     """A reverse proxy that forwards requests with the secret to studio's server.
 
-    The constructor opens the port, ``start`` begins to answer, and ``close`` or the end of a ``with`` block closes the
-    port.
+    The constructor opens the port, and ``start`` begins to answer. ``close``, or the end of a ``with`` block, closes
+    the port.
 
     Args:
         host: The address or the name on which to listen; see ``lw.view``.
@@ -142,7 +146,6 @@ class Proxy:
         self._sockets = public_sockets(host, port)
         addresses = [ipaddress.ip_address(each.getsockname()[0].partition("%")[0]) for each in self._sockets]
         self.port: int = self._sockets[0].getsockname()[1]
-        """The public port."""
         self.local = all(address.is_loopback for address in addresses)
         """Whether only this machine can connect."""
         self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
@@ -164,12 +167,12 @@ class Proxy:
 
     @property
     def address(self) -> str:
-        """The page's address with the token, for a browser."""
+        """The page's address with the token."""
         return self._address(self._shown_host)
 
     @property
     def ssh_line(self) -> str:
-        """The ssh command by which another machine forwards the port."""
+        """The ssh command that forwards the port to another machine."""
         host, port = self._ssh
         with contextlib.suppress(KeyError, OSError):  # in some containers the user has no name
             host = f"{getpass.getuser()}@{host}"
@@ -193,7 +196,7 @@ class Proxy:
 
         Args:
             upstream: The host and the port of studio's server.
-            on_quiet: A function that this thread calls after the page in control was closed or hidden.
+            on_quiet: Called in the proxy's thread after the page in control was closed or hidden.
         """
         self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
         ready = threading.Event()
@@ -206,7 +209,7 @@ class Proxy:
         self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._tell(file)))
 
     def close(self) -> None:
-        """Close the port and all connections. A second call does nothing."""
+        """Close the port and all connections."""
         if self._thread is not None and self._thread.is_alive():
             with contextlib.suppress(RuntimeError):  # the event loop has just ended
                 self._loop.call_soon_threadsafe(self._stop.set)
@@ -256,7 +259,7 @@ class Proxy:
             raise
 
     def _check_sender(self, request: web.BaseRequest) -> None:
-        """Refuse unknown hosts, requests from pages of other sites, and all requests except a plain GET."""
+        """Refuse unknown hosts, pages of other sites, and all requests except a plain GET."""
         host = request.headers.get("Host", "").lower()
         match = _HOST.fullmatch(host)
         if match is None:
@@ -270,7 +273,7 @@ class Proxy:
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # allow links on any page, and frames on pages of this host name; both work only with the token
+        # allow links from any page, and frames in pages of this host name; both still need the token
         site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
         linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
         if foreign or (_is_cross_site(request) and not linked):
@@ -295,14 +298,13 @@ class Proxy:
         }
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
-        # If the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
-        # redirect. If the next request comes from a page of the proxy, browsers send the cookie, so answer with such a
-        # page.
+        # After a link on another site, browsers do not send a SameSite=Strict cookie, not even after a redirect. They
+        # do send it when a page of the proxy makes the next request, so answer with such a page.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 
     def _checked_target(self, request: web.BaseRequest) -> str:
-        """Check the path and the cookie; return the target without the secret path."""
+        """Check the path and the cookie, and return the target without the secret path."""
         path, question, query = request.raw_path.partition("?")
         first, slash, below = path.removeprefix("/").partition("/")
         wanted = f"{_COOKIE}={self._cookie}"
@@ -370,7 +372,7 @@ class Proxy:
         return browser
 
     def _hear(self) -> None:
-        """Restart the timer that detects that the page in control was closed or hidden."""
+        """Restart the timer that detects a closed or hidden page."""
         if self._silence is not None:
             self._silence.cancel()
         self._silence = self._loop.call_later(QUIET_SECONDS, self._on_quiet)
@@ -398,7 +400,7 @@ class _Server(web.Server):
 
 
 async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None] | None = None) -> None:
-    """Forward messages until the source is closed; then close the sink with the same code.
+    """Forward messages until the source is closed. Then close the sink with the same code.
 
     Args:
         source: The receiving end.
@@ -423,7 +425,6 @@ async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None]
 
 
 def _same(given: str, secret: str) -> bool:
-    """Compare two strings in constant time."""
     return hmac.compare_digest(given.encode(errors="replace"), secret.encode())
 
 
@@ -432,5 +433,4 @@ def _is_cross_site(request: web.BaseRequest) -> bool:
 
 
 def _bracketed(host: str) -> str:
-    """Put an IPv6 address in brackets."""
     return f"[{host}]" if ":" in host else host

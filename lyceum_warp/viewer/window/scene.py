@@ -15,16 +15,15 @@ LINE_WIDTH = 3.0  # pixels
 SHRUNK = 0.98
 ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
-"""The maximum number of lines of all traces. A limit is necessary, because all geoms are sent to the browser 60 times a
-second, with about 600 bytes each."""
+"""Maximum number of lines of all traces. Each line costs about 600 bytes, 60 times a second."""
 FEWEST_SEGMENTS = 4
-"""The minimum number of lines of a trace; if this is too many for all traces, some are not drawn."""
+"""Minimum number of lines of one trace. If they are too many for all traces, some traces are left out."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""The prefixes of the model fields that change how the model is drawn."""
+"""Prefixes of the model fields that change how the model is drawn."""
 
 
 # ghosts and traces
@@ -42,7 +41,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # room for the geoms and sites of two more worlds: the displayed one, and the ghost that exceeds the limit
+        # room for two more worlds: the displayed one, and the ghost that exceeds the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(
@@ -54,11 +53,11 @@ class ExtraGeoms:
         arrows: Sequence[Arrow] = (),
         groups: np.ndarray | None = None,
     ) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame; the geoms are valid until the next frame.
+        """Make the geoms of a frame. They are valid until the next frame.
 
         Args:
             pose: The pose of the displayed world.
-            ghosts: Further poses.
+            ghosts: Poses of the ghosts.
             traces: The paths of samples, (samples, points, 3), in metres.
             best: The index of the best sample.
             arrows: Arrows.
@@ -93,7 +92,7 @@ class ExtraGeoms:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # surfaces that coincide would flicker
                 geom.size *= (
-                    SHRUNK  # the surfaces may coincide even so, as those of a capsule that has turned about its axis
+                    SHRUNK  # surfaces may still coincide, as those of a capsule that has turned about its axis
                 )
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
@@ -105,7 +104,6 @@ class ExtraGeoms:
         return geoms
 
     def _place(self, pose: Pose) -> None:
-        """Compute the kinematics of a pose."""
         data = self._data
         data.qpos[:] = pose.qpos
         if self.model.nmocap:
@@ -114,7 +112,7 @@ class ExtraGeoms:
 
 
 def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
-    """Draw paths with at most ``limit`` lines; drop points first, then whole paths."""
+    """Draw paths with at most ``limit`` lines. Drop points first, then whole paths."""
     if not paths:
         return []
     segments = min(len(paths[0]) - 1, max(limit // len(paths), FEWEST_SEGMENTS))
@@ -126,14 +124,13 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
             line = mujoco.MjvGeom()
             kind, rgba = mujoco.mjtGeom.mjGEOM_LINE, np.array(colour, dtype=np.float32)
             mujoco.mjv_initGeom(line, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
-            line.emission = 1.0  # make lines visible in the dark
+            line.emission = 1.0  # visible in the dark
             mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
     return lines
 
 
 def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
-    """Draw all arrows that have a length."""
     geoms, kind = [], mujoco.mjtGeom.mjGEOM_ARROW
     for arrow in arrows:
         if np.linalg.norm(arrow.end - arrow.start) > SHORTEST_ARROW:
@@ -162,7 +159,7 @@ class ModelValues:
         """The model with the current values."""
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
-        """Set a world's values; return whether any value has changed, and whether the change is visible."""
+        """Set a world's values. Return whether any value has changed, and whether the change is visible."""
         changed = [
             name for name in {*values, *self._values}
             if name not in values or name not in self._values or not np.array_equal(values[name], self._values[name])
@@ -207,7 +204,7 @@ class ViewCameras:
         self.state.camera_index = ux.set_camera(self.values.model, self.viewer.camera, index)
 
     def reset(self) -> None:
-        """Look at the whole model, and track a body if a camera of the model tracks it."""
+        """Look at the whole model. If a camera of the model tracks a body, track this body."""
         model = self.values.model
         mujoco.mjv_defaultFreeCamera(model, self.viewer.camera)
         self.state.camera_index = ux.TUMBLE_CAMERA_IDX

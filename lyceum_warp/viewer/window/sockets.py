@@ -8,7 +8,7 @@ import stat
 from typing import Any
 
 FIRST_PORT, PORTS = 8080, 20
-"""The ports that are tried by default, before any free port."""
+"""The first port that is tried by default, and the number of ports before any free one is taken."""
 
 _LOOPBACK = ("127.0.0.1", "::1")
 
@@ -55,7 +55,7 @@ def _is_own(connection: socket.socket) -> bool:
 
 
 def public_sockets(host: str, port: int | None) -> list[socket.socket]:
-    """Listen on all addresses of a host, with the same port.
+    """Listen on the same port of all addresses of a host.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -82,7 +82,7 @@ def public_sockets(host: str, port: int | None) -> list[socket.socket]:
 
 
 def _listen(host: str, port: int) -> list[socket.socket]:
-    # listen on both loopback addresses, because another program on one of them could pose as the viewer
+    # take both loopback addresses, because another program could listen on the second and pose as the viewer
     names = _LOOPBACK if host in ("", "localhost", *_LOOPBACK) else ("0.0.0.0", "::") if host == "::" else (host,)
     opened: list[socket.socket] = []
     with contextlib.ExitStack() as failed:

@@ -1,8 +1,8 @@
-"""Wrap mujoco.studio, which no other module imports, because its interface may still change.
+"""Wrap mujoco.studio in one module, because its interface may still change.
 
 Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens studio with a
-plugin. The plugin is derived from ``Plugin``, and has handlers for ``Started``, ``Update`` and ``Gui``. The simulation
-is in another process, so studio's own stepping, history and model loading are not used.
+plugin, a subclass of ``Plugin`` with handlers for ``Started``, ``Update`` and ``Gui``. Studio's own stepping, history
+and model loading are not used, because the simulation is in another process.
 """
 
 import socket
@@ -23,13 +23,13 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
-"""The maximum number of geoms that a browser draws in addition to the model's geoms."""
+"""Maximum number of geoms that a browser draws in addition to the model's."""
 
 Plugin: Any = plugin.ViewerPlugin
-"""The base class of plugins; after ``Started``, ``self.viewer`` is the viewer."""
+"""The base class of plugins. After ``Started``, ``self.viewer`` is the viewer."""
 
 handler: Any = messages.handler
-"""Decorator for a plugin's method. The method handles messages of the type in its annotation."""
+"""Decorator for a plugin's method, which handles messages of the type in its annotation."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
@@ -68,14 +68,14 @@ class Screen:
             taken.append(True)
             return sock
 
-        # studio would listen on every address, and on a loopback port to which other processes can connect
+        # by default, studio listens on every address, and on a loopback port that other processes can use
         web_server.bind_public_socket = bound
         web_server.bind_loopback_socket = lambda port=0: private_socket()
         launch_web.run_web_viewer(config, self._viewer_end, plugins=[_Guard(taken), own])
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raise an error if studio did not take the given socket, because it would then listen on all addresses."""
+    """Raises an error if studio did not take the given socket. It would then listen on all addresses."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken

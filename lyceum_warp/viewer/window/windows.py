@@ -11,12 +11,13 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""The maximum number of points of a plotted curve, and the time in seconds that a curve covers. Points are limited,
-because every frame sends all points to the browser."""
+"""Maximum number of points of a plotted curve, and the time in seconds that it covers. Every frame sends all points to
+the browser.
+"""
 NARROW = 1100
-"""The width in pixels below which the initial windows would cover the robot, for example in a notebook."""
+"""Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
-"""The curves that are displayed at the start: the reward and the evaluation."""
+"""The curves at the start: the reward and the evaluation."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
@@ -54,12 +55,12 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw a window, unless it is closed. The main window can only be folded.
+        """Draw an open window. The main window can only be folded.
 
         Args:
-            title: Its title.
+            title: The window's title.
             place: The left edge, the top edge, the width and the height in pixels.
-            cond: The condition under which the place is set, an ``ImGuiCond``.
+            cond: When the place is set, an ``ImGuiCond``.
             content: A function that draws the content.
         """
         left, top, width, height = place
@@ -179,7 +180,6 @@ class Windows:
         two_columns("##status", [*rows, *self._last_values()[:FEW_CURVES], *status.text])
 
     def _drive(self) -> None:
-        """Show a walking robot's command, and let the user replace it."""
         status, speeds = self._actions.status, self._scene.speeds
         if speeds is None or status.command is None:
             return
@@ -194,7 +194,7 @@ class Windows:
                 self._actions.do(protocol.Drive((command[0], command[1], command[2])))
 
     def _numbers(self) -> None:
-        """Let the user change the planner's settings and the task's parameters; send a value when its edit ends."""
+        """Let the user change the planner's settings and the task's parameters. A value is sent when its edit ends."""
         status = self._actions.status
         parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
         for of, numbers in parts:
@@ -214,7 +214,6 @@ class Windows:
             imgui.PopItemWidth()
 
     def _push(self) -> None:
-        """Explain how to push a body."""
         viewer, paused = self._actions.viewer, self._actions.status.paused
         body = viewer.perturb.select
         name = viewer.model.body(body).name if body > 0 else ""
@@ -227,12 +226,10 @@ class Windows:
         )
 
     def _metrics(self) -> None:
-        """Show the last value of each curve that is not part of the status."""
         if (values := self._last_values()[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
             two_columns("##metrics", values)
 
     def _last_values(self) -> list[tuple[str, str]]:
-        """Return the last value of each curve."""
         rows = self.curves.rows
         values = rows[-1, 2:].tolist() if len(rows) else []
         return [(name, f"{value:.4g}") for name, value in zip(self._scene.curves, values, strict=False)]
@@ -340,7 +337,6 @@ class Windows:
             ux.watch_gui(viewer.model, viewer.data, self._actions.cameras.state)
 
     def _joints(self) -> None:
-        """Show the joints, and let the user move them while paused."""
         viewer, frame = self._actions.viewer, self._actions.frame
         paused = frame is not None and frame.status.paused
         imgui.TextDisabled("drag a joint to move it" if paused else "pause to move joints")
@@ -374,7 +370,7 @@ def highlighted_button(label: str, on: bool) -> bool:
 
 
 def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
-    """Draw names and values."""
+    """Draw names and values in two columns."""
     if imgui.BeginTable(label, 2):
         for name, value in rows:
             imgui.TableNextColumn()
@@ -385,7 +381,7 @@ def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
 
 
 def combo(label: str, names: Any, now: int) -> int | None:
-    """Draw a list of choices; return the index of a new choice."""
+    """Draw a list of choices, and return the index of a new choice."""
     changed, chosen = imgui.Combo(label, now, list(names))
     return int(chosen) if changed and chosen != now else None
 
@@ -404,7 +400,7 @@ class Curves:
 
     def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 2 + number))
-        """The points, (points, 2 + number): the time in seconds, whether an episode ended, and a value per curve."""
+        """(points, 2 + number): the time in seconds, whether an episode ended, and a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
         """Append points. If time decreases, for example after steps back, points of later times are dropped."""
@@ -414,7 +410,10 @@ class Curves:
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reduce the last ``seconds`` to at most ``points`` rows: the minimum, mean and maximum of successive rows."""
+        """Reduce the last ``seconds`` to at most ``points`` rows.
+
+        The three results have the minimum, the mean and the maximum of successive rows.
+        """
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows
