@@ -16,15 +16,15 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced, unknown_format
 
 FORMAT = 1
-"""Format version of run folders and their files. The version increases when older releases cannot read new files."""
+"""Format version of run folders and their files. It increases when older releases cannot read new files."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
 PolicyContent = dict[str, Any]
-"""Content of a saved policy: ``iteration``, ``policy``, and ``value`` if there is a value function."""
+"""``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The class of each network, for files that do not name the class."""
+"""The class of each network, for files that do not name it."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
@@ -33,7 +33,7 @@ def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = 
     Args:
         iteration: Number of complete iterations.
         policy: The policy.
-        value: The value function, or None.
+        value: The value function.
     """
     content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
@@ -56,7 +56,7 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
         content: The content to write.
         options: Additional arguments for ``replaced``.
     """
-    buffer = io.BytesIO()  # write with Python, which raises OSError on a full disk, unlike torch
+    buffer = io.BytesIO()  # Python's writes raise OSError on a full disk, unlike torch's
     torch.save(content, buffer)
     with replaced(path, **options) as temporary:
         temporary.write_bytes(buffer.getbuffer())
@@ -92,7 +92,6 @@ def value_of(content: PolicyContent, path: Path) -> nn.Module:
 
 
 def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
-    """Load a network's weights from a file's content."""
     saved = content[name]
     try:
         module = given
@@ -112,11 +111,11 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
 
 
 def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
-    """Make a network with the class and shape in a file; the class must be part of this package."""
+    """Make a network with the class and shape in a file. The class must be part of this package."""
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # import only modules of algos, because a file could name any module, and importing runs its code
+        # import only modules of algos, because importing a module runs its code, and the file could name any module
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
@@ -145,7 +144,7 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """Describe the first difference between the weight shapes of a module and of a file; "" if all shapes are equal."""
+    """Describe the first difference between the weight shapes of a module and of a file, or return ""."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
     saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
@@ -158,7 +157,7 @@ def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
 def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
-    """Read a checkpoint or a saved policy. Reading executes no code from the file.
+    """Read a checkpoint or a saved policy. Code in the file is never run.
 
     Args:
         path: The file.
@@ -205,10 +204,10 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""Maps the names of a checkpoint's entries to functions that check the entries' values."""
+"""The checks of a checkpoint's entries, by name."""
 
 
 def _first_sentence(error: BaseException) -> str:
-    """Get the first sentence of an error message; torch's whole messages can fill a page."""
+    """Get the first sentence of an error message. A message of torch can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

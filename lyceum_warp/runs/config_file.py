@@ -1,4 +1,4 @@
-"""Read a run's config.json, and check the types of all entries that the package reads."""
+"""Read a run's config.json, and check the types of its entries."""
 
 import json
 from pathlib import Path
@@ -9,7 +9,7 @@ from lyceum_warp.support.files import unknown_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""Stands in ``_ENTRIES`` for the type of non-negative whole numbers."""
+"""The type of non-negative whole numbers in ``_ENTRIES``."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
@@ -22,8 +22,7 @@ _KEPT: dict[str, Any] = {
     "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
     "program": bool,
 }  # fmt: skip
-"""The type of each entry of config.json, and of each entry in its dicts ``reached`` and ``kept``. All entries are
-optional."""
+"""The types of the entries of config.json, and of its dicts ``reached`` and ``kept``. All entries are optional."""
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -31,11 +31,11 @@ log = logging.getLogger(__name__)
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
     "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
 }  # fmt: skip
-"""Maps an algorithm's name in config.json to two classes: the learner, and its hyperparameters."""
+"""The class of the learner and of its hyperparameters, by the algorithm's name in config.json."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
-    """Make the content of config.json, from which ``Configuration`` makes the same learner."""
+    """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
     others = options.given()
     if learner.team.neighbours > 1:  # omit nthread: the run may be resumed with another number of processes
@@ -67,32 +67,30 @@ class Configuration:
     """Configuration of a run: the task, the environment's options, and the algorithm with its hyperparameters."""
 
     task: str | None
-    """The task's name or file; None if the task was defined in a notebook."""
+    """The task's name or file. None if the task was defined in a notebook."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The task's parameters."""
     options: EnvOptions
-    """Options of the environment; ``nworld`` counts the worlds of all processes."""
+    """Options of the environment. ``nworld`` counts the worlds of all processes."""
     algorithm: str
-    """Name of the algorithm."""
     hyperparameters: Any
-    """The algorithm's hyperparameters; None for an algorithm that is not in ``ALGORITHMS``."""
+    """The algorithm's hyperparameters. None for an algorithm that is not in ``ALGORITHMS``."""
     seed: int | None = None
-    """Seed of the algorithm; None means the environment's seed."""
+    """Seed of the algorithm. None means the environment's seed."""
     threads: int = 1
     """Threads of torch."""
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration; if the file of a table parameter is missing, use the run's copy of the file.
+        """Read a run's configuration. A missing file of a table parameter is replaced by the run's copy.
 
         Raises:
             ValueError: A value is missing or not valid.
         """
         config = run.config
         try:
-            # earlier releases stored options that were given as --param in "params", or wrote no "physics"
+            # earlier releases stored --param options in "params", or wrote no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # an option of earlier releases, which had no effect on results
+            words.pop("unroll", None)  # an option of earlier releases without effect on results
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
@@ -125,11 +123,11 @@ class Configuration:
 
         Args:
             team: The processes that train together.
-            run: The run that provides the task. If a file has moved or changed, the run's copy of it is used.
+            run: The run that provides the task. A file that has moved or changed is replaced by the run's copy.
             networks: The initial policy and value function; None for new networks.
             note: Function that is called with messages about the task's files.
-            task: A task, in its current version, to use instead of the run's task.
-            trust: Whether to execute the run's task even if the run was not made by this user on this machine.
+            task: Another task to use instead, in its current version.
+            trust: Whether to execute the task even if the run was not made by this user on this machine.
 
         Raises:
             ValueError: A value is not valid, or ``run`` is not trusted.
@@ -161,13 +159,13 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """Load a learner's initial policy and value function from a run, and the iteration after which they were saved.
+    """Load a learner's initial policy and value function from a run, and the iteration at which they were saved.
 
     Args:
-        run: The run that saved the networks.
-        which: Policy of the run, or None to resume the run. A learner that resumes usually makes its networks from the
-            hyperparameters, so the returned networks are None. They are loaded only if the hyperparameters do not
-            describe them: if the run started from another run's networks, or if ``limit`` differs from its default.
+        run: The run.
+        which: Policy of the run, or None to resume the run. A resumed learner usually makes its networks from the
+            hyperparameters, so None is returned for them. Networks that the hyperparameters do not describe are
+            loaded: those of a run that started from another run, or with a ``limit`` that is not the default.
 
     Raises:
         FileNotFoundError: The run has no policy of this name or number.

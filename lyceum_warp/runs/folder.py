@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _TASK = "config.json", "task"
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
-"""Files that may remain in the folder if a process is killed while it creates a run. A new run replaces these files."""
+"""Remains of a process that was killed while it created a run. A new run replaces them."""
 
 log = logging.getLogger(__name__)
 
@@ -57,21 +57,21 @@ class Run:
     """
 
     metrics: Path
-    """Path of the metrics table."""
+    """Path of ``metrics.csv``."""
     checkpoint: Path
-    """Path of the checkpoint."""
+    """Path of ``checkpoint.pt``."""
     previous: Path
-    """Path of the previous checkpoint."""
+    """Path of ``previous.pt``."""
     replay: Path
-    """Path of the folder that holds the replay buffer."""
+    """Path of the folder ``replay``."""
     policy: Path
-    """Path of the last policy."""
+    """Path of ``policy.pt``."""
     best: Path
-    """Path of the best policy."""
+    """Path of ``best.pt``."""
     transfer: Path
-    """Path of ``transfer.json``, the verdict on the last policy."""
+    """Path of ``transfer.json``."""
     task_folder: Path
-    """Path of the folder with the copies of the task's file and model."""
+    """Path of the folder ``task``."""
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
@@ -116,15 +116,15 @@ class Run:
     ) -> "Run":
         """Create a run folder with a copy of the task, the configuration and the versions.
 
-        If an error occurs, the folder is deleted. If the task, its model or a parameter is a file of the user, the run
-        is recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``), so later calls can execute
-        the run's task without ``trust=True``.
+        The folder is deleted if an error occurs. If the task, its model or a parameter is a file of the user, the run
+        is recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``). Later calls can then execute
+        the task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
-            config: The configuration, which consists of JSON values.
-            device: Device of the run; the entry ``versions`` names the device's hardware.
-            files: The files of the folder ``task``: maps paths in the folder to files to copy, or to bytes to write.
+            config: The configuration, as JSON values.
+            device: Device of the run, for the entry ``versions``.
+            files: The content of the folder ``task``: maps paths in it to files to copy, or to bytes to write.
 
         Raises:
             ValueError: The folder is not empty, or is a file.
@@ -190,7 +190,7 @@ class Run:
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Get the path of an iteration's policy; the file exists if the policy was saved."""
+        """Get the path of an iteration's policy. The file exists if the policy was saved."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
@@ -200,7 +200,7 @@ class Run:
             which: "last", "best", or the number of an iteration.
 
         Raises:
-            FileNotFoundError: The run has no policy of this name or number; the message lists the run's policies.
+            FileNotFoundError: The run has no policy of this name or number. The message lists the run's policies.
             ValueError: ``which`` is neither a name nor a number.
         """
         if which == "last":
@@ -224,10 +224,10 @@ class Run:
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
-        """Read the iteration and the score of the best policy; None if there is no best policy.
+        """Read the iteration and the score of the best policy, or return None without one.
 
         Args:
-            note: Function that is called with a message if the file of the best policy is damaged.
+            note: Function that is called with a message if the file is damaged.
         """
         if not self.best.is_file():
             return None
@@ -245,14 +245,14 @@ class Run:
 
         Args:
             content: The policy and the value function.
-            state: The state of the algorithm, which consists of tensors, numbers, strings, dicts and lists.
+            state: The state of the algorithm: tensors, numbers, strings, dicts and lists.
         """
         write_content(self.policy, content)
         checkpoint = {**content, "state": dict(state)}
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
     def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
-        """Read the checkpoint's ``iteration``, ``policy``, ``state`` and (if the checkpoint has one) ``value``.
+        """Read the checkpoint's ``iteration``, ``policy``, ``state`` and, if it has one, ``value``.
 
         If the checkpoint is broken or missing, the previous checkpoint is read instead.
 
@@ -288,19 +288,19 @@ def load(
 ) -> Any:
     """Load a run's policy, including its observation normaliser. ``policy.act(obs)`` returns actions without noise.
 
-    For a ``GaussianPolicy``, ``policy(obs)`` returns the same mean actions. The parameters are frozen; ``NPG(env,
-    policy=lw.load(RUN))`` unfreezes and trains the parameters.
+    For a ``GaussianPolicy``, ``policy(obs)`` returns the same mean actions. The parameters are frozen.
+    ``NPG(env, policy=lw.load(RUN))`` unfreezes and trains them.
 
     Args:
         run: A run's folder, or a policy file in this folder.
         which: "last", "best" (see ``train``), or the number of a saved iteration.
-        policy: A policy into which the weights are loaded; required for custom classes of policies or networks.
+        policy: A policy into which the weights are loaded. Custom classes of policies or networks need it.
         device: Device for the parameters.
 
     Raises:
         FileNotFoundError: The run does not exist, or has no policy of this name or number.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release; or ``policy``
-            is required but missing, or does not fit the file.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. Or ``policy``
+            is missing or does not fit the file.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
@@ -310,7 +310,7 @@ def load(
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
     """Load a run's value function, a ``ValueFunction`` that predicts discounted returns by ``value(obs, step)``.
 
-    A run of SAC has a ``TwinCritic`` instead, which is called as ``value(obs, unit_action)``.
+    A run of SAC has a ``TwinCritic`` instead: ``value(obs, unit_action)``.
 
     Args:
         run: A run's folder, or a file with a value function in this folder.
@@ -327,7 +327,6 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
-    """Read a saved policy; return the file's content and path."""
     check_kind("run", run, str | Path | Run, "a run's folder")
     check_kind("which", which, str | int, "as 'last', 'best' or 100")
     check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")

@@ -11,11 +11,11 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], None]]:
-    """Context manager that locks a run. The file ``lock`` stores the process and its host.
+    """Lock a run in a ``with`` block. The file ``lock`` stores the process and its host.
 
-    The process locks this file by flock; the system releases the lock when the process ends, even after ``kill -9``.
-    On some network file systems, other hosts do not see the lock, so a lock file that names another host counts as
-    locked. On systems without flock, every lock file counts as locked until it is deleted.
+    The process locks this file by flock. The system releases the lock when the process ends, even after ``kill -9``.
+    On some network file systems, other hosts do not see the lock. A lock file that names another host therefore counts
+    as locked. On systems without flock, every lock file counts as locked until it is deleted.
 
     Args:
         folder: The run's folder.
@@ -56,7 +56,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
                     "run over with --take-over (take_over=True in Python)"
                 )
             if not path.exists() or not os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                continue  # another process has deleted or replaced the file since it was opened here
+                continue  # another process has deleted or replaced the file since it was opened
             file.truncate(0)
             file.write(own)
             file.flush()
@@ -70,7 +70,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
 
 
 def _owner(text: str) -> tuple[str, str]:
-    """Describe the process in a lock file, and return its host; the host is "" if the file is damaged."""
+    """Describe the process in a lock file, and return its host. The host of a damaged file is ""."""
     try:
         owner = json.loads(text)
         return f"process {owner['pid']} on {owner['host']}", str(owner["host"])

@@ -9,11 +9,11 @@ from lyceum_warp.support.files import replaced
 
 
 def append_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Append a row. New columns, for example after a change of the task, are empty in earlier rows.
+    """Append a row. New columns are empty in earlier rows.
 
     Args:
         path: The table; it need not exist.
-        row: Values by the names of columns. A value of None becomes an empty cell; floats are written with all digits.
+        row: Values by the names of columns. None becomes an empty cell. Floats are written with all digits.
     """
     lines: list[list[str]] = []
     if path.exists():
@@ -35,7 +35,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """Read the rows. An empty cell is None, and an incomplete last row, without a line end, is ignored.
+    """Read the rows. An empty cell is None. An incomplete last row, without a line end, is ignored.
 
     Raises:
         ValueError: A cell is not a number, or the rows differ in length.
@@ -53,7 +53,7 @@ def cut_rows(path: Path, iteration: int) -> None:
 
     Args:
         path: The table; it need not exist.
-        iteration: Number of the last iteration to keep. The first row need not be iteration 1.
+        iteration: The last iteration to keep. The first row need not be iteration 1.
 
     Raises:
         ValueError: The table is damaged. The file does not change.

@@ -15,10 +15,10 @@ def pretrained_tasks() -> list[str]:
 
 
 def pretrained_run(task: str) -> Path:
-    """Get the folder of a task's pretrained policy, which is a run's folder.
+    """Get the run folder of a task's pretrained policy.
 
-    ``lw.load`` and other functions accept this folder, as they accept every run's folder. The folder's config.json has
-    the training settings and, under ``evaluated``, the policy's return.
+    ``lw.load`` and other functions accept it like every run's folder. Its config.json has the training settings and,
+    under ``evaluated``, the policy's return.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))
@@ -27,7 +27,7 @@ def pretrained_run(task: str) -> Path:
         task: The task's name.
 
     Raises:
-        ValueError: The task has no pretrained policy; the message lists the tasks that have one.
+        ValueError: The task has no pretrained policy. The message lists the tasks that have one.
     """
     tasks = pretrained_tasks()
     if task not in tasks:
@@ -40,7 +40,7 @@ def pretrained_run(task: str) -> Path:
 
 
 def pretrained_text(run: Run) -> str:
-    """Describe in one line a pretrained policy's training and the settings that differ from the task's defaults."""
+    """Describe a pretrained policy in one line: its training, and the settings that differ from the task's defaults."""
     config, found = run.config, run.config["evaluated"]
     settings = {**config["params"], **config["physics"], **config["options"]}
     given = ", ".join(f"{name} {value}" for name, value in settings.items()) or "its defaults"

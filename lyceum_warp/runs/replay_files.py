@@ -1,9 +1,9 @@
-"""Save a replay buffer beside a run's checkpoint, in files that are not changed after they were written.
+"""Save a replay buffer beside a run's checkpoint, in files that are never changed.
 
 The sequence of all steps is divided into equal parts, each about 1/64 of the buffer, with one file per part. A save
-writes only the parts with new steps, so its duration is proportional to the number of new steps. A part with new steps
-is written to a new file. The part's old file is deleted after the checkpoint has been replaced, so the files always
-contain the checkpoint's steps.
+writes only the parts with new steps, so its duration is proportional to their number. A part with new steps gets a new
+file. Its old file is deleted after the checkpoint has been replaced. The files therefore always contain the
+checkpoint's steps.
 """
 
 from collections.abc import Callable, Iterator
@@ -17,7 +17,7 @@ _PARTS = 64
 
 
 def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], None] | None) -> None:
-    """Write the parts of the replay buffer that have new steps; all ranks must call this function.
+    """Write the parts of the replay buffer that have new steps. All ranks must call this function.
 
     Args:
         folder: The folder of the files; None on ranks that do not write.
@@ -29,7 +29,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
         first = max(start, oldest)
-        rows = {  # make the worlds the first axis, because gather concatenates along it
+        rows = {  # the worlds must be the first axis, because gather concatenates along it
             name: team.gather(part.transpose(0, 1).contiguous()).transpose(0, 1).cpu().contiguous()
             for name, part in replay.rows(first, end).items()
         }
@@ -63,7 +63,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # a later save that was interrupted may have written additional steps, which are ignored
+        # ignore later steps of a save that was interrupted
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")

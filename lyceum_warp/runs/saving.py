@@ -14,38 +14,37 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum time between saves in seconds; slow saves may be further apart, see ``LONG``."""
+"""Maximum time between saves in seconds, unless saves are slow (see ``LONG``)."""
 
 SHARE = 100
 """Usual time between saves, as a multiple of the last save's duration."""
 
 LONG = 20
-"""Minimum time between saves, as a multiple of the last save's duration; it may exceed ``SAVE_SECONDS``."""
+"""Minimum time between saves, as a multiple of the last save's duration. It may exceed ``SAVE_SECONDS``."""
 
 
 class Saver:
     """Writes a run's files.
 
-    The metrics of an iteration, a new best policy, and a policy in a numbered file are written immediately. The last
-    policy and the complete state are saved together: at the start, at the end and in between. The time between two
-    saves is 100 times the duration of the last save, but at most 30 s. For example, saves of 20 ms happen every 2 s and
-    take 1 % of the time; saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes
-    from the last save.
+    Metrics, a new best policy, and a policy in a numbered file are written after each iteration. The last policy and
+    the complete state are saved together: at the start, at the end and in between. The time between two saves is 100
+    times the duration of the last save, but at most 30 s. For example, saves of 20 ms happen every 2 s and take 1 % of
+    the time. Saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes from the last
+    save.
 
-    All ranks have a saver and make the same calls; only rank 0 writes.
+    All ranks have a saver and make the same calls. Only rank 0 writes.
 
     Args:
         run: The run; None on ranks that do not write.
         check: Function that checks the run's lock before every write; None if ``run`` is None.
         learner: The algorithm.
-        keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
+        keep_every: Iterations between two policies in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         saved: Number of the last saved iteration; -1 before the first save.
         note: Function that is called with a message if the file of the best policy is damaged.
     """
 
     saved: int
-    """Number of the last saved iteration."""
 
     def __init__(
         self,
@@ -67,10 +66,10 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's metrics; also write the policy if it is the best so far or needs a numbered file.
+        """Write an iteration's metrics. Also write the policy if it is the best so far or needs a numbered file.
 
         Returns:
-            The iteration's return, which decides whether its policy is the best; None if the iteration has no return.
+            The iteration's return, by which policies are compared. It may be None.
         """
         assert self.run is not None and self._check is not None
         self._check()
@@ -80,7 +79,7 @@ class Saver:
         score = None if score is None or math.isnan(score) else score
         better = score is not None and score > self._best
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
-        # return_mean belongs to the policy before the update, which sampled the episodes
+        # return_mean belongs to the policy that sampled the episodes, before the update
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
@@ -106,7 +105,7 @@ class Saver:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
         learner, run, replay = self.learner, self.run, self.learner.replay
-        state = learner.state_dict()  # on all ranks, because it gathers the worlds of all ranks
+        state = learner.state_dict()  # on all ranks, because it gathers their worlds
         if replay is not None:
             write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
         with learner.team.together():

@@ -26,21 +26,21 @@ log = logging.getLogger(__name__)
 Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
-"""Maps the path of each file to its content, or to the file from which to copy the content."""
+"""The content of each file, or the file from which to copy it."""
 
 _MODEL, TABLES = "model", "tables"
 _APART = 2
-"""The task's file and the model usually keep their paths relative to their common parent folder. If the task's file is
-more than this many levels below that folder, the file and the model are copied into separate folders."""
+"""The task's file and the model keep their relative paths, up to this many levels between the task's file and the
+common parent folder. Beyond it, they are copied into separate folders.
+"""
 _LARGEST = 512 * 2**20
-"""Maximum size of a model's files in bytes; larger models are not copied."""
+"""Maximum size of a model's files in bytes. Larger models are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Maximum number and maximum total size in bytes of a task's modules. If they exceed a limit, none of them is
-copied."""
+"""Maximum number and total size in bytes of a task's modules. Above either, none of them is copied."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """Collect the files of an environment's task to copy into a run folder: those that are not part of the package.
+    """Collect the files of an environment's task that are not part of the package, for a run folder.
 
     Returns:
         The entry ``kept`` of config.json, and the files for the folder ``task``, by their paths in it.
@@ -79,7 +79,7 @@ def json_value(name: str, value: Any) -> Any:
 
 
 def _table(value: Any) -> Any:
-    """Get the file or the array of a table parameter; None for any other parameter."""
+    """Get the file or the array of a table parameter. Other parameters give None."""
     if is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -92,14 +92,13 @@ def is_table(value: Any) -> bool:
 
 
 def _npy(array: np.ndarray) -> bytes:
-    """Make the content of a .npy file."""
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and the modules that it imports from its folder; omit the modules if they exceed a limit."""
+    """Get a task's file and the modules that it imports from its folder. Omit modules that exceed a limit."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
@@ -122,15 +121,15 @@ def run_env(
 ) -> Env:
     """Make an environment for a run's task.
 
-    If a file or a model has moved or changed since the run started, the run's copy is used, and ``note`` is called.
-    Tasks of the package are used in their current version.
+    A file or a model that has moved or changed since the run started is replaced by the run's copy, and ``note`` is
+    called. Tasks of the package are used in their current version.
 
     Args:
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
         note: Function that is called with each message.
-        task: Another task to use in place of the run's task, in its current version.
+        task: Another task to use instead, in its current version.
         trust: Whether to execute the task and read the files even if this user did not make the run on this machine;
             see ``lyceum_warp.runs.trust``.
 
@@ -184,7 +183,7 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """List the changes to a task's file, and to the modules that it imports, since the run started.
+    """List the changes since the run started to a task's file and to its modules.
 
     Args:
         file: The task's file.
@@ -203,19 +202,17 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
-    """Report how an environment's task and model differ from the run's task and model.
-
-    The environment itself does not change.
+    """Report how an environment's task and model differ from the run's.
 
     Args:
         run: The run.
         env: The environment.
         note: Function that is called with each message.
-        model: Whether to compare the compiled models, too; they also differ if the physics options differ.
+        model: Whether to compare the compiled models, which also depend on the physics options.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    # if the task's file is also the training script, a change may be unrelated to the task
+    # a task's file may also be the training script, and then a change may be unrelated to the task
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         note(f"{change}: it is used as it is now" if "changed" in change else change)
@@ -224,7 +221,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Check whether the model has changed since the run started; False if the version of MuJoCo has changed."""
+    """Check whether the model has changed since the run started. Another version of MuJoCo does not count."""
     known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
     # runs of earlier releases have no versions in config.json
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
@@ -236,7 +233,7 @@ def _digest(content: bytes) -> str:
 
 
 def _model_hash(env: Env) -> str:
-    """Hash the compiled model; the hash does not depend on the process or on paths."""
+    """Hash the compiled model. Processes and paths do not change the hash."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
@@ -251,15 +248,14 @@ def _model_hash(env: Env) -> str:
 
 
 def _beside(path: Path, file: Path) -> str:
-    """Get the path of a module relative to the folder of a task's file."""
     return path.relative_to(file.parent).as_posix()
 
 
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
     """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
 
-    Relative paths are preserved, so that the copied task finds the copied model. If the folders of the task's file and
-    the model are too far apart, the copy has a separate folder for the model.
+    Relative paths are kept, so that the copied task finds the copied model. If its folder is too far from the task's
+    file, the model gets a separate folder.
     """
     if not paths:
         return {}
@@ -272,10 +268,7 @@ def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collecti
 
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:
-    """Get the main file and all files of a task's model.
-
-    A model made in Python is written as MJCF; files to which the model refers are copied unchanged.
-    """
+    """Get the main file and all files of a task's model. A model made in Python is written as MJCF."""
     task, given = env.task.task, env.options.model
     source = given if given is not None else task.model
     if isinstance(source, str | Path):
@@ -310,7 +303,7 @@ def _dependencies(source: Path) -> list[Path]:
     """List the files to which a model file refers: includes, other models, meshes, textures, height fields."""
     if source.suffix.lower() != ".urdf":
         return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
-    root = ET.parse(source).getroot()  # parse a URDF, because MuJoCo lists no dependencies of URDF files
+    root = ET.parse(source).getroot()  # MuJoCo lists no dependencies of URDF files
     folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
     names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
     found = {
@@ -321,7 +314,6 @@ def _dependencies(source: Path) -> list[Path]:
 
 
 def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
-    """List the files to which a model made in Python refers."""
     parts = (*spec.meshes, *spec.hfields, *spec.skins)
     names = [Path(spec.meshdir, part.file) for part in parts if part.file]
     for texture in spec.textures:

@@ -1,4 +1,4 @@
-"""Record the runs that this user made or trusts; do not execute or read the files of other runs."""
+"""Record the runs that this user made or trusts. Files of other runs are neither executed nor read."""
 
 import datetime
 import hashlib
@@ -13,7 +13,7 @@ log = logging.getLogger(__name__)
 
 
 def remember(folder: Path, config: Mapping[str, Any]) -> None:
-    """Record a run as trusted, in this user's state directory.
+    """Record a run as trusted in this user's state directory.
 
     Args:
         folder: The run's folder.
@@ -35,7 +35,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         folder: The run's folder.
         config: Content of the run's config.json.
         named: The file to name in the error message.
-        runs: Whether the command would execute the run's task; otherwise it only reads files.
+        runs: Whether the command executes the run's task. Otherwise it only reads files.
         trust: Whether to trust and record the run.
 
     Raises:
@@ -53,13 +53,13 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
 
 
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
-    """Get the file that records a run as trusted; its name is a hash of all that the run can execute or read."""
+    """Get the file that records a run as trusted. Its name is a hash of all that the run can execute or read."""
     kept = config.get("kept", {})
     paths = [{key: value for key, value in config.get(part, {}).items() if isinstance(value, str)}
              for part in ("params", "options")]  # fmt: skip
     found = hashlib.sha256(json.dumps([config.get("task"), kept, paths], sort_keys=True).encode())
     task = folder / "task"
-    # hash the run's copy instead of the original, so that the run stays trusted if the user edits the original
+    # hash the run's copy, so that the run stays trusted if the user edits the original
     main = task / kept["file"] if "file" in kept else Path(str(config.get("task")).partition(":")[0])
     for name, path in [*((str(path.relative_to(task)), path) for path in sorted(task.rglob("*"))), ("", main)]:
         link, content = os.readlink(path) if path.is_symlink() else None, ""

@@ -103,7 +103,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file directly: the threads of torch's and TensorBoard's writers would hide the error of a full disk."""
+        """Open a file without torch's and TensorBoard's writers. Their thread would hide the error of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 

@@ -91,9 +91,7 @@ class ExtraGeoms:
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # surfaces that coincide would flicker
-                geom.size *= (
-                    SHRUNK  # surfaces may still coincide, as those of a capsule that has turned about its axis
-                )
+                geom.size *= SHRUNK  # surfaces may still coincide, such as those of a capsule that turned on its axis
                 geom.pos[:2] += ghost.shift
                 if colour is not None:
                     geom.rgba = colour
