@@ -31,18 +31,17 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""The largest value of ``success_steps``: a float32 counts the steps, and it is exact up to 2**24."""
+"""The largest value of ``success_steps``. The steps are counted in a float32, which is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """Load a task's model, or another given model, as an MjSpec, and apply the task's ``edit_model``."""
+    """Load a task's model, or the given model, as an MjSpec, and apply the task's ``edit_model``."""
     return _edited(task, _read_spec(task, model))
 
 
 def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
-    """Load a task's model without applying ``edit_model``."""
     if model is not None:
         return models.load_spec(model)
     if not hasattr(task, "model"):
@@ -52,7 +51,6 @@ def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
 
 
 def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    """Copy a model, and apply the task's ``edit_model`` to the copy."""
     copy = spec.copy()
     try:
         changed: Any = task.edit_model(copy)
@@ -70,11 +68,7 @@ def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def check_field_name(name: str) -> None:
-    """Refuse a name that neither MjData nor MjModel has.
-
-    Raises:
-        ValueError: There is no such field; the message suggests similar names.
-    """
+    """Refuse a name that neither MjData nor MjModel has."""
     if is_data_field(name) or is_model_field(name):
         return
     close = difflib.get_close_matches(name, [*similar_data_fields(name), *similar_model_fields(name)], 3)
@@ -83,11 +77,7 @@ def check_field_name(name: str) -> None:
 
 
 def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
-    """Compute the layout of each observation group, for given values of the task's parameters.
-
-    Raises:
-        ValueError: The task's ``obs`` is neither a dict of sizes nor a dict of such dicts, or a struct has no parts.
-    """
+    """Compute the layout of each observation group from the task's parameters."""
     task, name = source.task, source.name
     if not hasattr(task, "obs"):
         return {group: parts.sizes(slices) for group, slices in obs_slices(source, params).items()}
@@ -112,11 +102,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """Compute the layouts of observation groups that are declared as structs; return {} if the task has ``obs``.
-
-    Raises:
-        ValueError: ``observe`` takes no struct, or a struct has no parts, or a field of it has no size.
-    """
+    """Compute the layouts of observation groups that are declared as structs. Return {} if the task has ``obs``."""
     if hasattr(source.task, "obs"):
         return {}
     found = {}
@@ -149,16 +135,12 @@ class BoundTask:
 
     Args:
         task: The task's class.
-        nworld: Number of worlds, and the length of the array of a parameter that differs between worlds.
+        nworld: Number of worlds.
         model: A model to use instead of the task's own.
-        fields: Fields that the engine provides in addition to those in ``World``.
-        dynamics: Model fields that may differ between worlds in addition to those that the task writes.
+        fields: Further fields that the engine provides, beside those in ``World``.
+        dynamics: Further model fields that may differ between worlds, beside those that the task writes.
         physics: Options of the simulation.
-        params: Values for the fields of ``Params``; a scalar field takes one value, or one value per world.
-
-    Raises:
-        ValueError: The task is invalid, or a parameter or an option is invalid for this task.
-        FileNotFoundError: The model's file is missing.
+        params: Values for the fields of ``Params``. A scalar field takes one value, or one value per world.
     """
 
     def __init__(
@@ -186,10 +168,10 @@ class BoundTask:
         for name in named:
             check_field_name(name)
         self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
-        """The Warp types of one world's fields and rows of memory, by name."""
+        """The Warp types of one world's fields and rows of memory."""
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
-        """The fields of World and the rows of memory that each function writes, by the function's name."""
+        """The fields of World and the rows of memory that each function writes."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
@@ -206,34 +188,33 @@ class BoundTask:
         """The fields that the engine provides: those of World, those in ``fields``, the time and the controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
-        """The integration state at which a reset starts, (integration_size,) float64; None for the model's default."""
+        """The integration state at which a reset starts, (integration_size,) float64. None for the model's default."""
         self.parameters = Parameters(
             self.source.params, self.source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
             given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
         self.actions = self._checked_actions()
-        """Sizes of an action's parts, by name; None if the actions are MuJoCo's controls."""
+        """Sizes of an action's parts. None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
         """The layouts of a world's two rows, ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
-        """The parts of each group of observations and their sizes."""
         self.observers = self.source.group_functions(self.obs_layouts)
         """The functions that write observation groups, by group name."""
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.shared = self._shared_layouts()
-        """The layouts of the structs Shared and Sums; empty if worlds share no memory."""
+        """The layouts of the structs Shared and Sums. Empty if worlds share no memory."""
         structs = obs_slices(self.source, self.params) | self.shared
         self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
 
     @property
     def params(self) -> dict[str, Any]:
-        """The values of the parameters by name; the value is an array if it differs between worlds."""
+        """The values of the parameters. A parameter that differs between worlds is an array."""
         return self.parameters.values
 
     @property
     def reward_text(self) -> str:
-        """The generated source of the reward, the metrics and the terminations; empty if the task has no terms."""
+        """The generated source of the reward, the metrics and the terminations. Empty if the task has no terms."""
         return self.source.terms.text
 
     @property
@@ -266,7 +247,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return the fields that a function may write, by the name of the argument to which the fields belong."""
+        """Return the fields that a function may write, by the argument that has them."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -277,11 +258,10 @@ class BoundTask:
         }
 
     def _sort_model_fields(self, named: list[str], dynamics: Collection[str]) -> None:
-        """Separate the model fields that differ between worlds from those that do not."""
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
         between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
         self.reset_dynamics = [name for name in named if name in between]
-        """Names of the model fields that resets or events write. A reset first restores the fields' nominal values."""
+        """The model fields that resets or events write. A reset first restores their nominal values."""
         if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
             raise ValueError(
                 f"the model field {both[0]!r} of the task {self.name!r} is written by startup and by resets or "
@@ -301,15 +281,11 @@ class BoundTask:
             )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
-        """Change parameters.
-
-        Raises:
-            ValueError: A name is unknown, or the size of the observation or of the memory would change.
-        """
+        """Change parameters."""
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # raised by obs_layouts if a size differs between worlds
+        except ValueError:  # a size differs between worlds
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
@@ -403,11 +379,7 @@ class BoundTask:
         }
 
     def check_field(self, name: str, array: wp.array) -> None:
-        """Check that a field's type in World fits the engine's array, (nworld, ...).
-
-        Raises:
-            ValueError: The element types or the numbers of axes differ.
-        """
+        """Check that a field's type in World fits the engine's array, (nworld, ...)."""
         kind = self.types[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
         if not wp.types.types_equal(dtype, array.dtype) or ndim != array.ndim - 1:

@@ -1,8 +1,8 @@
 """Generate the source of a task's kernels, which call the task's functions for every world of a batch.
 
-The generated source defines a struct whose fields have an additional axis for the worlds, a function that returns a
-view of one world, and defaults for the functions that a task omits. The code is generated as text, because Warp
-compiles functions from their source.
+The generated source defines a struct whose fields have an additional axis for the worlds, and a function that returns
+a view of one world. It also defines defaults for the functions that a task omits. The code is generated as text,
+because Warp compiles functions from their source.
 """
 
 import dataclasses
@@ -105,14 +105,7 @@ def kernels_of(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> steps.Kernels:
-    """Return a task's kernels; tasks with the same functions, structs and sizes share them (see ``make_kernels``).
-
-    Args:
-        source: The task.
-        groups: The functions that write the task's observation groups.
-        memory: The layouts of the task's rows of memory.
-        structs: The layouts of rows that functions access as structs: observation groups, Shared and Sums.
-    """
+    """Return a task's kernels. Tasks with the same functions, structs and sizes share them (see ``make_kernels``)."""
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     called = tuple(source.terms.functions.items())
     key = (
@@ -167,7 +160,7 @@ def _generated(
             rows += [f"{name} = batch.{name}[w]", *view_lines(memory[name], "s", name, scope)]
         else:
             rows.append(f"s.{name} = batch.{name}[w]")
-        if name in memory or is_data_field(name):  # a step does not change model fields, so they are not copied
+        if name in memory or is_data_field(name):  # model fields are not copied, because a step does not change them
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope["restored_row"] = kernel_rows.restored_row
@@ -209,7 +202,7 @@ def _generated(
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Generate lines that copy one world's row of a field with ``ndim`` axes; each thread copies a part of the row."""
+    """Generate lines that copy one world's row of a field with ``ndim`` axes. Each thread copies a part of the row."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]

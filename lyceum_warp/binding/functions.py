@@ -18,16 +18,7 @@ from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, Task
 
 
 class TaskSource:
-    """Finds the structs and the functions of a task.
-
-    Args:
-        task: The task's class.
-        name: The task's name, for messages.
-
-    Raises:
-        ValueError: A struct or ``observe`` is missing, a function's signature is not the one in ``FUNCTIONS``, or a
-            name resembles a name in ``FUNCTIONS``.
-    """
+    """Finds the structs and the functions of a task."""
 
     def __init__(self, task: type[Task], name: str) -> None:
         self.task, self.name = task, name
@@ -38,28 +29,24 @@ class TaskSource:
         self.world: Any = self._struct("World")
         own: Any = self._struct("Params")
         self.defaults: type = own.cls
-        """The class that has the parameters' defaults as attributes."""
+        """The class with the parameters' defaults as attributes."""
         self.params: Any = self._with_functions(own)
         self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
-        """The fields of World that are the task's memory, by name."""
+        """The fields of World that are the task's memory."""
         self.shared, self.sums = self._shared_structs()
-        """The structs ``Shared`` and ``Sums``; None if the worlds of the task share no memory."""
+        """The structs ``Shared`` and ``Sums``. None if the worlds of the task share no memory."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by their names in ``FUNCTIONS``; None for missing functions."""
+        """The task's functions by their names in ``FUNCTIONS``. None for missing functions."""
         self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
 
     def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
-        """Return the functions that write observation groups, by group name.
-
-        Raises:
-            ValueError: No function writes a group, or a function writes a group that ``obs`` does not list.
-        """
+        """Return the functions that write observation groups, by group name."""
         found = {}
         for group in groups:
             wanted = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
@@ -118,7 +105,6 @@ class TaskSource:
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
-        """Find a Warp function of the task by its name; None if there is none."""
         for owner in self._owners:
             for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
                 found = names.get(name)
@@ -139,8 +125,8 @@ class TaskSource:
     def _with_functions(self, own: Any) -> Any:
         """Return the parameter struct that functions take.
 
-        If the task's struct differs from a base task's only in defaults, functions take the base task's struct. Tasks
-        that differ only in defaults then share functions and kernels.
+        If the task's struct has only other defaults than a base task's, functions take the base task's struct. Such
+        tasks then share functions and kernels.
         """
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
@@ -151,7 +137,7 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """Return the fields of World that are memory, by name; refuse memory that is not declared in parts."""
+        """Return the fields of World that are memory. Refuse memory that is not declared in parts."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
@@ -166,11 +152,7 @@ class TaskSource:
         return parts
 
     def _shared_structs(self) -> tuple[Any, Any]:
-        """Return the structs Shared and Sums, or None if the worlds share no memory.
-
-        Raises:
-            ValueError: ``World.shared``, ``tally`` or ``share`` is missing or malformed.
-        """
+        """Return the structs Shared and Sums, or None if the worlds share no memory."""
         field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
         if field is None and tally is None and share is None:
             return None, None
@@ -245,7 +227,7 @@ class TaskSource:
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse a name that resembles a name in ``FUNCTIONS``, because such a function would never be called."""
+        """Refuse a name that is similar to one in ``FUNCTIONS``. Such a function would never be called."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
@@ -267,18 +249,17 @@ def draws_noise(observer: wp.Function) -> bool:
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether the ``obs`` of a task may have the given group; True if ``obs`` is a method, whose result is unknown."""
+    """Whether the ``obs`` of a task may have the given group. The groups of a method are unknown."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:
-    """Return the file that defines a struct. If there is no file, return the name of the struct's module."""
+    """Return the file that defines a struct, or the name of its module."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
 def _return_values(function: wp.Function) -> list[ast.expr]:
-    """Return the expressions in a function's return statements."""
     nodes = ast.walk(FunctionSource(function).tree)
     return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]

@@ -10,17 +10,17 @@ from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""The stamp of each file: its modification time and its size; None if the file does not exist."""
+"""The modification time and the size of each file. None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""Maps each module that a task's file imported from its folder to the stamp of the module's file at that time."""
+"""For each module that a task's file imported from its folder, the module's file as it was then."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
     """Find the modules in a Python file's folder that the file imports, directly or indirectly, without running them.
 
     Returns:
-        The file of each module by the module's name; for a package without ``__init__.py``, the package's folder.
+        The file of each module. For a package without ``__init__.py``, it is the package's folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}
@@ -44,7 +44,7 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Return the full names of everything that a module imports: modules, and names within modules."""
+    """Yield the full names of everything that a module imports: modules, and names within modules."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -60,7 +60,7 @@ def _prefixes(name: str) -> list[str]:
 
 
 def _module_file(folder: Path, name: str) -> Path | None:
-    """Return a module's file in a folder; for a package without ``__init__.py``, return the package's folder."""
+    """Return a module's file in a folder. For a package without ``__init__.py``, return the package's folder."""
     if not name:
         return None
     base = folder.joinpath(*name.split("."))
@@ -81,20 +81,20 @@ def stamps(files: Iterable[Path]) -> Stamps:
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """Context in which a task's file can import the modules that ``local_modules`` has found in its folder.
+    """Let a task's file import the modules that ``local_modules`` has found in its folder, in a ``with`` block.
 
     A loaded module of the same name is replaced if it has changed or comes from another folder. If the block raises an
     error, ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
-        for name in modules:  # reload all modules, because they may have imported names from each other
+        for name in modules:  # reload all of them, because they may have imported names from each other
             if name in _taken:
                 sys.modules.pop(name, None)
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # do not write bytecode into run folders
+    sys.dont_write_bytecode = True  # write no bytecode into run folders
     try:
         yield
     except BaseException:

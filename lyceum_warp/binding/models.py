@@ -21,11 +21,11 @@ log = logging.getLogger(__name__)
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Load a model as an editable MjSpec, which also compiles after a change of the working directory.
+    """Load a model as an MjSpec. It still compiles after a change of the working directory.
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
-            path is relative to the folder of the class ``owner``, or to the current folder if there is no owner.
+            path is relative to the folder of the class ``owner``, or to the current folder without an owner.
         owner: The task class that declares the model.
 
     Raises:
@@ -45,12 +45,7 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
 
 
 def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
-    """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The source is a string of XML.
-    """
+    """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``."""
     if isinstance(source, str) and source.lstrip().startswith("<"):
         start = textwrap.shorten(source, 24, placeholder=" ...")
         raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
@@ -75,11 +70,7 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
 
 
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return a keyframe as an integration state with time 0, (integration_size,) float64.
-
-    Raises:
-        ValueError: The model has no such keyframe.
-    """
+    """Return a keyframe as an integration state with time 0, (integration_size,) float64."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
     if key < 0:
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
@@ -101,19 +92,17 @@ def compile_model(
 
     - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
-    - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors. If no field
-      needs sensors, all sensors are turned off. The energy is computed if a function reads it.
-    - If ``contact`` lists a pair of geoms twice, only the first entry is kept: MuJoCo would make the contact twice, and
-    MuJoCo Warp would make it once.
+    - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors. Without
+    such
+      fields, all sensors are turned off. The energy is computed if a function reads it.
+    - If ``contact`` lists a pair of geoms twice, only the first entry is kept. MuJoCo would make the contact twice, and
+      MuJoCo Warp once.
 
     Args:
-        spec: The model; changed in place.
+        spec: The model. It is changed.
         fields: Names of the fields that will be read.
         physics: Options of the solver and the integrator that replace the model's own.
         varied: Names of the model fields that may differ between worlds.
-
-    Raises:
-        ValueError: MuJoCo refuses the model.
     """
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
@@ -159,7 +148,6 @@ def compile_model(
 
 
 def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
-    """Remove all contact pairs of the same two geoms except the first."""
     known: set[frozenset[str]] = set()
     for pair in list(spec.pairs):
         geoms = frozenset((pair.geomname1, pair.geomname2))

@@ -15,11 +15,11 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Fields of ``Params`` that the package sets: the durations of a step and of a substep in seconds."""
+"""Fields of ``Params`` that the package sets: the seconds in a step and in a substep."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
-    """Return the defaults of a task's parameters by name, without ``dt`` and ``substep_dt``.
+    """Return the defaults of a task's parameters, without ``dt`` and ``substep_dt``.
 
     ``struct`` declares the parameters, and the class ``owner`` has the defaults as attributes.
     """
@@ -30,7 +30,7 @@ def defaults(struct: Any, owner: type) -> dict[str, Any]:
 class Parameters:
     """The values of a task's parameters: scalars, vectors, arrays with one value per world, or tables.
 
-    A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share a table.
+    A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
         struct: The task's ``Params``, which the functions take.
@@ -40,10 +40,7 @@ class Parameters:
         nworld: Number of worlds.
         timestep: Seconds in a step, the value of ``dt``.
         given: Values that replace defaults.
-        weights: The weights of the task's terms, by name; weights are set like parameters.
-
-    Raises:
-        ValueError: A field has the name of an option, a name is unknown, or a value is missing or invalid.
+        weights: The weights of the task's terms. They are set like parameters.
     """
 
     def __init__(
@@ -62,7 +59,7 @@ class Parameters:
         self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
-        """The types of the fields that are tables, by name."""
+        """The types of the fields that are tables."""
         self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
@@ -72,23 +69,19 @@ class Parameters:
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
-        """Names of the parameters whose values are computed from the model."""
+        """Parameters that are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
         self.values = self.changed(given).values
         self._computed -= set(given)
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
-        """The values of the parameters that differ between worlds, by name, (nworld, ...)."""
+        """The values of the parameters that differ between worlds, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def changed(self, given: Mapping[str, Any]) -> "Parameters":
-        """Return a copy with some values replaced, each converted to its field's type.
-
-        The copy and the original share arrays.
-
-        Raises:
-            ValueError: A name is unknown, or a value is missing or invalid.
+        """Return a copy with some values replaced, each converted to its field's type. Arrays are shared with the
+        original.
         """
         known = (*self._struct.vars, *self._weights)
         for name in given:
@@ -116,7 +109,7 @@ class Parameters:
         return other
 
     def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
-        """Compute a default from the model; return the previous table if the contents did not change."""
+        """Compute a default from the model. Return the previous table if its contents did not change."""
         try:
             found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
         except Exception as error:  # the task's function may raise any error
@@ -130,8 +123,8 @@ class Parameters:
     def array(self, device: wp.Device) -> wp.array:
         """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
 
-        The entries contain pointers to tables on the device, and this object keeps these tables alive. If a table
-        gets new values of the same shape, the values are copied into the existing table.
+        The entries contain pointers to tables on the device, which this object keeps alive. New values of the same
+        shape are copied into the existing table.
         """
         for name, kind in self.tables.items():
             self._upload(name, kind.dtype, device)
@@ -237,7 +230,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace model elements in a table by their indices; replace names, too, if ``field`` is given."""
+        """Replace model elements in a table by their indices. With ``field``, replace names, too."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -266,19 +259,15 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field that holds a table's default elements, such as "site_xpos" for a default that lists sites.
-
-    The result is None if the default consists of numbers.
-    """
+    """Return the field with a table's default elements, such as "site_xpos" for a list of sites. None for numbers."""
     while isinstance(default, list | tuple) and default:
         default = default[0]
     return default.field if isinstance(default, Element) else None
 
 
 def _loaded(what: str, path: str | Path) -> np.ndarray:
-    """Load the array in a file written by ``numpy.save``."""
     try:
-        # map the file instead of reading it, because a broken header could make NumPy allocate any amount of memory
+        # map the file instead of reading it: a broken header could make NumPy allocate any amount of memory
         loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
     except FileNotFoundError:
         raise FileNotFoundError(f"{what} cannot be read, because there is no such file") from None

@@ -17,7 +17,6 @@ class Slice:
     """The slice of a row of floats that holds a part."""
 
     start: int
-    """The index of the first float."""
     count: int
     """Number of elements."""
     dtype: Any
@@ -30,15 +29,11 @@ class Slice:
 
 
 Layout = dict[str, Slice]
-"""The parts of a row of floats: their slices by name, in order."""
+"""The slices of a row of floats by name, in order."""
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """Return the fields of a struct that have parts as defaults; ``owner`` is the struct's name in error messages.
-
-    Raises:
-        ValueError: A field has a part as its default, but is not declared as a row of floats.
-    """
+    """Return the fields of a struct that have parts as defaults. ``owner`` is the struct's name in error messages."""
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}
     for name in parts:
@@ -52,11 +47,7 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Compute the layout of a struct's parts of one kind; a part's size may be the name of a table in ``params``.
-
-    Raises:
-        ValueError: A size is neither a positive number nor the name of a table of Params.
-    """
+    """Compute the layout of a struct's parts of one kind. A part's size may be the name of a table in ``params``."""
     slices, start = dict[str, Slice](), 0
     for name, part in parts_of(struct, owner).items():
         if part.kind == kind:
@@ -72,7 +63,7 @@ def sizes(layout: Layout) -> dict[str, int]:
 
 
 def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> list[str]:
-    """Generate Warp source that sets a struct's fields to slices of a row; add the fields' types to ``scope``."""
+    """Generate Warp source that sets a struct's fields to slices of a row. Add the fields' types to ``scope``."""
     lines = []
     for name, part in layout.items():
         scope[f"dtype_{struct}_{name}"] = part.dtype
@@ -87,12 +78,9 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """Return a size as a number; if the size is the name of a table in ``params``, return the table's number of rows.
+    """Return a size as a number. The name of a table in ``params`` stands for the table's number of rows.
 
     ``what`` names the size in error messages.
-
-    Raises:
-        ValueError: The size is not a positive number or the name of a table.
     """
     if not isinstance(size, str):
         return whole_number(what, size, low=1)

@@ -50,7 +50,7 @@ class ReadOnlyModel(mujoco.MjModel):  # type: ignore[misc]
 
 
 def read_only(model: mujoco.MjModel) -> ReadOnlyModel:
-    """Copy a model; the copy refuses edits."""
+    """Copy a model. The copy refuses edits."""
     copy = ReadOnlyModel.__new__(ReadOnlyModel)
     copy.__setstate__(model.__getstate__())
     return copy

@@ -25,11 +25,10 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""For each task module, the stamps (times and sizes) of its file and of the modules that it imports from its folder, as
-they were when the file was last run."""
+"""For each task module, the stamps of its file and of the modules that it imports from its folder, when it last ran."""
 
 _LOADING = threading.RLock()
-"""A lock that is held while a file is loaded, because imports and linecache are global to the process."""
+"""Held while a file is loaded, because imports and linecache are global to the process."""
 
 _PACKAGE = "lyceum_warp.tasks."
 _FILE = "lyceum_task_"
@@ -74,9 +73,9 @@ def package_task_names() -> list[str]:
 
 @functools.cache
 def _package_modules() -> dict[str, str]:
-    """The modules of the package's tasks, by task name. The modules are not imported.
+    """The modules of the package's tasks, by task name. They are not imported.
 
-    A module contains the task of the same name. A folder contains a family of tasks and declares their modules in
+    A module contains the task of the same name. A folder contains a family of tasks, and declares their modules in
     ``TASKS``.
     """
     found: dict[str, str] = {}
@@ -107,7 +106,7 @@ def _file(task: type[Task]) -> str | None:
 def spelled_task(task: type[Task]) -> str | None:
     """Return the name or ``file:Class`` by which ``find_task`` finds a task in another process.
 
-    The result is None for a task without a file.
+    A task without a file gives None.
     """
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)
@@ -118,7 +117,7 @@ def spelled_task(task: type[Task]) -> str | None:
 def task_name(task: type[Task]) -> str:
     """Return the name under which a task is registered: the class's name in snake_case.
 
-    Names in a family of the package's tasks may have a prefix: ``dm/walker_walk`` for WalkerWalk.
+    A name in one of the package's families may have a prefix, such as ``dm/walker_walk`` for WalkerWalk.
     """
     name = snake_case(task.__name__)
     declared = (known for known, module in _package_modules().items() if module == task.__module__)
@@ -143,8 +142,8 @@ def task_names() -> list[str]:
 def find_task(task: str | Path | type[Task]) -> type[Task]:
     """Find a task's class by name, by file (``path/to/file.py`` or ``path/to/file.py:Class``), or return a given class.
 
-    A file may import modules from its folder. If the task's file or a module that it imports from its folder has
-    changed, the file is run again. Existing environments still use the old version.
+    A file may import modules from its folder. If one of these files has changed, the task's file is run again. Existing
+    environments still use the old version.
 
     Raises:
         ValueError: There is no such task, or its file can't be run.
@@ -173,8 +172,8 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
     """Return the source, as loaded, of a task's file and of the modules that it imports from its folder.
 
-    If the program itself imports or defines the class, the files are read when ``find_task`` is first called with the
-    class. A class without a file, as in a notebook, has no sources.
+    If the program itself imports or defines the class, the files are read at the first call of ``find_task``. A class
+    without a file, as in a notebook, has no sources.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -195,7 +194,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
     sys.modules[name] = module
     try:
         code = compile(source, file, "exec")  # cached bytecode with the same time stamp may be stale
-        # Warp reads the source of functions from linecache, where later changes of the file do not appear
+        # Warp reads the source of functions from linecache, which must not show later changes of the file
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))
@@ -218,7 +217,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
 
 
 def _explained(error: Exception) -> str:
-    """Return the message for an error in a task file; add a fix if Warp's own message is unclear."""
+    """Return the message for an error in a task file, with a fix if Warp's own message is unclear."""
     text = str(error).strip()
     if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
         argument, function, kind = found.groups()
@@ -249,7 +248,7 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
 
 
 def kernel_name(task: type[Task]) -> str:
-    """Return the task's name in Warp's cache; it contains a hash of the file, so copies of a file share kernels."""
+    """Return the task's name in Warp's cache. It contains a hash of the file, so copies of a file share kernels."""
     module = task.__module__
     if module.startswith(_FILE) and task in _sources:
         module = f"{module[:-8]}{zlib.crc32(b''.join(_sources[task].values())):08x}"
@@ -257,7 +256,7 @@ def kernel_name(task: type[Task]) -> str:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """Return the module of a task's file, and run the file if necessary.
+    """Return the module of a task's file.
 
     A file is run on first use, and again whenever it or a module that it imports from its folder has changed.
     """

@@ -14,11 +14,7 @@ from lyceum_warp.support.upstream import builtin_functions
 
 
 class FunctionSource:
-    """Holds the source that a ``wp.func`` had when it was defined, even if the file has changed since then.
-
-    Raises:
-        ValueError: The source is not a single function definition.
-    """
+    """Holds the source that a ``wp.func`` had when it was defined, even if the file has changed since then."""
 
     def __init__(self, function: wp.Function) -> None:
         adj: Any = function.adj
@@ -42,7 +38,7 @@ class FunctionSource:
         return f"{self.file}, line {self._first_line + getattr(node, 'lineno', 1) - 1}"
 
     def value(self, node: ast.expr) -> Any:
-        """Evaluate a name, a path such as ``module.helper`` or a ``wp.static(...)``; return None if that fails."""
+        """Evaluate a name, a path such as ``module.helper`` or a ``wp.static(...)``. Return None if that fails."""
         if isinstance(node, ast.Name):
             if node.id in self.locals:
                 return None
@@ -61,7 +57,7 @@ class FunctionSource:
         return None
 
     def is_static(self, node: ast.AST) -> bool:
-        """Whether a node is ``wp.static(...)``, which Warp replaces with the value of its argument."""
+        """Whether a node is ``wp.static(...)``. Warp replaces it with the value of its argument."""
         return (
             isinstance(node, ast.Call)
             and isinstance(node.func, ast.Name | ast.Attribute)
@@ -70,10 +66,10 @@ class FunctionSource:
         )
 
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
-        """Classify a call, and return its kind and its callee.
+        """Return a call's kind and its callee.
 
-        A callee is a helper (a function with Python source), a native function (``wp.func_native``), one of Warp's
-        builtins, or another object: a type, a Python function, or None if unknown.
+        A callee is a helper (a function with Python source), a native function (``wp.func_native``) or one of Warp's
+        builtins. Otherwise it is a type, a Python function, or None if unknown.
         """
         callee = self.value(node.func)
         if self.is_static(node):
@@ -85,16 +81,16 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a condition that is a ``wp.static(...)``; Warp compiles only the selected branch.
+        """Evaluate a condition that is a ``wp.static(...)``, of which Warp compiles only the selected branch.
 
-        The result is None for other conditions.
+        Other conditions give None.
         """
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
 
 def has_source(function: wp.Function) -> bool:
-    """Whether a function has Python source; a builtin and a ``wp.func_native`` have none."""
+    """Whether a function has Python source. A builtin and a ``wp.func_native`` have none."""
     return function.func is not None and function.native_snippet is None
 
 
@@ -114,9 +110,9 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Find a builtin function by name, first of Warp, then of Python.
+    """Find a builtin function of Warp or Python. Return None if there is none.
 
-    The result is None if there is no such builtin. Some of Warp's builtins are not attributes of the module ``warp``.
+    Some of Warp's builtins are not attributes of the module ``warp``.
     """
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
@@ -145,7 +141,7 @@ _module_names: set[str] = set()
 def free_module_name(name: str) -> str:
     """Return an unused name for a Warp module.
 
-    The name is the same in every process, so that Warp finds the module in its cache.
+    Every process gets the same name, so that Warp finds the module in its cache.
     """
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0

@@ -1,8 +1,8 @@
 """Find a task's terms and their arguments by name, and generate the functions that compute them.
 
-A term is a function, and its arguments are found by their names, as pytest finds fixtures. A name refers to the state,
-the action, the result of another function, a parameter, or a field. The generated text calls each function once, and
-terms share the results.
+A term is a function. As pytest finds fixtures by name, so the package finds the term's arguments. A name refers to the
+state, the action, the result of another function, a parameter, or a field. The generated text calls each function once,
+and terms share the results.
 """
 
 import difflib
@@ -16,13 +16,13 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""Maps the arguments s0, action, s1, s and p of a reward term or a metric to names in the generated text."""
+"""The arguments s0, action, s1, s and p of a reward term or a metric, in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""Maps the arguments s, s1 and p of a termination to names in the generated text."""
+"""The arguments s, s1 and p of a termination, in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
-"""Other names in the generated text, which are not available to terms."""
+"""Other names in the generated text. Terms cannot use them."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 
@@ -37,9 +37,6 @@ class Terms:
         written: The task's functions by their names in ``FUNCTIONS``; None for missing functions.
         world: The task's World.
         params: The task's Params.
-
-    Raises:
-        ValueError: A term, or one of its arguments, cannot be found or has another type.
     """
 
     def __init__(
@@ -53,7 +50,7 @@ class Terms:
     ) -> None:
         self._name, self.lookup, self._world, self._params = name, lookup, world, params
         self.weights = self._checked_weights(task.rewards)
-        """The weights of the reward's terms, by name."""
+        """The weights of the reward's terms."""
         self.terminations = self._names("terminations", task.terminations)
         self._reward, self._measure = written["reward"], written["measure"]
         functions = self._names("metrics", task.metrics, written=self._measure is not None)
@@ -61,9 +58,9 @@ class Terms:
             if getattr(task, attribute) and written[kind]:
                 raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: remove one of them")
         self.functions: dict[str, wp.Function] = {}
-        """The functions that the generated text calls, by name."""
+        """The functions that the generated text calls."""
         self.text = ""
-        """The source of the generated functions; empty if the task has no terms."""
+        """The source of the generated functions. Empty if the task has no terms."""
         self.metrics = (*self.weights, *task.metrics, *self.terminations)
         """The names of all metrics, in order."""
         if self.weights or self.terminations or functions:
@@ -72,7 +69,7 @@ class Terms:
     def generated(self, file: str) -> dict[str, wp.Function]:
         """Generate ``reward``, ``score`` and ``terminated``, except the functions that the task defines.
 
-        ``reward`` computes a transition's reward with given weights; ``score`` also writes the metrics. ``file`` is the
+        ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` is the
         name of the generated text in error messages.
         """
         if not self.text:
@@ -104,7 +101,7 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Check and return the names in an attribute; return () if the task has ``written`` a function for them."""
+        """Check and return the names in an attribute. Return () if the task has ``written`` a function for them."""
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -121,7 +118,7 @@ class Terms:
     # text
 
     def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
-        """Generate the text; ``measure`` writes the first ``first`` metrics."""
+        """Generate the text. ``measure`` writes the first ``first`` metrics."""
         parts = []
         if self.weights:
             body = _Body(self, _STEP)
@@ -155,7 +152,7 @@ class Terms:
     # names
 
     def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
-        """Select the overload of a function for which all arguments can be found; also return its result type.
+        """Select the overload of a function for which all arguments can be found, and return it with its result type.
 
         Args:
             name: The function's name.
@@ -243,7 +240,7 @@ class _Body:
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
     def value(self, name: str, *wanted: type) -> str:
-        """Return the variable that holds a function's result; if types are given, check the type of the result."""
+        """Return the variable that holds a function's result. Check the result's type against ``wanted``."""
         if name not in self._values:
             function, kind = self._terms.choose(name, self._given)
             arguments, named = [], False
@@ -264,12 +261,12 @@ class _Body:
         return f"{name}_"
 
     def number(self, name: str) -> str:
-        """Convert a value to float; a bool becomes 0 or 1."""
+        """Convert a value to float. A bool becomes 0 or 1."""
         value = self.value(name, float, bool)
         return f"wp.where({value}, 1.0, 0.0)" if _fits(bool, self._values[name][1]) else value
 
     def function(self, signature: str, lines: list[str]) -> str:
-        """Return the function's text, which ends with ``lines``."""
+        """Return the text of a function that ends with ``lines``."""
         return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
 
 

@@ -1,9 +1,8 @@
 """Copy the functions of a family of tasks, so that each task can run them with structs and functions of its own.
 
 Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
-functions are therefore copied. The copies take the task's World. If the task replaces one of the parent's functions,
-the copies call the replacement. Copies have the source of the original, so error messages name the original's file and
-line.
+functions are therefore copied, and the copies take the task's World. If the task replaces one of the parent's
+functions, the copies call the replacement. Error messages name the original's file and line.
 """
 
 import sys
@@ -21,10 +20,10 @@ class Variant:
     """Copies of a family's functions that use one task's structs and functions.
 
     Args:
-        modules: The modules of the family; the task's module comes first.
+        modules: The modules of the family. The task's module comes first.
         functions: The functions with Python source in these modules.
-        structs: Maps each replaced struct to its replacement.
-        replaced: Maps each replaced function to its replacement.
+        structs: The replacement of each replaced struct.
+        replaced: The replacement of each replaced function.
     """
 
     def __init__(
@@ -48,8 +47,8 @@ class Variant:
     def seen(self, value: Any, viewer: str = "") -> Any:
         """Return the replacement of a function, a struct or a module of the family.
 
-        ``viewer`` is the name of the module in which the value is used. The module that defines a replacement still
-        gets the original function, so that the replacement can call it.
+        ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
+        original, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
             while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
@@ -96,10 +95,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         owners: The task's class and its base classes, without ``Task``.
         world: The task's World.
         params: The task's Params, which its functions take.
-        own: The task's own declaration of Params: ``params`` itself, or a struct that differs from it only in defaults.
-
-    Raises:
-        ValueError: A function's arguments differ from those of the function that it replaces.
+        own: The task's own declaration of Params: ``params`` itself, or a struct with other defaults.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -139,7 +135,6 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
 
 
 def _home(function: wp.Function) -> str:
-    """Return the name of the module that defines a function."""
     return str(function.func.__module__) if function.func is not None else ""
 
 
@@ -163,7 +158,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Refuse a replacement whose arguments differ from those of the function that it replaces."""
+    """Refuse a replacement with other arguments than the function that it replaces."""
     wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
     same = len(wanted) == len(given) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)

@@ -15,20 +15,18 @@ from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
-"""The bytes of guard memory before and after every row. Guard memory receives writes outside a row, so that they damage
-nothing."""
+"""Bytes of guard memory before and after every row. A write outside a row goes there and damages nothing."""
 
 _ALIGNED = 64
 
 _UNWRITTEN = 0x7FA5C3E1
-"""The sentinel that marks unwritten memory: a signaling NaN. Arithmetic turns it into a quiet NaN, so that ``+=``
-counts as a write."""
+"""A signaling NaN that marks unwritten memory. Arithmetic turns it into a quiet NaN, so ``+=`` counts as a write."""
 
 
 class GuardedRows:
     """Holds an array of n rows, with guard memory around each row.
 
-    The rows are filled with sentinels, or with the first n rows of ``values`` if this argument is given.
+    The rows are filled with sentinels, or with the first n rows of ``values``.
     """
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:
@@ -46,7 +44,7 @@ class GuardedRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """Return the ascending indices of elements written outside a row; those before the row are negative."""
+        """Return the ascending indices of elements written outside a row. Those before the row are negative."""
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -63,14 +61,7 @@ class GuardedRows:
 
 
 class Probe:
-    """Runs the functions of a task in the first world of a batch; the arrays of the batch stay unchanged.
-
-    Args:
-        task: The task.
-        batch: The fields of the worlds.
-        params: The parameters.
-        device: The device of the batch.
-    """
+    """Runs the functions of a task in the first world of a batch. The arrays of the batch stay unchanged."""
 
     def __init__(self, task: BoundTask, batch: Any, params: wp.array, device: wp.Device) -> None:
         self._name, self._kernels, self._writes, self._params = task.name, task.kernels, task.writes, params
@@ -151,7 +142,6 @@ class Probe:
                 )
 
     def _named(self, group: str, chosen: np.ndarray) -> str:
-        """Return the names of the chosen elements of an observation, for messages."""
         columns = Space.of(self._layouts[group]).columns
         return ", ".join(columns[i] for i in np.flatnonzero(chosen))
 
@@ -171,7 +161,7 @@ class Probe:
         """Raise a ValueError if a function wrote outside a field or outside its random stream."""
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
-            if parts:  # writes to a wrong element within a row are left to check_task
+            if parts:  # check_task finds writes to a wrong element within a row
                 self._check_memory(function, rows, parts)
             else:
                 self._check(function, rows, name, f"the model has {rows.size}")

@@ -1,8 +1,8 @@
 """Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
-The analysis follows a row into its elements and their components, into calls, local variables and local structs. A row
-that is used in any other way (returned, put into a tuple, selected by ``wp.where``, passed to a native function) counts
-as written.
+The analysis follows a row into its elements and their components, into calls, local variables and local structs. Any
+other use of a row counts as a write: if it is returned, put into a tuple, selected by ``wp.where``, or passed to a
+native function.
 """
 
 import ast
@@ -27,9 +27,8 @@ class Write:
     """A write into an argument of a function."""
 
     position: int
-    """The index of the argument."""
     field: str | None
-    """The written field of an argument that is a struct; None for a row."""
+    """The written field of an argument that is a struct. None for a row."""
     target: str
     """The argument with its field, such as "s.qpos"."""
     function: str
@@ -39,7 +38,7 @@ class Write:
     replaced: bool = False
     """Whether the write assigns the field, as ``s.time = 0.0`` does, instead of an element of its row."""
     use: str | None = None
-    """An expression that may write the row but cannot be analysed; None for a definite write."""
+    """An expression that may write the row but cannot be analysed. None for a definite write."""
 
 
 @functools.cache
@@ -61,7 +60,7 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""For each argument, by name: the fields that a function may write, or None for an output row."""
+"""For each argument, the fields that a function may write, or None for an output row."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
@@ -130,7 +129,6 @@ class _Place:
 
 
 def _kind(written: Any) -> Any:
-    """Return a type's ``_Place.kind``; None for numbers, vectors and matrices."""
     return written if is_struct(written) else (written.ndim, written.dtype) if is_row(written) else None
 
 
@@ -140,10 +138,10 @@ class _Reader:
     Args:
         function: The function.
         places: What the caller has passed for each argument of ``function``: an argument of the analysed function or a
-            part of it; None for anything else.
+            part of it, or None.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
-        seen: The functions that were already read, each together with the places of its arguments.
+        seen: The functions that were already read, each with the places of its arguments.
     """
 
     def __init__(
@@ -158,20 +156,20 @@ class _Reader:
         self.source = FunctionSource(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # read everything twice: in a loop, a use of a local struct may precede the line that puts a row into the struct
+        # read everything twice: in a loop, a local struct may be used before the line that puts a row into it
         for _ in range(2):
             for statement in self.source.tree.body:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Record a write; if ``follows`` is False, record instead a use of a row that the analysis cannot follow."""
+        """Record a write. If ``follows`` is False, record a use of a row that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Record the writes in an expression or a statement; return the part of an argument that it refers to."""
+        """Record the writes in an expression or a statement. Return the part of an argument that it refers to."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
                 if place is not None and name.startswith(f"{node.id}."):  # a local struct of rows, used as a whole

@@ -27,7 +27,8 @@ _COMMANDS = {
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
 """The module, the class and the help line of each command. A module is imported only when its command is run, because
-most modules import torch, Warp and MuJoCo."""
+most modules import torch, Warp and MuJoCo.
+"""
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
@@ -76,12 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    """Import the module of a command, parse its options, and run it.
-
-    Raises:
-        ValueError: There is no such command.
-        SystemExit: The help was printed, or an option is wrong.
-    """
+    """Import the module of a command, parse its options, and run it."""
     if argv[:1] in (["-h"], ["--help"]):
         commands: Any = {name: type(name, (), {"__doc__": line}) for name, (*_, line) in _COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])

@@ -22,15 +22,7 @@ class Hyperparameters(
     """Hyperparameters. For each flag, the help lists the algorithms that have it, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
-        """Override a configuration's hyperparameters with the given flags.
-
-        Args:
-            config: The configuration; None for the algorithm's defaults.
-            algorithm: Name of the algorithm.
-
-        Raises:
-            ValueError: The algorithm or a hyperparameter does not exist, or a value is not valid.
-        """
+        """Override a configuration's hyperparameters with the given flags."""
         if algorithm not in ALGORITHMS:
             raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
         values, (_, kind) = given(self), ALGORITHMS[algorithm]

@@ -14,7 +14,7 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions, given_value
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
-"""Declare a flag that takes one NAME=VALUE and may be repeated."""
+"""A flag that takes one NAME=VALUE and may be repeated."""
 
 ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -24,7 +24,7 @@ ParamWords = Annotated[
         "may be repeated.",
     ),
 ]
-"""Declare the flag --param, which ``parameters`` parses."""
+"""The flag --param. ``parameters`` parses it."""
 
 Trust = Annotated[
     bool,
@@ -33,7 +33,7 @@ Trust = Annotated[
         "read the files that the run names.",
     ),
 ]
-"""Declare the flag --trust; see ``lyceum_warp.runs.trust``."""
+"""The flag --trust; see ``lyceum_warp.runs.trust``."""
 
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -44,7 +44,7 @@ CameraWords = Annotated[
         "may be repeated.",
     ),
 ]
-"""Declare the flag --camera, which ``viz.cameras.parsed_camera`` parses."""
+"""The flag --camera. ``viz.cameras.parsed_camera`` parses it."""
 
 TaskWord = Annotated[
     tyro.conf.Positional[str],
@@ -62,16 +62,15 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 class OptionFlags:
     """Base class of groups of flags: each field of the given dataclasses becomes a flag.
 
-    The field's docstring becomes the flag's help text. A subclass must declare a field again if the field's type is a
-    union, or if its type or help text differs on the command line. Values are validated when the options are made,
-    because the parser would print errors in a multi-line box.
+    The field's docstring becomes the flag's help text. A subclass must declare a field again if its type is a union, or
+    if its type or help text differs on the command line. Values are validated when the options are made, because the
+    parser would print errors in a multi-line box.
 
     Args:
-        options: The dataclasses. If several dataclasses have the same field, the first one determines its type and help
-            text.
+        options: The dataclasses. If several have the same field, the first one gives its type and help text.
         omit: Names of fields without a flag.
-        default: Text that describes the default in the help, for all flags or by field name. If a text is given, flags
-            default to None; otherwise, flags have the dataclass's defaults.
+        default: Text that describes the default in the help, for all flags or by field name. Flags with a text
+            default to None. Other flags have the dataclass's defaults.
     """
 
     def __init_subclass__(
@@ -102,11 +101,7 @@ class OptionFlags:
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """Return the values, by name, of all flags that differ from their defaults.
-
-    Raises:
-        ValueError: A limit of the solver is not of the form NAME=VALUE.
-    """
+    """Return the values of all flags that differ from their defaults, by name."""
     found = given_values(flags)
     if "solver" in found:
         found["solver"] = dict(map(parameter, found["solver"]))
@@ -114,8 +109,9 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment for which no flag is generated. Commands declare flags for nworld, seed and the model, and
-``Physics`` declares the flags of ``physics``. The other options can be set only in Python."""
+"""Options of an environment for which no flag is generated. Commands declare flags for nworld, seed and the model.
+``Physics`` declares the flags of ``physics``. The other options can be set only in Python.
+"""
 
 
 class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
@@ -153,12 +149,8 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
 
     Args:
         texts: The strings, each NAME=VALUE.
-        command: The command's arguments. If a name in the strings is an option instead of a parameter, the error names
-            the option's flag.
+        command: The command's arguments. If NAME is an option instead of a parameter, the error names its flag.
         instead: Flags by option name, for options whose flag has another name in this command.
-
-    Raises:
-        ValueError: A string is not of the form NAME=VALUE, or NAME is an option instead of a parameter.
     """
     found: dict[str, Any] = {}
     for text in texts:
@@ -180,9 +172,6 @@ def parameter(text: str) -> tuple[str, Any]:
     """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit.
 
     The path of a ``.npy`` table becomes absolute.
-
-    Raises:
-        ValueError: The string has a different form.
     """
     name, equals, value = text.partition("=")
     if not equals or not name.strip():

@@ -14,7 +14,7 @@ import tyro
 from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
-"""The folder bench/ of a checkout; an installed package does not contain bench/."""
+"""The folder bench/ of a checkout. An installed package does not have it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -33,18 +33,7 @@ class Bench:
     """A program in bench/, without .py."""
 
     def run(self, *arguments: str) -> int:
-        """Run the command.
-
-        Args:
-            arguments: Arguments for the program.
-
-        Returns:
-            The program's exit code.
-
-        Raises:
-            ValueError: There is no such program.
-            FileNotFoundError: The package is not in a checkout.
-        """
+        """Run the command, and return the program's exit code."""
         if not (FOLDER / "experiment.py").exists():
             raise FileNotFoundError(f"the experiments need a checkout of the repository, and {FOLDER} does not exist")
         programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
@@ -52,7 +41,7 @@ class Bench:
             close = difflib.get_close_matches(self.name, programs, 1)
             hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
             raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
-        # the subprocess imports the package from this checkout, not an installed one
+        # the subprocess must import the package from this checkout, not an installed one
         path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
         command = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
         child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})

@@ -26,7 +26,7 @@ _TABLE_ROWS = 15
 
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-"""The standard output; if it is not a terminal, it has 120 columns, so that tables are not wrapped."""
+"""The standard output. In a file or a pipe, it has 120 columns, so that tables are not wrapped."""
 
 
 def note(line: str) -> None:
@@ -35,11 +35,7 @@ def note(line: str) -> None:
 
 
 class Display(training.Display):
-    """Shows the progress of training: a live bar of at most 80 columns on a terminal, otherwise one line per iteration.
-
-    Args:
-        console: The output.
-    """
+    """Shows the progress of training: a live bar of at most 80 columns on a terminal, otherwise one line per iteration."""
 
     def __init__(self, console: Console) -> None:
         self.console, self.total, self.mean = console, 0, math.nan
@@ -52,7 +48,7 @@ class Display(training.Display):
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Print the task, its worlds and the run folder, and show a progress bar until the context ends."""
+        """Print the task, its worlds and the run folder, and show a progress bar until the ``with`` block ends."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
@@ -73,7 +69,7 @@ class Display(training.Display):
             self.mean = it.mean_return
         shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
         row = _known(it.row())
-        # before the first episode ends, the return is unknown
+        # the return is unknown until the first episode ends
         reward = f"reward {row['reward_mean']:.3g} a step" if "reward_mean" in row else ""
         result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
@@ -108,11 +104,10 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns of metrics.csv that count problems, each with its label in messages. An algorithm may lack some of these
-columns."""
+"""Columns of metrics.csv that count problems, each with its label in messages. Algorithms may lack some of them."""
 
 _BAR_WIDTH = 36
-"""The total width, in characters, of the progress bar, the iteration number and the times."""
+"""Total width of the progress bar, the iteration number and the times, in characters."""
 
 
 def counted(number: int, what: str) -> str:
@@ -134,9 +129,8 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
     Args:
         console: The output.
-        columns: The cells of each column, by its heading. The first column may contain text; all other columns contain
-            numbers.
-        omit: Headings of the columns that may be omitted, in the order in which they are omitted.
+        columns: The cells of each column, by its heading. All columns but the first contain numbers.
+        omit: Headings of the columns that may be omitted, the first to go first.
     """
     table = Table()
     for count in range(len(omit) + 1):
@@ -157,7 +151,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
 
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
-    """Make a table of at most 15 iterations of a run; omit empty columns and columns that do not fit the console.
+    """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
 
     Iterations that did not evaluate the mean policy are omitted if at least 4 others remain between the first and last.
     """
@@ -192,7 +186,7 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """Call a function that writes a file, and return the path; if the function fails, return "none" and the reason.
+    """Call a function that writes a file, and return the path. If it fails, return "none" and the reason.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """
@@ -206,10 +200,10 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 
 
 class PlanDisplay:
-    """Shows the progress of a planner's episode: a live line on a terminal, and a line at the end of the episode.
+    """Shows the progress of a planner's episode: a live line on a terminal, and a line when the episode ends.
 
-    If ``real_time`` is True, the live line shows the number of plans per second and the age of the action. Otherwise,
-    it shows the number of steps per second. Both numbers are means over the episode so far.
+    The live line shows the number of steps per second. If ``real_time`` is True, it shows the number of plans per
+    second and the age of the action. These numbers are means over the episode so far.
     """
 
     def __init__(
@@ -253,7 +247,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """Make the table of a controller's report; omit the row "success" if ``success`` is False."""
+    """Make the table of a controller's report. The row "success" is omitted if ``success`` is False."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

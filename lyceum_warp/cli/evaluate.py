@@ -146,7 +146,6 @@ class Eval:
 
 
 def _print_transfer(verdict: Transfer, console: Console) -> None:
-    """Print the verdict of each comparison, and a table of the differences."""
     for comparison in verdict.comparisons:
         found = comparison.differences
         columns = {
@@ -175,7 +174,7 @@ def run_worlds(
             the CPU.
         params: Parameters that replace the run's parameters.
         nworld: Number of worlds.
-        task: A task to use instead of the run's task, with its own default options and parameters.
+        task: Another task to use instead, with its own default options and parameters.
         trust: Whether to execute the run's task even if the run was not made by this user on this machine.
     """
     saved = Configuration.of(run)
@@ -211,7 +210,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: di
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """Return the ``source`` of saved episodes; if the run's copy of the model was used, add the path of the copy."""
+    """Return the ``source`` of saved episodes. If the run's copy of the model was used, add the path of the copy."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

@@ -48,10 +48,7 @@ class Export:
         return 0
 
     def _env(self, run: Run) -> Env | None:
-        """Make an environment of the run's task, from which the metadata are computed.
-
-        If the task cannot be loaded, print a message and return None.
-        """
+        """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""
         try:
             saved = Configuration.of(run)
             options = saved.options.changed({"nworld": 1} | options_on_cores())

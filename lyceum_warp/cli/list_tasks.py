@@ -30,7 +30,7 @@ To write your own task: lyceum-warp new --help"""
 _UNKNOWN = "-"
 
 _ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
-"""Actuators with these types of gain have one control each."""
+"""Types of gain of the actuators that have one control."""
 
 _WIDTH = 100
 """Maximum width of a description, in characters."""
@@ -79,15 +79,12 @@ class Tasks:
 
 @dataclasses.dataclass
 class _Entry:
-    """A task in the list."""
-
     name: str
     task: type[Task] | None = None
-    """The task's class, or None if importing its file raises an error."""
+    """None if importing the task's file raises an error."""
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""
-    """Why some of the values are unknown."""
 
     def has(self, word: str) -> bool:
         """Whether the entry contains a word, in any case."""
@@ -95,7 +92,7 @@ class _Entry:
 
 
 def _entry(name: str) -> _Entry:
-    """Make the entry of a task, without its sizes, which require the model."""
+    """Make the entry of a task without its sizes, which require the model."""
     entry = _Entry(name)
     try:
         task = entry.task = find_task(name)
@@ -104,13 +101,13 @@ def _entry(name: str) -> _Entry:
         entry.about = (about.partition(": ")[2] or about).rstrip(".")
         entry.about += f" (physics: {', '.join(task.physics)})" * bool(task.physics)
         entry.source = _source(task)
-    except Exception as error:  # the import of a broken task file may raise any error
+    except Exception as error:  # importing a broken task file may raise any error
         entry.note = _reason(error)
     return entry
 
 
 def _cells(entry: _Entry) -> tuple[str, ...]:
-    """Return the cells of a task's row, and set the entry's note if the task's model cannot be loaded."""
+    """Return the cells of a task's row. If the model cannot be loaded, set the entry's note."""
     task = entry.task
     if task is None:
         return (entry.name, *[_UNKNOWN] * 5, entry.source)
@@ -130,17 +127,14 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """Return the number of a model's controls.
-
-    The model is compiled only if necessary, because that takes up to a second.
-    """
+    """Return the number of a model's controls. Compiling the model can take a second, so avoid it if possible."""
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu
 
 
 def _source(task: type[Task]) -> str:
-    """Describe the source of a task's model, and name the extra that the model needs, if any."""
+    """Describe the source of a task's model, and name the extra that the model needs."""
     model: Any = task.model() if callable(task.model) else task.model
     if not isinstance(model, str | ModelFile):
         return f"made in {task.__module__.rpartition('.')[2]}.py"

@@ -25,10 +25,10 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "gymnasium": gymnasium_model,
     "gymnasium_robotics": gymnasium_robotics_model,
 }
-"""Functions that locate a model, by the prefix before the colon in --model."""
+"""Functions that find a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
-"""Names that a generated file uses for other purposes, so a task's class cannot have them."""
+"""Names that a generated file already uses. A task's class cannot have them."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,11 +108,7 @@ class New:
 
 
 def _class_name(path: Path) -> str:
-    """Return the name of the class for a task file.
-
-    Raises:
-        ValueError: The file's name cannot be the name of a task, or belongs to another task or module.
-    """
+    """Return the name of the class for a task file."""
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
     if (
@@ -134,16 +130,7 @@ def _class_name(path: Path) -> str:
 
 
 def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """Return three things: the Python expression for a model in a task file, a description of the model, and the model.
-
-    Args:
-        text: The model as given on the command line.
-        path: The task file.
-
-    Raises:
-        FileNotFoundError: The file, its package or the checkout is missing.
-        ValueError: MuJoCo cannot read the file.
-    """
+    """Return the Python expression for a model in a task file, a description of the model, and the model."""
     where, _, file = text.partition(":")
     if where in _SOURCES:
         return f"lw.{where}_model({literal(file)})", _title(file), _SOURCES[where](file).spec()

@@ -17,17 +17,10 @@ def parse(command: type, prog: str, words: Sequence[str]) -> Any:
     """Parse the options of a command.
 
     Args:
-        command: The command's class. The class attribute ``USUAL`` names the fields whose options --help describes;
-            --help-all describes all options. Without ``USUAL``, --help also describes all options.
+        command: The command's class. --help describes the options in its attribute ``USUAL``, and --help-all describes
+            all options. Without ``USUAL``, --help also describes all of them.
         prog: The command's name, for messages.
         words: The arguments.
-
-    Returns:
-        An instance of the command, with its options.
-
-    Raises:
-        ValueError: There is no such option; the message suggests one.
-        SystemExit: The help was printed, or an option has a wrong value.
     """
     if {"-h", "--help"} & set(words):
         _print_help(command, prog)
@@ -59,7 +52,6 @@ def _print_help(command: type, prog: str) -> None:
 
 
 def _unknown(word: str, options: Sequence[str], prog: str) -> str:
-    """Return the error message for an argument that a command does not accept."""
     flag = word.partition("=")[0].replace("_", "-")
     if not flag.startswith("-"):
         return f"{prog} does not take the argument {word!r}: see {prog} --help"
@@ -75,7 +67,7 @@ def _nested(hint: Any) -> Any:
 
 
 def _options(command: Any, group: str = "options") -> dict[str, dict[str, str]]:
-    """Return the flags of a command, by group; each flag maps to the name of its field."""
+    """Return the flags of a command by group, each with the name of its field."""
     found: dict[str, dict[str, str]] = {group: {}}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
         own = next(filter(None, (getattr(marker, "name", None) for marker in _markers(hint))), name)
@@ -91,7 +83,7 @@ def _markers(hint: Any) -> tuple[Any, ...]:
 
 
 def _with_only(command: Any, usual: Sequence[str]) -> type:
-    """Make a subclass of a command, or of a group of its options, that shows only the usual options in the help."""
+    """Make a subclass of a command, or of a group of its options, whose help shows only the usual options."""
     own = _options(command)["options"].values()
     body: dict[str, Any] = {"__annotations__": {}, "__doc__": command.__doc__}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():

@@ -64,11 +64,7 @@ class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)
     risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
-        """Override a configuration's settings with the given flags.
-
-        Raises:
-            ValueError: A setting is not valid.
-        """
+        """Override a configuration's settings with the given flags."""
         settings = given(self)
         if self.fill is not None:
             settings["fill"] = _fill(self.fill)
@@ -166,7 +162,7 @@ class Plan:
         name = file_name(task_name(find_task(self.task)))
         out = self.out or Path("runs", f"plan-{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
         Run.check_free(out)
-        # all options are checked before the folder is created
+        # check all options before the folder is created
         camera = parsed_camera(self.camera)
         if camera is not None and not self.video:
             raise ValueError("--camera has no effect with --no-video: omit one of them")
@@ -195,11 +191,7 @@ class Plan:
 
 
 def _check_value_task(run: Path, task: str) -> None:
-    """Refuse the value function of a run that trained a different task.
-
-    Raises:
-        ValueError: The run's configuration names a different task.
-    """
+    """Refuse the value function of a run that trained a different task."""
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
@@ -211,7 +203,6 @@ def _check_value_task(run: Path, task: str) -> None:
 
 
 def _stem(task: str) -> str:
-    """Return the name of a task, or its file's name without the suffix."""
     name = task.partition(":")[0]
     return Path(name).stem if name.endswith(".py") else name
 
@@ -245,11 +236,11 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""The numbers of samples that real-time planning tries, in addition to the number that the task suggests."""
+"""The numbers of samples that real-time planning tries, in addition to the task's own."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Choose the settings that no flag gives, by measuring planning times; return None if flags give all of them.
+    """Measure planning times to choose the settings that have no flag. Return None if all have one.
 
     A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
     as one step of the planner's worlds.
@@ -279,7 +270,6 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
 
 
 def _suggested_physics(task: type[Task]) -> str | None:
-    """Return the name of the physics that a task suggests for planners."""
     return EnvOptions().changed(task.planning.options).physics.base
 
 
@@ -293,7 +283,6 @@ def _fill(words: tuple[str, ...]) -> Any:
 
 
 def _model(path: Path) -> Path:
-    """Return the path of the planner's model."""
     path = path.expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"--planner-model: there is no file {path}")
@@ -341,7 +330,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """Say where the episodes are saved if the command is interrupted after ``whole`` complete episodes."""
+    """Say where the episodes are if the command is interrupted after ``whole`` complete ones."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"
@@ -366,7 +355,6 @@ def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
 
 
 def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
-    """Print the report, make the plot and the video, and list the files."""
     camera, report = parsed_camera(options.camera), _summary(done, options)
     console.print(report_table(report, success=plant.task.functions["success"] is not None))
     paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]

@@ -6,16 +6,16 @@ import mujoco
 import numpy as np
 
 _STEP = 0.02
-"""The desired duration of a step in seconds."""
+"""Desired duration of a step, in seconds."""
 
 _EPISODE = 10.0
-"""The duration of an episode in seconds."""
+"""Duration of an episode, in seconds."""
 
 _NAMES = 8
-"""The maximum number of names of each kind of element that a comment lists."""
+"""Maximum number of names of each kind of element in a comment."""
 
 _WIDTH = 118
-"""The width of a comment in characters, without the #."""
+"""Width of a comment in characters, without the #."""
 
 _ELEMENTS = {
     "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -60,7 +60,6 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
 
 
 def _lengths(model: mujoco.MjModel) -> list[str]:
-    """Generate the lines that set the lengths of steps and episodes."""
     substep = model.opt.timestep
     frame_skip = max(1, round(_STEP / substep))
     horizon = max(1, round(_EPISODE / (frame_skip * substep)))
@@ -71,7 +70,7 @@ def _lengths(model: mujoco.MjModel) -> list[str]:
 
 
 def _has_other_ranges(model: mujoco.MjModel) -> bool:
-    """Whether every control has a range, and some range differs from -1 to 1."""
+    """Whether every control has a range, and at least one range is not -1 to 1."""
     limited, ranges = model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange
     return bool(limited.all() and (ranges[:, 0] < ranges[:, 1]).all() and (ranges != (-1.0, 1.0)).any())
 
@@ -79,8 +78,7 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
     """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation.
 
-    If sensors measure every joint, the observation has only sensors; otherwise it has positions, velocities and
-    sensors.
+    The observation has only sensors if they measure every joint. Otherwise it has positions, velocities and sensors.
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)
@@ -105,7 +103,7 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the ranges (first, last) of sensordata that the policy observes; last is exclusive."""
+    """Return the ranges (first, last) of sensordata that the policy observes, without ``last``."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
@@ -164,13 +162,13 @@ def _elements(model: mujoco.MjModel) -> str:
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the names of all elements of a kind; unnamed elements have empty names."""
+    """Return the names of all elements of a kind. Elements without a name have the name ""."""
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
 
 
 def _listed(kind: str, names: list[str]) -> list[str]:
-    """Generate a line with as many names of a kind as fit, or no line if there are no names."""
+    """Generate a line with as many names as fit. Without names, there is no line."""
     for shown in range(min(len(names), _NAMES), 0, -1):
         rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
         line = f"  {kind}: {', '.join(names[:shown])}{rest}"

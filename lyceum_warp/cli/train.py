@@ -45,7 +45,7 @@ _FINAL_EPISODES = 32
 _SETTINGS: dict[str, Any] = {
     "iterations": 100, "target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
 }  # fmt: skip
-"""The defaults of the settings that may be changed when a run is resumed."""
+"""The defaults of the settings that may change when a run is resumed."""
 
 _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
@@ -178,7 +178,7 @@ class Train:
         if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         with join(self.env.device or saved.get("device", "cpu")) as team:
-            with team.together():  # all options are checked before the folder is created
+            with team.together():  # check all options before the folder is created
                 learner, folder, entries = self._learner(source, team)
             leads, total = learner.team.leads, settings["iterations"]
             try:
@@ -212,7 +212,7 @@ class Train:
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
-        """Return the training that the task suggests; if --algorithm differs, return only that algorithm."""
+        """Return the training that the task suggests. With another --algorithm, return only that algorithm."""
         assert self.task is not None
         suggestion = find_task(self.task).training
         if self.algorithm in (None, suggestion.algorithm):
@@ -262,7 +262,7 @@ class Train:
         )  # fmt: skip
 
     def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner; return the learner, the run's folder and additional entries for config.json."""
+        """Make the learner. Return it with the run's folder and additional entries for config.json."""
         configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)
@@ -290,7 +290,6 @@ class Train:
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: Run, learner: Learner) -> int:
-        """Print the table of iterations, evaluate the policy, make the plot and the video, and return the exit code."""
         env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
         console.print(curve_table(run.rows(), console))
         few = evaluation_worlds(env, _FINAL_EPISODES)

@@ -15,7 +15,7 @@ from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
 
 Cell: TypeAlias = Callable[[dict[str, Any]], str]
-"""A function that formats one cell of a row."""
+"""Formats one cell of a row."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -85,7 +85,6 @@ def _progress(row: dict[str, Any]) -> None:
 
 
 def _report(tuning: Tuning, options: Tune) -> None:
-    """Print the table of all settings, the best setting, and the settings that were not tried."""
     reference = tuning.reference
 
     def line(text: str) -> None:
@@ -128,8 +127,6 @@ def _report(tuning: Tuning, options: Tune) -> None:
 
 
 def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    """Make the columns of the table, by heading."""
-
     def divergence(i: int) -> Cell:
         return lambda row: _short(row["divergence"][i] / max(reference["nudged_divergence"][i], 1e-300))
 
@@ -147,8 +144,6 @@ def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
 
 
 def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    """Make the columns of the table with --planning, by heading."""
-
     def ranks(kind: str) -> Cell:
         return lambda row: "{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind])
 
@@ -160,5 +155,4 @@ def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
 
 
 def _short(ratio: float) -> str:
-    """Format a ratio of any size in a few characters."""
     return f"{ratio:.0e}" if ratio >= 1e4 else f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"

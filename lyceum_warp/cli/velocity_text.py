@@ -11,19 +11,19 @@ from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
-"""Options of lyceum-warp train that are enough to learn walking on one GPU."""
+"""Options of lyceum-warp train that suffice to learn walking on one GPU."""
 
 _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""A leg's end is a foot if it is not much higher than the lowest end: at most by this fraction of the base's height."""
+"""A leg's end is a foot up to this height above the lowest end, as a fraction of the base's height."""
 
 _FLAT = 0.01
 """A sphere of a foot is part of the sole if its bottom is at most this many metres above the foot's lowest point."""
 
 _AT = 0.06
-"""The maximum distance in metres between the centre of a sole and a site that marks the foot."""
+"""Maximum distance between the centre of a sole and a site that marks the foot, in metres."""
 
 _Kind = mujoco.mjtObj
 
@@ -34,7 +34,7 @@ class _Foot:
     """The name of the foot's site, in the model or added by the task."""
     body: int
     element: str = ""
-    """The name of the foot's body, or of a joint or geom of this body; empty if the model already has the site."""
+    """The name of the foot's body, or of a joint or geom in it. Empty if the model already has the site."""
     position: tuple[float, ...] = ()
     """The position of the new site in the body, m."""
     height: float = 0.0
@@ -48,10 +48,6 @@ class Walker:
         spec: The model.
         feet: Names of the sites, bodies or geoms that are feet; by default the lowest ends of legs.
         joints: Names of the joints to control; by default the leg joints that have an actuator.
-
-    Raises:
-        ValueError: The robot has no floating base, no feet or no joints, or the model does
-            not name an element that the task file refers to.
     """
 
     def __init__(self, spec: mujoco.MjSpec, feet: Sequence[str] = (), joints: Sequence[str] = ()) -> None:
@@ -116,7 +112,7 @@ class Walker:
         raise ValueError(f"the model has no site, geom or body {name!r}: give names after --feet, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
-        """Find a site near the centre of a body's sole; if there is none, describe a new site."""
+        """Find a site near the centre of a body's sole. If there is none, describe a new site."""
         spheres = self._spheres(body)
         if not len(spheres):
             raise ValueError(f"the foot {self._called(body)} has no geom that can touch the ground")
@@ -131,7 +127,6 @@ class Walker:
         return _Foot(name, body, self._called(body), tuple(round(float(x), 4) + 0.0 for x in local), float(middle[2]))
 
     def _called(self, body: int) -> str:
-        """Return the name of a body, or of a joint or geom in it."""
         ids = ((_Kind.mjOBJ_BODY, [body]), (_Kind.mjOBJ_JOINT, np.flatnonzero(self.model.jnt_bodyid == body)),
                (_Kind.mjOBJ_GEOM, np.flatnonzero(self.model.geom_bodyid == body)))  # fmt: skip
         names = [mujoco.mj_id2name(self.model, kind, int(i)) for kind, found in ids for i in found]
@@ -152,7 +147,7 @@ class Walker:
         return names
 
     def _moved(self) -> np.ndarray:
-        """Return the mask, (njnt,), of the joints that an actuator moves directly or through a tendon."""
+        """Return which joints an actuator moves, directly or through a tendon, (njnt,) bool."""
         m, d = self.model, self.data
         mujoco.mj_forward(m, d)
         moment = np.zeros((m.nu, m.nv))

@@ -35,7 +35,7 @@ from lyceum_warp.viewer.show import view
 _RUN_WORLDS = 16
 _WAIT = 10.0  # seconds that --follow waits until the run starts
 _LONG = 1e9
-_NICE = 10  # the niceness (low priority) of the subprocess of `lw.RunViewer`
+_NICE = 10  # low priority of the subprocess of `lw.RunViewer`
 
 
 class Place(
@@ -105,11 +105,7 @@ class View:
         return self.show(_WAIT)
 
     def show(self, seconds: float) -> int:
-        """Run the command until the viewer is closed, and return the exit code.
-
-        Args:
-            seconds: The longest time that --follow waits for the run.
-        """
+        """Run the command until the viewer is closed, and return the exit code."""
         _check(self)
         if self.pretrained:
             folder = pretrained_run(" ".join(self.what))
@@ -165,7 +161,6 @@ def _check(options: View) -> None:
 
 
 def _kind(what: tuple[str, ...]) -> str:
-    """Say what the arguments are: "task", "run" or "episodes"."""
     first = Path(what[0])
     if first.suffix == ".npz":
         return "episodes"
@@ -182,7 +177,6 @@ def _kind(what: tuple[str, ...]) -> str:
 
 
 def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
-    """Make a world for the playback of episodes."""
     if options.nworld is not None and options.nworld > 1:
         raise ValueError(f"--nworld {options.nworld} has no effect for episodes: omit it")
     return episode_env(episodes, task=options.task, **parameters(options.param, options))
@@ -197,14 +191,13 @@ def _task_worlds(options: View) -> Env:
 
 
 def _planner(options: View, env: Env) -> MPPI:
-    """Make the planner, on the engine and device that the flags give."""
     config = options.planner.on_top_of(task_config(env.task.task, None))
     words = _words(options) | ({} if env.options.model is None else {"model": env.options.model})
     return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the displayed worlds or, if --mppi is given, of the planner's worlds."""
+    """Return the options of the displayed worlds. With --mppi, they are those of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 
@@ -224,7 +217,7 @@ def _run_worlds(options: View, run: Run) -> Env:
 
 
 def attached() -> None:
-    """Run the subprocess of ``lw.RunViewer``, which reads its arguments from stdin and ends with its parent process."""
+    """Run the subprocess of ``lw.RunViewer``. It reads its arguments from stdin and ends with its parent process."""
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(_NICE)
     job = json.loads(sys.stdin.readline())
@@ -239,7 +232,7 @@ def attached() -> None:
 
 
 def _end_with_parent() -> None:
-    """End this process at EOF on stdin: the parent process has ended, perhaps by SIGKILL."""
+    """End this process at EOF on stdin. The parent process has then ended, perhaps by SIGKILL."""
     with contextlib.suppress(OSError, ValueError):
         sys.stdin.read()
     os.kill(os.getpid(), signal.SIGTERM)

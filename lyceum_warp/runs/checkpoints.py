@@ -28,13 +28,7 @@ _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": Value
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """Copy a policy and a value function to the CPU, in the format in which they are saved.
-
-    Args:
-        iteration: Number of complete iterations.
-        policy: The policy.
-        value: The value function.
-    """
+    """Copy a policy and a value function to the CPU, in the format in which they are saved."""
     content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
@@ -49,13 +43,7 @@ def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = 
 
 
 def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> None:
-    """Replace the file of a policy or a checkpoint atomically.
-
-    Args:
-        path: The file.
-        content: The content to write.
-        options: Additional arguments for ``replaced``.
-    """
+    """Replace the file of a policy or a checkpoint atomically."""
     buffer = io.BytesIO()  # Python's writes raise OSError on a full disk, unlike torch's
     torch.save(content, buffer)
     with replaced(path, **options) as temporary:
@@ -63,29 +51,12 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
 
 
 def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
-    """Make a policy from a file's content.
-
-    Args:
-        content: Content of the file.
-        path: The file's path, for error messages.
-        given: A policy into which the weights are loaded; by default a new policy.
-
-    Raises:
-        ValueError: The file has no policy, or the weights do not fit the given policy.
-    """
+    """Make a policy from a file's content."""
     return _filled(content, path, "policy", given)
 
 
 def value_of(content: PolicyContent, path: Path) -> nn.Module:
-    """Make a value function from a file's content.
-
-    Args:
-        content: Content of the file.
-        path: The file's path, for error messages.
-
-    Raises:
-        ValueError: The file has no value function.
-    """
+    """Make a value function from a file's content."""
     if "value" not in content:
         raise ValueError(f"{path} has no value function, because the run's algorithm learns none")
     return _filled(content, path, "value", None)
@@ -125,16 +96,7 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
 
 
 def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Check that a policy fits an environment's observations and actions.
-
-    Args:
-        policy: The policy.
-        env: The environment.
-        path: The path of the policy's file, for the error message.
-
-    Raises:
-        ValueError: The sizes of the policy and the environment differ.
-    """
+    """Check that a policy fits an environment's observations and actions."""
     sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
     if sizes != wanted:
         raise ValueError(
@@ -158,11 +120,6 @@ def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
     """Read a checkpoint or a saved policy. Code in the file is never run.
-
-    Args:
-        path: The file.
-        device: Device for the tensors.
-        parts: Names of the entries that the file must have.
 
     Raises:
         FileNotFoundError: The file does not exist.

@@ -26,14 +26,7 @@ _KEPT: dict[str, Any] = {
 
 
 def read_config(path: Path) -> dict[str, Any]:
-    """Read the configuration of a training run or a planner run.
-
-    Args:
-        path: The file.
-
-    Raises:
-        ValueError: The file is damaged or has an unknown format, or an entry has the wrong type.
-    """
+    """Read the configuration of a training run or a planner run."""
     try:
         config = json.loads(path.read_text())
         number = config["format"]

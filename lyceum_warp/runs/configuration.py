@@ -81,11 +81,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration. A missing file of a table parameter is replaced by the run's copy.
-
-        Raises:
-            ValueError: A value is missing or not valid.
-        """
+        """Read a run's configuration. A missing file of a table parameter is replaced by the run's copy."""
         config = run.config
         try:
             # earlier releases stored --param options in "params", or wrote no "physics"
@@ -128,10 +124,6 @@ class Configuration:
             note: Function that is called with messages about the task's files.
             task: Another task to use instead, in its current version.
             trust: Whether to execute the task even if the run was not made by this user on this machine.
-
-        Raises:
-            ValueError: A value is not valid, or ``run`` is not trusted.
-            FileNotFoundError: The task or its model is missing.
         """
         try:
             if self.threads < 1:
@@ -166,10 +158,6 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
         which: Policy of the run, or None to resume the run. A resumed learner usually makes its networks from the
             hyperparameters, so None is returned for them. Networks that the hyperparameters do not describe are
             loaded: those of a run that started from another run, or with a ``limit`` that is not the default.
-
-    Raises:
-        FileNotFoundError: The run has no policy of this name or number.
-        ValueError: The file cannot be read, or the policy's class is not part of this package.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

@@ -91,9 +91,6 @@ class Run:
     def check_free(folder: str | Path) -> None:
         """Check that a folder can be used for a new run.
 
-        Args:
-            folder: The folder; it need not exist.
-
         Raises:
             ValueError: The folder is not empty, or is a file.
         """
@@ -125,9 +122,6 @@ class Run:
             config: The configuration, as JSON values.
             device: Device of the run, for the entry ``versions``.
             files: The content of the folder ``task``: maps paths in it to files to copy, or to bytes to write.
-
-        Raises:
-            ValueError: The folder is not empty, or is a file.
         """
         folder = Path(folder)
         cls.check_free(folder)
@@ -224,11 +218,7 @@ class Run:
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
-        """Read the iteration and the score of the best policy, or return None without one.
-
-        Args:
-            note: Function that is called with a message if the file is damaged.
-        """
+        """Read the iteration and the score of the best policy, or return None without one."""
         if not self.best.is_file():
             return None
         try:
@@ -241,12 +231,7 @@ class Run:
     # the checkpoint
 
     def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
-        """Replace the last policy and the checkpoint atomically. The old checkpoint becomes ``previous.pt``.
-
-        Args:
-            content: The policy and the value function.
-            state: The state of the algorithm: tensors, numbers, strings, dicts and lists.
-        """
+        """Replace the last policy and the checkpoint atomically. The old checkpoint becomes ``previous.pt``."""
         write_content(self.policy, content)
         checkpoint = {**content, "state": dict(state)}
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)

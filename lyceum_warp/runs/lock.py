@@ -17,10 +17,6 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
     On some network file systems, other hosts do not see the lock. A lock file that names another host therefore counts
     as locked. On systems without flock, every lock file counts as locked until it is deleted.
 
-    Args:
-        folder: The run's folder.
-        take_over: Whether to take over the lock from any other process.
-
     Yields:
         A function that raises ValueError if another process has taken over the lock, or OSError if the lock file is
         gone.

@@ -35,11 +35,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """Read the rows. An empty cell is None. An incomplete last row, without a line end, is ignored.
-
-    Raises:
-        ValueError: A cell is not a number, or the rows differ in length.
-    """
+    """Read the rows. An empty cell is None. An incomplete last row, without a line end, is ignored."""
     with path.open(newline="") as file:
         reader = csv.DictReader((line for line in file if line.endswith("\n")), strict=True)
         try:

@@ -50,17 +50,7 @@ def clean_replay(folder: Path, replay: Replay) -> None:
 
 
 def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
-    """Restore the buffer of a checkpoint.
-
-    Args:
-        folder: The folder.
-        replay: The replay buffer.
-        stored: Number of stored steps.
-        own: Indices of this process's worlds.
-
-    Raises:
-        ValueError: A file is missing or damaged.
-    """
+    """Restore the buffer of a checkpoint."""
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
         # ignore later steps of a save that was interrupted

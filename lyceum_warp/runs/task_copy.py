@@ -183,13 +183,7 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """List the changes since the run started to a task's file and to its modules.
-
-    Args:
-        file: The task's file.
-        kept: The entry ``kept`` of config.json.
-        loaded: Contents of files that were already read, by path.
-    """
+    """List the changes since the run started to a task's file and to its modules."""
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
         path = file.parent / name

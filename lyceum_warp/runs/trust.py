@@ -13,12 +13,7 @@ log = logging.getLogger(__name__)
 
 
 def remember(folder: Path, config: Mapping[str, Any]) -> None:
-    """Record a run as trusted in this user's state directory.
-
-    Args:
-        folder: The run's folder.
-        config: Content of the run's config.json.
-    """
+    """Record a run as trusted in this user's state directory."""
     record = _record(folder, config)
     try:
         record.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -37,9 +32,6 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         named: The file to name in the error message.
         runs: Whether the command executes the run's task. Otherwise it only reads files.
         trust: Whether to trust and record the run.
-
-    Raises:
-        ValueError: The run is unknown, and ``trust`` is False.
     """
     if os.path.exists(_record(folder, config)):
         return

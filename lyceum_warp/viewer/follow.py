@@ -24,10 +24,6 @@ from lyceum_warp.runs.folder import Run, load
 class Follower:
     """Loads the newest policy of a run; ``policy(obs)`` returns mean actions.
 
-    Args:
-        run: The run.
-        device: The device of the worlds.
-
     Raises:
         FileNotFoundError: The run has no policy yet.
         ValueError: The policy cannot be read, or its network is a class that the user defined.
@@ -69,15 +65,7 @@ class Follower:
 
 
 def wait_for_run(folder: Path, *, seconds: float) -> Run:
-    """Wait until a run has a policy.
-
-    Args:
-        folder: The run's folder.
-        seconds: Maximum time.
-
-    Raises:
-        FileNotFoundError: There is no run, or it has no policy.
-    """
+    """Wait until a run has a policy."""
     end = time.monotonic() + seconds
     while True:
         try:

@@ -71,9 +71,6 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
     Args:
         words: A name, an index, or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
             Without words, the result is None.
-
-    Raises:
-        ValueError: The words have a different form.
     """
     words = list(words)
     if not words or (len(words) == 1 and "=" not in words[0]):

@@ -22,9 +22,6 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
         out: The PNG file.
         title: The title of the plot; by default task, engine and mode.
 
-    Returns:
-        The file's path.
-
     Raises:
         ImportError: matplotlib is not installed.
     """

@@ -26,11 +26,7 @@ _PATIENCE = 10.0  # seconds until a subprocess that does not end is killed
 
 
 def check_video() -> None:
-    """Check that the packages for videos are installed.
-
-    Raises:
-        NoVideoError: One of the packages is not installed.
-    """
+    """Check that the packages for videos are installed."""
     if missing := [name for name in ("imageio", "imageio_ffmpeg") if importlib.util.find_spec(name) is None]:
         raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
 
@@ -43,18 +39,7 @@ def libraries() -> list[str]:
 
 
 class DrawingProcess:
-    """A context manager for a subprocess that renders poses with the first graphics library that works.
-
-    Args:
-        model: The model.
-        camera: The camera.
-        size: The width and the height in pixels.
-        fps: The frames per second of a video; None for pictures.
-        background: Whether the subprocess has a low priority.
-
-    Raises:
-        ValueError: The model has no such camera, or the size is out of range.
-    """
+    """A context manager for a subprocess that renders poses with the first graphics library that works."""
 
     product = "the drawing"
     """The name of the result in error messages."""
@@ -99,11 +84,7 @@ class DrawingProcess:
         self._stop()
 
     def draw(self, shot: Shot) -> None:
-        """Draw a pose.
-
-        Raises:
-            NoVideoError: The subprocess has ended.
-        """
+        """Draw a pose."""
         if not self._send(shot) or self._answer() != "frame":
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
 
@@ -212,12 +193,7 @@ class Drawing(DrawingProcess):
         self._frames += 1
 
     def finish(self) -> Path:
-        """Complete the video, and move it to its path.
-
-        Raises:
-            NoVideoError: There is no frame, or the video cannot be completed.
-            OSError: The file cannot be written.
-        """
+        """Complete the video, and move it to its path."""
         if not self._frames:
             raise NoVideoError(f"the video {self.out} has no pose: nothing is written")
         self._send(None)

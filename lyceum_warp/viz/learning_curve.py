@@ -19,9 +19,6 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path
         run: A run, or its folder.
         out: The PNG file; by default ``curve.png`` in the run's folder.
 
-    Returns:
-        The file's path.
-
     Raises:
         FileNotFoundError: The run does not exist.
         ValueError: The run's metrics.csv cannot be read, or has no row.

@@ -36,9 +36,6 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
         out: The file. It is replaced when the page is complete.
         camera: The initial camera, as in ``write_video``. The reader can turn it.
 
-    Returns:
-        The file's path.
-
     Raises:
         ValueError: The states do not have the environment's shape, or the model has no such camera.
     """
@@ -62,16 +59,7 @@ def write_poses(
     title: str,
     camera: Sequence[float],
 ) -> Path:
-    """Write poses of a model as a page; see ``write_page``.
-
-    Args:
-        model: The model.
-        poses: The arrays qpos, mocap_pos and mocap_quat of each frame.
-        out: The file.
-        dt: The seconds between frames.
-        title: The title of the page.
-        camera: The camera's values, from ``cameras.camera_values``.
-    """
+    """Write poses of a model as a page; see ``write_page``."""
     data, frames = mujoco.MjData(model), []
     for qpos, place, turn in poses:
         data.qpos[:] = qpos

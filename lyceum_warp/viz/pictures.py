@@ -15,9 +15,6 @@ class WorldPictures(DrawingProcess):
         env: The environment.
         camera: The camera, as in ``write_video``.
         size: The width and the height in pixels, both even.
-
-    Raises:
-        ValueError: The model has no such camera, or the size is odd.
     """
 
     product = "the picture"
@@ -27,11 +24,7 @@ class WorldPictures(DrawingProcess):
         self.env = env
 
     def __call__(self) -> list[np.ndarray]:
-        """Render a picture of each world, (height, width, 3) uint8. The first call starts the subprocess.
-
-        Raises:
-            NoVideoError: This machine cannot render.
-        """
+        """Render a picture of each world, (height, width, 3) uint8. The first call starts the subprocess."""
         if self._process is None:
             self.__enter__()
         pictures = []

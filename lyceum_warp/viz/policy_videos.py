@@ -29,16 +29,7 @@ def policy_video(
     env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None,
     progress: NamedProgress | None = None,
 ) -> Path:  # fmt: skip
-    """Run an episode of a policy in a new world, write a video of it, and return the video's path.
-
-    Args:
-        env: An environment of the policy's task.
-        policy: The policy.
-        path: The file.
-        seed: Seed of the initial state.
-        camera: The camera; see ``write_video``.
-        progress: Called regularly. The default prints to stderr: a progress bar on a terminal, otherwise lines.
-    """
+    """Run an episode of a policy in a new world, write a video of it, and return the video's path."""
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
     with contextlib.ExitStack() as shown:
@@ -55,15 +46,6 @@ class Videos:
     """Writes a video of the mean policy every few iterations.
 
     After an error, for example because the machine cannot draw, training continues without videos.
-
-    Args:
-        learner: The algorithm.
-        folder: The folder of the videos. File names are numbers of iterations.
-        every: The number of iterations between two videos; 0 makes no videos.
-        seed: The seed of the initial state of all videos.
-        camera: The camera; see ``write_video``.
-        note: A function that is called with the message of an error.
-        progress: A function that is called regularly while a video is made.
     """
 
     def __init__(

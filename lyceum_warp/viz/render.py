@@ -44,14 +44,7 @@ class Shot(TypedDict):
 
 
 class Painter:
-    """Draws poses of a model.
-
-    Args:
-        mujoco: The module.
-        model: The model. The painter changes its fields.
-        size: The width and the height in pixels.
-        camera: The camera's values.
-    """
+    """Draws poses of a model."""
 
     def __init__(self, mujoco: Any, model: Any, size: tuple[int, int], camera: tuple[float, ...]) -> None:
         self.mujoco, self.model = mujoco, model

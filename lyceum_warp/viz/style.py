@@ -10,16 +10,7 @@ LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
 
 def new_figure(purpose: str, width: float, height: float) -> Any:
-    """Make a figure without pyplot. It needs no display, and shares no state with the user's figures.
-
-    Args:
-        purpose: The plot's name, for the error message.
-        width: The width in inches.
-        height: The height in inches.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+    """Make a figure without pyplot. It needs no display, and shares no state with the user's figures."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

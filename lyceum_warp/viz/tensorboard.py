@@ -120,11 +120,7 @@ class TensorBoard:
 
 
 def check_tensorboard() -> None:
-    """Check that the package for TensorBoard is installed.
-
-    Raises:
-        ImportError: The package tensorboard is not installed.
-    """
+    """Check that the package for TensorBoard is installed."""
     if importlib.util.find_spec("tensorboard") is None:
         raise ImportError(f"curves for TensorBoard need the package tensorboard: {EXTRA}")
 

@@ -56,9 +56,6 @@ def write_video(
         progress: A function that is called after each frame with the number of frames so far and the total number. The
             default prints to stderr: a progress bar on a terminal, otherwise lines.
 
-    Returns:
-        The file's path.
-
     Raises:
         ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
             the file's name does not end in ``.mp4``.
@@ -80,12 +77,7 @@ def write_video(
 
 
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
-    """Yield the content of a frame for each state.
-
-    Args:
-        env: The environment of the states.
-        states: The states, (number of states, state_space.size), on the CPU.
-    """
+    """Yield the content of a frame for each state."""
     parts = env.state_space.parts
     poses = [states[:, parts.get(name, slice(0))].numpy() for name in _POSES]
     fields = {field.name: states[:, parts[field.name]].numpy() for field in env.task.dynamics}
@@ -114,9 +106,6 @@ class Recorder:
         size: The width and the height in pixels, both even.
         fps: The frames per second of the video.
         most_waiting: The maximum number of shots in the queue.
-
-    Raises:
-        NoVideoError: A package for videos is not installed.
     """
 
     def __init__(
@@ -144,12 +133,7 @@ class Recorder:
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
-        """Add a shot.
-
-        Raises:
-            NoVideoError: The rendering subprocess has failed.
-            OSError: The file cannot be written.
-        """
+        """Add a shot."""
         self._check()
         with self._changed:
             self.added += shot["frames"]
@@ -171,12 +155,7 @@ class Recorder:
         self._done.wait(seconds)
 
     def close(self) -> Path:
-        """Finish the video, wait until the file is complete, and return its path.
-
-        Raises:
-            NoVideoError: The rendering subprocess has failed, the video was cancelled, or it has no shot.
-            OSError: The file cannot be written.
-        """
+        """Finish the video, wait until the file is complete, and return its path."""
         self.end()
         self._done.wait()
         self._check()

@@ -48,15 +48,6 @@ class Session:
 
     A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world runs in real
     time in the plant, a single world. While the plant runs, commands and frames are handled between its steps.
-
-    Args:
-        env: The worlds.
-        controllers: See ``lw.view``.
-        watchers: See ``lw.view``.
-        shown: ``episodes``, ``seed`` and ``paused``; see ``Stage``.
-
-    Raises:
-        ValueError: An argument is invalid.
     """
 
     def __init__(

@@ -42,17 +42,7 @@ class PlanView:
 
 
 class PolicyControl:
-    """Calls a policy that acts in all worlds.
-
-    Args:
-        name: The policy's name in the viewer.
-        policy: A function, or an object with a method ``act``, that maps observations (nworld, nobs) to actions
-            (nworld, nact).
-        env: The worlds.
-
-    Raises:
-        ValueError: The policy cannot be called with the observations, or returns actions of a wrong shape.
-    """
+    """Calls a policy that acts in all worlds."""
 
     def __init__(self, name: str, policy: Policy, env: Env) -> None:
         self.name, self.seconds = name, float("nan")
@@ -72,11 +62,7 @@ class PolicyControl:
             )
 
     def act(self) -> None:
-        """Write the actions of all worlds.
-
-        Raises:
-            ControllerError: The policy raised an exception, or returned actions of a wrong shape.
-        """
+        """Write the actions of all worlds."""
         begun = time.perf_counter()
         try:
             self._env.action.copy_(self._policy(self._env.obs))
@@ -86,12 +72,7 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world.
-
-    Args:
-        name: The controller's name in the viewer.
-        controller: See ``lw.Controller``.
-    """
+    """Calls a controller of one world."""
 
     def __init__(self, name: str, controller: Any) -> None:
         self.name, self.seconds = name, float("nan")
@@ -115,11 +96,7 @@ class WorldControl:
         return self._busy.locked()
 
     def reset(self) -> None:
-        """Reset the controller now, or after the call that is in progress.
-
-        Raises:
-            ControllerError: The controller raised an exception.
-        """
+        """Reset the controller now, or after the call that is in progress."""
         self._reset_due = True
         if self._busy.acquire(blocking=False):
             try:
@@ -205,10 +182,6 @@ Control = PolicyControl | WorldControl
 
 def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
     """Check controllers: a policy takes one argument, and a controller of one world takes two.
-
-    Args:
-        given: Controllers by name; see ``lw.view``.
-        env: The worlds.
 
     Raises:
         ValueError: A controller cannot be called, or does not fit the task.

@@ -20,11 +20,7 @@ _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 
 
 class Driving:
-    """Reads and replaces the command of a walking robot.
-
-    Args:
-        env: The worlds.
-    """
+    """Reads and replaces the command of a walking robot."""
 
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params

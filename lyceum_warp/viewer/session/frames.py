@@ -25,13 +25,7 @@ _OPACITY, _FADE = 0.35, 0.95  # _FADE: ratio of the opacities of successive stat
 
 
 class FrameMaker:
-    """Makes frames.
-
-    Args:
-        env: The worlds.
-        curves: The number of curves.
-        driving: Reads the command of a walking robot.
-    """
+    """Makes frames."""
 
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
         self.ghosts = SetGhosts()

@@ -28,10 +28,6 @@ class Past:
     """A ring buffer with the states of all worlds before each recent step.
 
     The buffer stays empty if the memory is too small for two states of all worlds.
-
-    Args:
-        env: The worlds.
-        limit: The maximum memory in bytes.
     """
 
     def __init__(self, env: Env, limit: int) -> None:
@@ -90,12 +86,7 @@ class Rows:
 
 
 class Live:
-    """Steps worlds, and keeps their history.
-
-    Args:
-        env: The worlds.
-        limit: The maximum memory of the history in bytes.
-    """
+    """Steps worlds, and keeps their history."""
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
@@ -323,12 +314,7 @@ class Live:
     # rows of frames
 
     def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
-        """Start to copy the data of a frame to the host, unless a copy is already in progress.
-
-        Args:
-            worlds: The worlds to copy in addition to the displayed world.
-            burst: The number of earlier states of the displayed world.
-        """
+        """Start to copy the data of a frame to the host, unless a copy is already in progress."""
         if self._reading is not None:
             return
         past, device = self.past, self.env.obs.device
@@ -373,13 +359,7 @@ def _to_host(part: torch.Tensor) -> torch.Tensor:
 
 
 def pose(state: np.ndarray, parts: Mapping[str, slice], nmocap: int) -> Pose:
-    """Extract the pose from a state.
-
-    Args:
-        state: The state, (state_space.size,).
-        parts: The slices of the state by name.
-        nmocap: Number of mocap bodies.
-    """
+    """Extract the pose from a state."""
     none = slice(0, 0)
     position, quaternion = (
         state[parts.get(name, none)].reshape(-1, size)[:nmocap].copy()

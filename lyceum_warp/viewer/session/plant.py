@@ -52,9 +52,6 @@ def run_plant(
         work: A function that is called while the plant waits for its next step. It may raise ``InterruptedByCommand``
             to stop the plant.
         on_step: A function that is called after each step.
-
-    Raises:
-        ControllerError: The controller raised an exception, or its actions are invalid.
     """
     live.expect_steps()
     try:
@@ -71,12 +68,7 @@ def run_plant(
 
 
 class _WorkingClock(Clock):
-    """A wall clock that calls ``work`` while it waits.
-
-    Args:
-        work: The function to call.
-        warm: Whether to call ``work`` before the first plan is ready.
-    """
+    """A wall clock that calls ``work`` while it waits."""
 
     def __init__(self, work: Callable[[], None], *, warm: bool) -> None:
         self._work, self._warm = work, warm

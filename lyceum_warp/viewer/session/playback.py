@@ -41,16 +41,7 @@ def reasons(bits: int) -> str:
 
 
 def episodes_of(given: Any, env: Env) -> list[Episode]:
-    """Load the episodes to play back.
-
-    Args:
-        given: The episodes; see ``lw.view``.
-        env: An environment of the episodes' task.
-
-    Raises:
-        FileNotFoundError: A file is missing.
-        ValueError: An episode belongs to another task, or has the wrong type.
-    """
+    """Load the episodes to play back."""
     if isinstance(given, Mapping):
         return [_episode(name, each, env) for name, each in given.items()]
     if isinstance(given, str | Path | Trajectory | torch.Tensor):

@@ -33,9 +33,6 @@ class Stage:
 
     Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the displayed
     world. Meanwhile the other worlds wait. ``lw.view`` explains the arguments.
-
-    Raises:
-        ValueError: An argument is invalid.
     """
 
     def __init__(
@@ -100,11 +97,7 @@ class Stage:
     # steps
 
     def advance(self, steps: int = 1) -> None:
-        """Make steps at once, not in real time.
-
-        Raises:
-            ControllerError: The controller raised an exception.
-        """
+        """Make steps at once, not in real time."""
         self.changed = True
         for _ in range(steps):
             self.steps += 1
@@ -199,9 +192,6 @@ class Stage:
         """Change a setting of the planner in use, or a task parameter in all worlds.
 
         A new setting makes a new planner.
-
-        Raises:
-            ValueError: The value is not valid.
         """
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":

@@ -40,13 +40,6 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
     for an arm is the last body in the longest chain of actuated bodies. The point is the body's first site, or its
     centre of mass if it has no site.
-
-    Args:
-        model: The model.
-        name: The name of a site or a body that replaces the default.
-
-    Raises:
-        ValueError: The model has no site and no body of this name.
     """
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
@@ -99,12 +92,7 @@ class Traces:
 
 
 class TraceRollouts:
-    """Rolls out plans and some of their samples in a few worlds.
-
-    Args:
-        controller: The planner.
-        plant: The plant.
-    """
+    """Rolls out plans and some of their samples in a few worlds."""
 
     def __init__(self, controller: Any, plant: Env) -> None:
         own = getattr(controller, "env", None)
@@ -157,11 +145,7 @@ class TraceRollouts:
 
 
 class TraceThread:
-    """A thread that rolls out the newest plan, and sleeps between rollouts.
-
-    Args:
-        rollouts: Makes the rollouts. From now on, only the thread may use it.
-    """
+    """A thread that rolls out the newest plan, and sleeps between rollouts."""
 
     def __init__(self, rollouts: TraceRollouts) -> None:
         self.error: BaseException | None = None

@@ -29,13 +29,7 @@ _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
 class VideoTaker:
-    """Records one video at a time; earlier videos may still be rendered in the background.
-
-    Args:
-        model: The model.
-        title: The prefix of the file names.
-        folder: The folder of the files.
-    """
+    """Records one video at a time; earlier videos may still be rendered in the background."""
 
     def __init__(self, model: mujoco.MjModel, title: str, folder: Path | None = None) -> None:
         self._model, self._title, self._folder = model, title, folder or Path()
@@ -60,14 +54,7 @@ class VideoTaker:
         return self._running is not None and (time.perf_counter() - self._start) * FPS >= self._running.added
 
     def begin(self, camera: dict[str, Any]) -> None:
-        """End the current video, and start another one.
-
-        Args:
-            camera: The attributes of the ``mujoco.MjvCamera``.
-
-        Raises:
-            NoVideoError: A package for videos is not installed.
-        """
+        """End the current video, and start another one."""
         self.end()
         self._camera, self._poses = _camera(camera), []
         self._running = Recorder(
@@ -76,11 +63,7 @@ class VideoTaker:
         self._start = time.perf_counter()
 
     def picture(self, camera: dict[str, Any], frame: Frame) -> None:
-        """Write a picture of a frame in a thread.
-
-        Raises:
-            NoVideoError: A package for pictures is not installed.
-        """
+        """Write a picture of a frame in a thread."""
         check_video()
         import imageio.v2 as imageio
 
@@ -105,11 +88,7 @@ class VideoTaker:
         return self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}"
 
     def add(self, frame: Frame) -> None:
-        """Add a frame as often as needed for the video to reach the present time.
-
-        Raises:
-            NoVideoError: The rendering subprocess has failed.
-        """
+        """Add a frame as often as needed for the video to reach the present time."""
         video = self._running
         if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
             return
@@ -151,9 +130,6 @@ class VideoTaker:
         """Finish all videos when the ``with`` block ends, even after an exception, such as Ctrl-C.
 
         A video that is incomplete after two minutes, or at a second Ctrl-C, is discarded.
-
-        Args:
-            show: A function that is called with a line about each video.
         """
         try:
             yield

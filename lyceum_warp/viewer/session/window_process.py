@@ -42,11 +42,6 @@ class Window:
     The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
     guard. It ends when this process ends, even by SIGKILL. Ctrl-C does not reach it.
 
-    Args:
-        scene: The constants of the session.
-        host: The address on which the page is served; see ``lw.view``.
-        port: The port of the page; see ``lw.view``.
-
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
         NoWindowError: The window cannot be opened.

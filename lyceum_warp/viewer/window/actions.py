@@ -24,12 +24,7 @@ KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down"
 
 
 class Actions:
-    """Stores the user's choices, and sends the corresponding commands.
-
-    Args:
-        scene: The constants of the session.
-        do: A function that sends a command to the session.
-    """
+    """Stores the user's choices, and sends the corresponding commands."""
 
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do

@@ -11,11 +11,7 @@ from lyceum_warp.viewer.protocol import Perturb
 
 
 class Mouse:
-    """Converts drags of the selected body to commands.
-
-    Args:
-        do: A function that sends a command to the session.
-    """
+    """Converts drags of the selected body to commands."""
 
     def __init__(self, do: Callable[[Perturb], None]) -> None:
         self._do = do
@@ -24,12 +20,7 @@ class Mouse:
         self._lock = threading.Lock()
 
     def drag(self, viewer: Any, *, paused: bool) -> None:
-        """Push the selected body while the mouse drags it. If the session is paused, move it instead.
-
-        Args:
-            viewer: Studio's viewer.
-            paused: Whether the session is paused.
-        """
+        """Push the selected body while the mouse drags it. If the session is paused, move it instead."""
         with self._lock:
             if self._left:
                 self._left = False

@@ -19,18 +19,7 @@ SWAP_TIME = 0.5
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
-    """A plugin of studio that shows frames and sends commands.
-
-    Args:
-        scene: The constants of the session.
-        model: The scene's model.
-        send: A function that sends a message to the session.
-        newest: A function that returns the latest frame, or None if it was already returned.
-        screen: The screen that runs the plugin.
-        opened: The message to the session when the window is open.
-        offer: A function that offers a file for download.
-        limit: The maximum number of geoms for ghosts and traces.
-    """
+    """A plugin of studio that shows frames and sends commands."""
 
     def __init__(
         self,

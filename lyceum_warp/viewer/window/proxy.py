@@ -132,11 +132,6 @@ class Proxy:
     The constructor opens the port, and ``start`` begins to answer. ``close``, or the end of a ``with`` block, closes
     the port.
 
-    Args:
-        host: The address or the name on which to listen; see ``lw.view``.
-        port: The port on which to listen; by default the first free port from 8080.
-        title: The title of the browser's tab.
-
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
     """

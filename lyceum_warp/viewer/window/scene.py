@@ -30,12 +30,7 @@ VISIBLE = (
 
 
 class ExtraGeoms:
-    """Draws ghosts and traces with a limited number of geoms: first the best trace, then ghosts, then other traces.
-
-    Args:
-        model: The model.
-        limit: The maximum number of geoms.
-    """
+    """Draws ghosts and traces with a limited number of geoms: first the best trace, then ghosts, then other traces."""
 
     def __init__(self, model: mujoco.MjModel, limit: int) -> None:
         self.model, self.limit = model, limit
@@ -53,16 +48,7 @@ class ExtraGeoms:
         arrows: Sequence[Arrow] = (),
         groups: np.ndarray | None = None,
     ) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame. They are valid until the next frame.
-
-        Args:
-            pose: The pose of the displayed world.
-            ghosts: Poses of the ghosts.
-            traces: The paths of samples, (samples, points, 3), in metres.
-            best: The index of the best sample.
-            arrows: Arrows.
-            groups: Whether each group of geoms is visible, (6,); by default unchanged.
-        """
+        """Make the geoms of a frame. They are valid until the next frame."""
         if groups is not None:
             self._options.geomgroup = groups
         paths = [] if traces is None else list(traces)
@@ -144,11 +130,7 @@ def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
 
 
 class ModelValues:
-    """Holds a copy of the model with the values of one world.
-
-    Args:
-        nominal: The model. It is copied.
-    """
+    """Holds a copy of the model with the values of one world."""
 
     def __init__(self, nominal: mujoco.MjModel) -> None:
         self._nominal = nominal
@@ -185,12 +167,7 @@ def field(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 class ViewCameras:
-    """Chooses the camera of the view.
-
-    Args:
-        viewer: Studio's viewer.
-        values: The model with the displayed world's values.
-    """
+    """Chooses the camera of the view."""
 
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values

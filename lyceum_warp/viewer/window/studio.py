@@ -51,16 +51,7 @@ class Screen:
         self._own_end.send_to_viewer(messages.ExitEvent())
 
     def run(self, own: Any, *, title: str, sock: socket.socket) -> None:
-        """Draw until ``close`` is called.
-
-        Args:
-            own: The plugin.
-            title: The title of the page.
-            sock: A bound socket that serves the page to a browser.
-
-        Raises:
-            RuntimeError: Studio did not take ``sock``, and would listen on another socket.
-        """
+        """Draw until ``close`` is called."""
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         taken: list[bool] = []
 

@@ -22,11 +22,7 @@ WINDOWS = ("messages", "curves", "view", "keys")
 
 
 class Windows:
-    """Draws the windows of the panel.
-
-    Args:
-        actions: The user's choices.
-    """
+    """Draws the windows of the panel."""
 
     def __init__(self, actions: Actions) -> None:
         self.curves = Curves(len(actions.scene.curves))
@@ -392,11 +388,7 @@ def speed_name(speed: float) -> str:
 
 
 class Curves:
-    """Holds the newest points of several curves with common times.
-
-    Args:
-        number: The number of curves.
-    """
+    """Holds the newest points of several curves with common times."""
 
     def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 2 + number))
