@@ -31,7 +31,7 @@ _SPELLED = {
 }  # fmt: skip
 
 _MOST_SUCCESS_STEPS = 2**24
-"""The largest value of ``success_steps``. The steps are counted in a float32, which is exact up to 2**24."""
+"""The steps are counted in a float32, which is exact up to 2**24."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
@@ -102,7 +102,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
-    """Compute the layouts of observation groups that are declared as structs. Return {} if the task has ``obs``."""
+    """Compute the layouts of observation groups that are declared as structs."""
     if hasattr(source.task, "obs"):
         return {}
     found = {}
@@ -137,10 +137,10 @@ class BoundTask:
         task: The task's class.
         nworld: Number of worlds.
         model: A model to use instead of the task's own.
-        fields: Further fields that the engine provides, beside those in ``World``.
-        dynamics: Further model fields that may differ between worlds, beside those that the task writes.
+        fields: Fields that the engine provides in addition to those in ``World``.
+        dynamics: Model fields that may differ between worlds in addition to those that the task writes.
         physics: Options of the simulation.
-        params: Values for the fields of ``Params``. A scalar field takes one value, or one value per world.
+        params: Values for the fields of ``Params``: one value, or one value per world.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.metrics = self.source.terms.metrics
-        """The names of the metrics: reward terms, the names in the attribute ``metrics``, and terminations."""
+        """Reward terms, the names in the attribute ``metrics``, and terminations."""
         self._check_class()
         memory = self.source.memory
         own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
@@ -185,10 +185,9 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*own, "time", "ctrl"])
         ]
-        """The fields that the engine provides: those of World, those in ``fields``, the time and the controls."""
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
-        """The integration state at which a reset starts, (integration_size,) float64. None for the model's default."""
+        """The state at which a reset starts, (integration_size,) float64. None for the model's default."""
         self.parameters = Parameters(
             self.source.params, self.source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
             given=params or {}, weights=self.source.terms.weights,
@@ -196,14 +195,12 @@ class BoundTask:
         self.actions = self._checked_actions()
         """Sizes of an action's parts. None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
-        """The layouts of a world's two rows, ``memory`` and ``lasting_memory``."""
+        """The layouts of ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
         self.observers = self.source.group_functions(self.obs_layouts)
-        """The functions that write observation groups, by group name."""
         observers = {observer_name(group): function for group, function in self.observers.items()}
         check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.shared = self._shared_layouts()
-        """The layouts of the structs Shared and Sums. Empty if worlds share no memory."""
         structs = obs_slices(self.source, self.params) | self.shared
         self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
 
@@ -214,7 +211,7 @@ class BoundTask:
 
     @property
     def reward_text(self) -> str:
-        """The generated source of the reward, the metrics and the terminations. Empty if the task has no terms."""
+        """The generated source of the reward, the metrics and the terminations."""
         return self.source.terms.text
 
     @property
@@ -247,7 +244,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return the fields that a function may write, by the argument that has them."""
+        """Return the fields that a function may write, for each of its arguments."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -270,7 +267,6 @@ class BoundTask:
         written = frozenset().union(dynamics, *drawn.values())
         varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
-        """The model fields that differ between worlds."""
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
         """The model fields that functions read and all worlds share."""
         drawn_constants = [field.name for field in self.dynamics if field.constants]

@@ -1,8 +1,7 @@
 """Generate the source of a task's kernels, which call the task's functions for every world of a batch.
 
 The generated source defines a struct whose fields have an additional axis for the worlds, and a function that returns
-a view of one world. It also defines defaults for the functions that a task omits. The code is generated as text,
-because Warp compiles functions from their source.
+a view of one world. The code is generated as text, because Warp compiles functions from their source.
 """
 
 import dataclasses
@@ -93,7 +92,7 @@ _MEMORY_CHECKS = {
         "    if not restored_row(before.lasting_memory[w], after.lasting_memory[w], lane, lanes):\n"
         "        finite = False",
 }  # fmt: skip
-"""Lines of Warp source that detect non-finite memory, and restore lasting memory to its value before the step."""
+"""Warp source that detects non-finite memory, and restores lasting memory to its value before the step."""
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()
@@ -133,7 +132,7 @@ def _generated(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> dict[str, Any]:
-    """Run the generated source, and return the structs, wrappers and default functions that it defines, by name."""
+    """Run the generated source, and return the structs, wrappers and default functions that it defines."""
     scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": source.world, "Params": source.params}
     scope |= {"Shared": source.shared, "Sums": source.sums}
     batch, rows, state, views = [], [], [], []
@@ -202,7 +201,7 @@ def _generated(
 
 
 def _copy(name: str, ndim: int) -> list[str]:
-    """Generate lines that copy one world's row of a field with ``ndim`` axes. Each thread copies a part of the row."""
+    """Generate lines that copy one world's row of a field. Each thread copies a part of the row."""
     if ndim == 1:
         return ["    if lane == 0:", f"        target.{name}[w] = source.{name}[w]"]
     lines = [f"    for i1 in range(lane, source.{name}.shape[1], lanes):"]

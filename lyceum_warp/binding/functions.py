@@ -29,17 +29,15 @@ class TaskSource:
         self.world: Any = self._struct("World")
         own: Any = self._struct("Params")
         self.defaults: type = own.cls
-        """The class with the parameters' defaults as attributes."""
         self.params: Any = self._with_functions(own)
         self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
-        """The fields of World that are the task's memory."""
         self.shared, self.sums = self._shared_structs()
-        """The structs ``Shared`` and ``Sums``. None if the worlds of the task share no memory."""
+        """None if the worlds of the task share no memory."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """The task's functions by their names in ``FUNCTIONS``. None for missing functions."""
+        """None for missing functions."""
         self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
@@ -96,7 +94,7 @@ class TaskSource:
         return None
 
     def _seen(self, value: Any) -> Any:
-        """Return the task's copy of a struct or function that it shares with other tasks; see ``variants``."""
+        """Return the task's copy of a struct or function; see ``variants``."""
         return value if self._variant is None else self._variant.seen(value)
 
     @property
@@ -125,8 +123,8 @@ class TaskSource:
     def _with_functions(self, own: Any) -> Any:
         """Return the parameter struct that functions take.
 
-        If the task's struct has only other defaults than a base task's, functions take the base task's struct. Such
-        tasks then share functions and kernels.
+        If the task's struct differs from a base task's only in defaults, it is the base task's struct. Such tasks share
+        functions and kernels.
         """
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
@@ -137,7 +135,7 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """Return the fields of World that are memory. Refuse memory that is not declared in parts."""
+        """Return the fields of World that are memory."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
@@ -152,7 +150,6 @@ class TaskSource:
         return parts
 
     def _shared_structs(self) -> tuple[Any, Any]:
-        """Return the structs Shared and Sums, or None if the worlds share no memory."""
         field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
         if field is None and tally is None and share is None:
             return None, None
@@ -213,7 +210,7 @@ class TaskSource:
                     )
 
     def _kind(self, argument: Any) -> str:
-        """Return the text that ``FUNCTIONS`` uses for an argument's type, such as "World" or "Row[float]"."""
+        """Return an argument's type as ``FUNCTIONS`` writes it, such as "World" or "Row[float]"."""
         if argument is self.world:
             return "World"
         if argument is self.params:
@@ -249,13 +246,12 @@ def draws_noise(observer: wp.Function) -> bool:
 
 
 def _may_list(task: type[Task], group: str) -> bool:
-    """Whether the ``obs`` of a task may have the given group. The groups of a method are unknown."""
+    """Whether the ``obs`` of a task may have the given group."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
 
 
 def _origin(struct: Any) -> str:
-    """Return the file that defines a struct, or the name of its module."""
     module = struct.cls.__module__
     return str(getattr(sys.modules.get(module), "__file__", None) or module)
 

@@ -13,14 +13,13 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The modification time and the size of each file. None if the file does not exist."""
 
 _taken: dict[str, Stamps] = {}
-"""For each module that a task's file imported from its folder, the module's file as it was then."""
+"""For each module that a task's file imported from its folder, the stamp of the module's file."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
     """Find the modules in a Python file's folder that the file imports, directly or indirectly, without running them.
 
-    Returns:
-        The file of each module. For a package without ``__init__.py``, it is the package's folder.
+    For a package without ``__init__.py``, the result has the package's folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}
@@ -81,10 +80,10 @@ def stamps(files: Iterable[Path]) -> Stamps:
 
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
-    """Let a task's file import the modules that ``local_modules`` has found in its folder, in a ``with`` block.
+    """Let a task's file import the modules that ``local_modules`` has found in its folder.
 
-    A loaded module of the same name is replaced if it has changed or comes from another folder. If the block raises an
-    error, ``sys.modules`` is restored.
+    A loaded module of the same name is replaced if it has changed or comes from another folder. After an error,
+    ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
     if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
@@ -94,7 +93,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # write no bytecode into run folders
+    sys.dont_write_bytecode = True  # run folders must not get bytecode
     try:
         yield
     except BaseException:

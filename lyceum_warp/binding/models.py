@@ -93,8 +93,7 @@ def compile_model(
     - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors. Without
-    such
-      fields, all sensors are turned off. The energy is computed if a function reads it.
+      such fields, all sensors are turned off. The energy is computed if a function reads it.
     - If ``contact`` lists a pair of geoms twice, only the first entry is kept. MuJoCo would make the contact twice, and
       MuJoCo Warp once.
 

@@ -15,7 +15,7 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Fields of ``Params`` that the package sets: the seconds in a step and in a substep."""
+"""Set by the package: the seconds in a step and in a substep."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
@@ -33,14 +33,14 @@ class Parameters:
     A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
-        struct: The task's ``Params``, which the functions take.
+        struct: The task's ``Params``.
         owner: The class with the defaults as attributes.
         task_name: The task's name, for messages.
-        model: The compiled model, which maps names of elements to indices.
+        model: The compiled model.
         nworld: Number of worlds.
-        timestep: Seconds in a step, the value of ``dt``.
+        timestep: Seconds in a step.
         given: Values that replace defaults.
-        weights: The weights of the task's terms. They are set like parameters.
+        weights: The weights of the task's terms, which are set like parameters.
     """
 
     def __init__(
@@ -59,7 +59,6 @@ class Parameters:
         self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
-        """The types of the fields that are tables."""
         self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
@@ -80,9 +79,7 @@ class Parameters:
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
     def changed(self, given: Mapping[str, Any]) -> "Parameters":
-        """Return a copy with some values replaced, each converted to its field's type. Arrays are shared with the
-        original.
-        """
+        """Return a copy with some values replaced. The copy and the original share arrays."""
         known = (*self._struct.vars, *self._weights)
         for name in given:
             if name not in known or name in _FILLED_IN:
@@ -121,7 +118,7 @@ class Parameters:
         return before if name in self.tables and np.array_equal(before, value) else value
 
     def array(self, device: wp.Device) -> wp.array:
-        """Make the kernels' array of ``Params``: one entry for all worlds, or one per world if any value differs.
+        """Make the kernels' array of ``Params``: one entry for all worlds, or one per world.
 
         The entries contain pointers to tables on the device, which this object keeps alive. New values of the same
         shape are copied into the existing table.
@@ -133,7 +130,7 @@ class Parameters:
         return wp.array(instances, dtype=self._struct, device=device)
 
     def weights(self, device: wp.Device) -> wp.array:
-        """Make the array of the terms' weights, (1 or nworld, terms): one row for all worlds, or one per world."""
+        """Make the array of the terms' weights, (1 or nworld, terms)."""
         count = self._nworld if any(name in self._weights for name in self.per_world) else 1
         rows = [np.broadcast_to(self.values[name], count) for name in self._weights]
         table: wp.array = wp.array(np.reshape(rows, (len(rows), count)).T, dtype=float, device=device)
@@ -259,7 +256,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field with a table's default elements, such as "site_xpos" for a list of sites. None for numbers."""
+    """Return the field with a table's default elements, such as "site_xpos" for a list of sites."""
     while isinstance(default, list | tuple) and default:
         default = default[0]
     return default.field if isinstance(default, Element) else None

@@ -18,9 +18,8 @@ class Slice:
 
     start: int
     count: int
-    """Number of elements."""
     dtype: Any
-    """Type of an element: float, or a vector or matrix of float."""
+    """Float, or a vector or matrix of float."""
 
     @property
     def size(self) -> int:
@@ -78,10 +77,7 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """Return a size as a number. The name of a table in ``params`` stands for the table's number of rows.
-
-    ``what`` names the size in error messages.
-    """
+    """Return a size as a number. The name of a table in ``params`` stands for the table's number of rows."""
     if not isinstance(size, str):
         return whole_number(what, size, low=1)
     table = params.get(size)

@@ -106,7 +106,7 @@ def _file(task: type[Task]) -> str | None:
 def spelled_task(task: type[Task]) -> str | None:
     """Return the name or ``file:Class`` by which ``find_task`` finds a task in another process.
 
-    A task without a file gives None.
+    The result is None for a task without a file.
     """
     if task.__module__.startswith("lyceum_warp."):
         return task_name(task)
@@ -172,8 +172,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
     """Return the source, as loaded, of a task's file and of the modules that it imports from its folder.
 
-    If the program itself imports or defines the class, the files are read at the first call of ``find_task``. A class
-    without a file, as in a notebook, has no sources.
+    A class without a file, as in a notebook, has no sources.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -256,10 +255,7 @@ def kernel_name(task: type[Task]) -> str:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """Return the module of a task's file.
-
-    A file is run on first use, and again whenever it or a module that it imports from its folder has changed.
-    """
+    """Return the module of a task's file, and run the file if it or a module from its folder has changed."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"

@@ -1,4 +1,4 @@
-"""Parse the source of a Warp function, and resolve its names and calls; run generated source."""
+"""Parse the source of a Warp function, resolve its names and calls, and run generated source."""
 
 import ast
 import builtins
@@ -27,11 +27,9 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
-        """The values of the names that the module and the enclosing functions define."""
         self.locals = {argument.arg for argument in self.tree.args.args} | {
             node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
-        """The function's arguments, and the names that it assigns."""
 
     def place(self, node: ast.AST) -> str:
         """Return the file and the line of a node, for messages."""
@@ -68,8 +66,8 @@ class FunctionSource:
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
         """Return a call's kind and its callee.
 
-        A callee is a helper (a function with Python source), a native function (``wp.func_native``) or one of Warp's
-        builtins. Otherwise it is a type, a Python function, or None if unknown.
+        A helper has Python source. A native function is a ``wp.func_native``. Other callees are types, Python
+        functions, or None if unknown.
         """
         callee = self.value(node.func)
         if self.is_static(node):
@@ -81,10 +79,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a condition that is a ``wp.static(...)``, of which Warp compiles only the selected branch.
-
-        Other conditions give None.
-        """
+        """Evaluate a condition that is a ``wp.static(...)``, of which Warp compiles only the selected branch."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
@@ -110,10 +105,7 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Find a builtin function of Warp or Python. Return None if there is none.
-
-    Some of Warp's builtins are not attributes of the module ``warp``.
-    """
+    """Find a builtin function of Warp or Python. Some of Warp's are not attributes of the module ``warp``."""
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
@@ -139,10 +131,7 @@ _module_names: set[str] = set()
 
 
 def free_module_name(name: str) -> str:
-    """Return an unused name for a Warp module.
-
-    Every process gets the same name, so that Warp finds the module in its cache.
-    """
+    """Return an unused name for a Warp module. It must be the same in every process, so that Warp's cache works."""
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0
     while free in _module_names:

@@ -1,8 +1,8 @@
 """Find a task's terms and their arguments by name, and generate the functions that compute them.
 
-A term is a function. As pytest finds fixtures by name, so the package finds the term's arguments. A name refers to the
-state, the action, the result of another function, a parameter, or a field. The generated text calls each function once,
-and terms share the results.
+A term is a function. Its arguments are found by name, as pytest finds fixtures. A name refers to the state, the action,
+the result of another function, a parameter, or a field. The generated text calls each function once, and terms share
+the results.
 """
 
 import difflib
@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The arguments s0, action, s1, s and p of a reward term or a metric, in the generated text."""
+"""Names of a reward term's or a metric's arguments in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The arguments s, s1 and p of a termination, in the generated text."""
+"""Names of a termination's arguments in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Other names in the generated text. Terms cannot use them."""
@@ -33,8 +33,8 @@ class Terms:
     Args:
         task: The task's class.
         name: The task's name, for messages.
-        lookup: A function that finds a function by name in the task's class, its base classes, and their modules.
-        written: The task's functions by their names in ``FUNCTIONS``; None for missing functions.
+        lookup: Finds a function by name in the task's class, its base classes, and their modules.
+        written: The task's functions by their names in ``FUNCTIONS``.
         world: The task's World.
         params: The task's Params.
     """
@@ -50,7 +50,6 @@ class Terms:
     ) -> None:
         self._name, self.lookup, self._world, self._params = name, lookup, world, params
         self.weights = self._checked_weights(task.rewards)
-        """The weights of the reward's terms."""
         self.terminations = self._names("terminations", task.terminations)
         self._reward, self._measure = written["reward"], written["measure"]
         functions = self._names("metrics", task.metrics, written=self._measure is not None)
@@ -58,19 +57,17 @@ class Terms:
             if getattr(task, attribute) and written[kind]:
                 raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: remove one of them")
         self.functions: dict[str, wp.Function] = {}
-        """The functions that the generated text calls."""
         self.text = ""
-        """The source of the generated functions. Empty if the task has no terms."""
+        """The source of the generated functions."""
         self.metrics = (*self.weights, *task.metrics, *self.terminations)
-        """The names of all metrics, in order."""
         if self.weights or self.terminations or functions:
             self.text = self._written_text(functions, len(task.metrics) - len(functions))
 
     def generated(self, file: str) -> dict[str, wp.Function]:
         """Generate ``reward``, ``score`` and ``terminated``, except the functions that the task defines.
 
-        ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` is the
-        name of the generated text in error messages.
+        ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` names
+        the generated text in error messages.
         """
         if not self.text:
             return {}
@@ -157,7 +154,7 @@ class Terms:
         Args:
             name: The function's name.
             given: The text for each name that refers to a state, the action or Params.
-            within: The chain of functions whose arguments led to this function, to detect cycles.
+            within: The functions whose arguments led to this one, to detect cycles.
         """
         if name in within:
             raise ValueError(
@@ -240,7 +237,7 @@ class _Body:
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
     def value(self, name: str, *wanted: type) -> str:
-        """Return the variable that holds a function's result. Check the result's type against ``wanted``."""
+        """Return the variable that holds a function's result."""
         if name not in self._values:
             function, kind = self._terms.choose(name, self._given)
             arguments, named = [], False
@@ -261,12 +258,10 @@ class _Body:
         return f"{name}_"
 
     def number(self, name: str) -> str:
-        """Convert a value to float. A bool becomes 0 or 1."""
         value = self.value(name, float, bool)
         return f"wp.where({value}, 1.0, 0.0)" if _fits(bool, self._values[name][1]) else value
 
     def function(self, signature: str, lines: list[str]) -> str:
-        """Return the text of a function that ends with ``lines``."""
         return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
 
 

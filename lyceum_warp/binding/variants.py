@@ -2,7 +2,7 @@
 
 Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
 functions are therefore copied, and the copies take the task's World. If the task replaces one of the parent's
-functions, the copies call the replacement. Error messages name the original's file and line.
+functions, the copies call the replacement.
 """
 
 import sys
@@ -22,8 +22,8 @@ class Variant:
     Args:
         modules: The modules of the family. The task's module comes first.
         functions: The functions with Python source in these modules.
-        structs: The replacement of each replaced struct.
-        replaced: The replacement of each replaced function.
+        structs: The replacements of structs.
+        replaced: The replacements of functions.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         owners: The task's class and its base classes, without ``Task``.
         world: The task's World.
         params: The task's Params, which its functions take.
-        own: The task's own declaration of Params: ``params`` itself, or a struct with other defaults.
+        own: ``params`` itself, or a struct that differs from it only in defaults.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -149,7 +149,6 @@ def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[
 
 
 def _names(module: types.ModuleType, structs: set[Any]) -> bool:
-    """Whether a function that a module defines takes one of the structs."""
     return any(
         isinstance(value, wp.Function) and _home(value) == module.__name__
         and any(is_struct(kind) and kind in structs for f in overloads(value) for kind in f.input_types.values())

@@ -158,7 +158,6 @@ class Probe:
             launch_worlds(kernel, 1, args, self._device)
 
     def _check_fields(self, function: str) -> None:
-        """Raise a ValueError if a function wrote outside a field or outside its random stream."""
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
             if parts:  # check_task finds writes to a wrong element within a row
@@ -168,7 +167,6 @@ class Probe:
         self._check(function, self._streams, "rng", "a stream has 1")
 
     def _check_memory(self, function: str, rows: GuardedRows, layout: Layout) -> None:
-        """Raise a ValueError if a function wrote outside the parts of a row of memory."""
         name = next(iter(layout) if (rows.outside() < 0).all() else reversed(layout))
         start, size = layout[name].start, layout[name].size
         self._check(function, rows, name, f"World declares {size}", start, size)

@@ -1,8 +1,7 @@
 """Find all places where a Warp function, or a function that it calls, writes into its arguments.
 
 The analysis follows a row into its elements and their components, into calls, local variables and local structs. Any
-other use of a row counts as a write: if it is returned, put into a tuple, selected by ``wp.where``, or passed to a
-native function.
+other use of a row counts as a write, for example returning it or passing it to a native function.
 """
 
 import ast
@@ -16,7 +15,6 @@ import warp as wp
 from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
 
 _READERS = {"len", "lower_bound", "sample_cdf", "print", "printf"}
-"""Builtins that only read their arrays."""
 
 _INQUIRIES = {"shape", "ndim", "size", "strides", "dtype", "device"}
 """Attributes of an array that do not refer to its elements."""
@@ -28,11 +26,10 @@ class Write:
 
     position: int
     field: str | None
-    """The written field of an argument that is a struct. None for a row."""
+    """None for a row."""
     target: str
     """The argument with its field, such as "s.qpos"."""
     function: str
-    """The name of the function that contains the write."""
     place: str
     """The file and the line of the write."""
     replaced: bool = False
@@ -83,7 +80,6 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    """Say which fields the function may write, and which functions may write the given field."""
     may = [field for fields in rights[name].values() for field in fields or ()]
     results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
     own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
@@ -137,8 +133,7 @@ class _Reader:
 
     Args:
         function: The function.
-        places: What the caller has passed for each argument of ``function``: an argument of the analysed function or a
-            part of it, or None.
+        places: What the caller has passed for each argument: an argument of the analysed function or a part of it.
         arguments: Names of the arguments of the analysed function.
         writes: The dict to which writes are added.
         seen: The functions that were already read, each with the places of its arguments.
@@ -162,7 +157,7 @@ class _Reader:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Record a write. If ``follows`` is False, record a use of a row that the analysis cannot follow."""
+        """Record a write, or if ``follows`` is False, a use of a row that the analysis cannot follow."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)
@@ -194,7 +189,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Analyse the children of a syntax node, and record each row that a child uses as a whole, not by element."""
+        """Analyse the children of a syntax node, and record each row that a child uses as a whole."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):
@@ -215,12 +210,10 @@ class _Reader:
                     self._note(lost, node, follows=False)
 
     def _is_local(self, target: ast.expr) -> bool:
-        """Whether an assignment changes only a local variable, or a field of a local struct."""
         owner = target.value if isinstance(target, ast.Attribute) else None
         return isinstance(target, ast.Name) or (isinstance(owner, ast.Name) and owner.id not in self.places)
 
     def _store(self, target: ast.expr) -> None:
-        """Record the assignment of an element, a component or a field."""
         if isinstance(target, ast.Tuple | ast.List):
             for part in target.elts:
                 self._store(part)
@@ -244,7 +237,6 @@ class _Reader:
             self._read_all(node, given)
 
     def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
-        """Record which arguments of a call the called function writes."""
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
         places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}

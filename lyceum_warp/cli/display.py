@@ -35,7 +35,7 @@ def note(line: str) -> None:
 
 
 class Display(training.Display):
-    """Shows the progress of training: a live bar of at most 80 columns on a terminal, otherwise one line per iteration."""
+    """Shows the progress of training: a live bar on a terminal, otherwise one line per iteration."""
 
     def __init__(self, console: Console) -> None:
         self.console, self.total, self.mean = console, 0, math.nan

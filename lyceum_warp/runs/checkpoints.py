@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced, unknown_format
 
 FORMAT = 1
-"""Format version of run folders and their files. It increases when older releases cannot read new files."""
+"""Format version of run folders. It increases when older releases cannot read new files."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
@@ -24,7 +24,7 @@ PolicyContent = dict[str, Any]
 """``iteration``, ``policy``, and ``value`` if there is a value function."""
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The class of each network, for files that do not name it."""
+"""The class of a network for files that do not name it."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
@@ -165,6 +165,6 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
 
 
 def _first_sentence(error: BaseException) -> str:
-    """Get the first sentence of an error message. A message of torch can fill a page."""
+    """Get the first sentence of an error message, because torch's messages can fill a page."""
     text = str(error).strip() or type(error).__name__
     return text.splitlines()[0].split(". ")[0][:200]

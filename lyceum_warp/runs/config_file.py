@@ -22,7 +22,7 @@ _KEPT: dict[str, Any] = {
     "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
     "program": bool,
 }  # fmt: skip
-"""The types of the entries of config.json, and of its dicts ``reached`` and ``kept``. All entries are optional."""
+"""Types of the entries of config.json. All entries are optional."""
 
 
 def read_config(path: Path) -> dict[str, Any]:

@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
     "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
 }  # fmt: skip
-"""The class of the learner and of its hyperparameters, by the algorithm's name in config.json."""
+"""The learner's class and the class of its hyperparameters, by the algorithm's name in config.json."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -77,7 +77,6 @@ class Configuration:
     seed: int | None = None
     """Seed of the algorithm. None means the environment's seed."""
     threads: int = 1
-    """Threads of torch."""
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
@@ -121,8 +120,8 @@ class Configuration:
             team: The processes that train together.
             run: The run that provides the task. A file that has moved or changed is replaced by the run's copy.
             networks: The initial policy and value function; None for new networks.
-            note: Function that is called with messages about the task's files.
-            task: Another task to use instead, in its current version.
+            note: Called with messages about the task's files.
+            task: Another task to use instead.
             trust: Whether to execute the task even if the run was not made by this user on this machine.
         """
         try:
@@ -155,9 +154,9 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
 
     Args:
         run: The run.
-        which: Policy of the run, or None to resume the run. A resumed learner usually makes its networks from the
-            hyperparameters, so None is returned for them. Networks that the hyperparameters do not describe are
-            loaded: those of a run that started from another run, or with a ``limit`` that is not the default.
+        which: Policy of the run, or None to resume the run. A resumed learner makes its networks from the
+            hyperparameters, so None is returned for them. The exceptions are networks with a ``limit``, and runs that
+            started from another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

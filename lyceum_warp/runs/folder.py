@@ -28,7 +28,7 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _TASK = "config.json", "task"
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
-"""Remains of a process that was killed while it created a run. A new run replaces them."""
+"""Remains of a process that was killed while it created a run."""
 
 log = logging.getLogger(__name__)
 
@@ -113,9 +113,8 @@ class Run:
     ) -> "Run":
         """Create a run folder with a copy of the task, the configuration and the versions.
 
-        The folder is deleted if an error occurs. If the task, its model or a parameter is a file of the user, the run
-        is recorded as trusted in the user's state directory (``lyceum_warp.runs.trust``). Later calls can then execute
-        the task without ``trust=True``.
+        The folder is deleted if an error occurs. If the run uses the user's own files, it is recorded as trusted (see
+        ``lyceum_warp.runs.trust``). Later calls can then execute the task without ``trust=True``.
 
         Args:
             folder: A new or empty folder.
@@ -184,7 +183,7 @@ class Run:
     # policies
 
     def numbered(self, iteration: int) -> Path:
-        """Get the path of an iteration's policy. The file exists if the policy was saved."""
+        """Get the path of an iteration's policy."""
         return self.folder / "policies" / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
@@ -243,7 +242,7 @@ class Run:
 
         Args:
             device: Device for the tensors.
-            note: Function that is called with a message if the previous checkpoint is read.
+            note: Called with a message if the previous checkpoint is read.
 
         Raises:
             FileNotFoundError: The run has no checkpoint.

@@ -66,7 +66,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
 
 
 def _owner(text: str) -> tuple[str, str]:
-    """Describe the process in a lock file, and return its host. The host of a damaged file is ""."""
+    """Describe the process in a lock file, and return its host."""
     try:
         owner = json.loads(text)
         return f"process {owner['pid']} on {owner['host']}", str(owner["host"])

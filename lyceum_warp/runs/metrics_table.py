@@ -35,7 +35,7 @@ def append_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 def read_metrics(path: Path) -> list[dict[str, float | None]]:
-    """Read the rows. An empty cell is None. An incomplete last row, without a line end, is ignored."""
+    """Read the rows. An empty cell is None. An incomplete last row is ignored."""
     with path.open(newline="") as file:
         reader = csv.DictReader((line for line in file if line.endswith("\n")), strict=True)
         try:
@@ -49,10 +49,7 @@ def cut_rows(path: Path, iteration: int) -> None:
 
     Args:
         path: The table; it need not exist.
-        iteration: The last iteration to keep. The first row need not be iteration 1.
-
-    Raises:
-        ValueError: The table is damaged. The file does not change.
+        iteration: The last iteration to keep.
     """
     if not path.exists():
         return

@@ -1,9 +1,8 @@
 """Save a replay buffer beside a run's checkpoint, in files that are never changed.
 
-The sequence of all steps is divided into equal parts, each about 1/64 of the buffer, with one file per part. A save
-writes only the parts with new steps, so its duration is proportional to their number. A part with new steps gets a new
-file. Its old file is deleted after the checkpoint has been replaced. The files therefore always contain the
-checkpoint's steps.
+The steps are divided into equal parts, each about 1/64 of the buffer, with one file per part. A save writes only the
+parts with new steps, each to a new file. Old files are deleted after the checkpoint has been replaced. The files
+therefore always contain the checkpoint's steps.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,7 +23,7 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
         replay: The replay buffer.
         team: The processes.
         since: Number of stored steps at the last save.
-        check: Function that checks the run's lock before each write; None if ``folder`` is None.
+        check: Checks the run's lock before each write; None if ``folder`` is None.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):

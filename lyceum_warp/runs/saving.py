@@ -14,34 +14,33 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
-"""Maximum time between saves in seconds, unless saves are slow (see ``LONG``)."""
+"""Maximum seconds between saves, unless saves are slow (see ``LONG``)."""
 
 SHARE = 100
 """Usual time between saves, as a multiple of the last save's duration."""
 
 LONG = 20
-"""Minimum time between saves, as a multiple of the last save's duration. It may exceed ``SAVE_SECONDS``."""
+"""Minimum time between saves, as a multiple of the last save's duration."""
 
 
 class Saver:
     """Writes a run's files.
 
     Metrics, a new best policy, and a policy in a numbered file are written after each iteration. The last policy and
-    the complete state are saved together: at the start, at the end and in between. The time between two saves is 100
-    times the duration of the last save, but at most 30 s. For example, saves of 20 ms happen every 2 s and take 1 % of
-    the time. Saves of 1 s happen every 30 s and take 3 % of the time. After ``kill -9``, the run resumes from the last
-    save.
+    the complete state are saved together. The time between two saves is 100 times the duration of the last save, but at
+    most 30 s. For example, saves of 20 ms happen every 2 s and take 1 % of the time. After ``kill -9``, the run resumes
+    from the last save.
 
     All ranks have a saver and make the same calls. Only rank 0 writes.
 
     Args:
         run: The run; None on ranks that do not write.
-        check: Function that checks the run's lock before every write; None if ``run`` is None.
+        check: Checks the run's lock before every write; None if ``run`` is None.
         learner: The algorithm.
         keep_every: Iterations between two policies in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         saved: Number of the last saved iteration; -1 before the first save.
-        note: Function that is called with a message if the file of the best policy is damaged.
+        note: Called with a message if the file of the best policy is damaged.
     """
 
     saved: int
@@ -66,7 +65,7 @@ class Saver:
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
     def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's metrics. Also write the policy if it is the best so far or needs a numbered file.
+        """Write an iteration's metrics, and its policy if it is the best so far or needs a numbered file.
 
         Returns:
             The iteration's return, by which policies are compared. It may be None.

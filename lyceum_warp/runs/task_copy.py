@@ -30,11 +30,11 @@ Files = dict[Path, Path | bytes]
 
 _MODEL, TABLES = "model", "tables"
 _APART = 2
-"""The task's file and the model keep their relative paths, up to this many levels between the task's file and the
-common parent folder. Beyond it, they are copied into separate folders.
+"""If the task's file is more than this many levels below the folder that it shares with the model, the two are copied
+into separate folders.
 """
 _LARGEST = 512 * 2**20
-"""Maximum size of a model's files in bytes. Larger models are not copied."""
+"""Larger models, in bytes, are not copied."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
 """Maximum number and total size in bytes of a task's modules. Above either, none of them is copied."""
 
@@ -98,7 +98,7 @@ def _npy(array: np.ndarray) -> bytes:
 
 
 def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and the modules that it imports from its folder. Omit modules that exceed a limit."""
+    """Get a task's file and the modules that it imports from its folder, unless they exceed a limit."""
     size = sum(map(len, loaded.values())) - len(loaded[file])
     if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
         return dict(loaded)
@@ -128,10 +128,9 @@ def run_env(
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
-        note: Function that is called with each message.
-        task: Another task to use instead, in its current version.
-        trust: Whether to execute the task and read the files even if this user did not make the run on this machine;
-            see ``lyceum_warp.runs.trust``.
+        note: Called with each message.
+        task: Another task to use instead.
+        trust: Whether to execute the task and read the files even if this user did not make the run on this machine.
 
     Raises:
         ValueError: The task does not fit the run, or the run is not trusted.
@@ -183,7 +182,6 @@ def run_env(
 
 
 def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
-    """List the changes since the run started to a task's file and to its modules."""
     changes = []
     for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
         path = file.parent / name
@@ -201,7 +199,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
     Args:
         run: The run.
         env: The environment.
-        note: Function that is called with each message.
+        note: Called with each message.
         model: Whether to compare the compiled models, which also depend on the physics options.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
@@ -227,7 +225,7 @@ def _digest(content: bytes) -> str:
 
 
 def _model_hash(env: Env) -> str:
-    """Hash the compiled model. Processes and paths do not change the hash."""
+    """Hash the compiled model, without what depends on processes and paths."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
@@ -248,8 +246,7 @@ def _beside(path: Path, file: Path) -> str:
 def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
     """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
 
-    Relative paths are kept, so that the copied task finds the copied model. If its folder is too far from the task's
-    file, the model gets a separate folder.
+    Relative paths are kept if possible, so that the copied task finds the copied model.
     """
     if not paths:
         return {}

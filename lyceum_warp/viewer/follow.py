@@ -1,7 +1,6 @@
 """Follow a training run: show its newest policy in separate worlds.
 
-The viewer only reads the run's files, so it does not change the training. It may run on another machine that shares
-the folder.
+The viewer only reads the run's files. It may run on another machine that shares the folder.
 """
 
 import contextlib
@@ -22,7 +21,7 @@ from lyceum_warp.runs.folder import Run, load
 
 
 class Follower:
-    """Loads the newest policy of a run; ``policy(obs)`` returns mean actions.
+    """Loads the newest policy of a run. ``policy(obs)`` returns mean actions.
 
     Raises:
         FileNotFoundError: The run has no policy yet.
@@ -118,7 +117,7 @@ class RunViewer:
         return self._process.poll() is None
 
     def close(self) -> None:
-        """End the viewer's process; a second call does nothing."""
+        """End the viewer's process."""
         self._process.terminate()
         try:
             self._process.wait(10.0)

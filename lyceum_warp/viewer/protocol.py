@@ -14,16 +14,15 @@ WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
 """The number of a world, or a rule that selects one. "best" and "worst" compare the returns of unfinished episodes."""
 
 MOST_GHOSTS = 32
-"""The maximum number of other worlds, and of other episodes, that are drawn at once."""
+"""The most other worlds or episodes that are drawn at once."""
 MOST_BURST = 50
-"""The maximum number of states along a trajectory that are drawn at once."""
+"""The most states along a trajectory that are drawn at once."""
 
 TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
 BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
-"""Colours of a planner's samples and of the best sample, in the window and in videos."""
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""The most curve points and messages in one frame, including those of skipped frames."""
+"""The most curve points and messages in one frame."""
 
 
 # messages to the window
@@ -35,14 +34,12 @@ class Scene:
 
     title: str
     model: bytes
-    """The model, as ``mujoco.mj_saveModel`` writes it."""
     nworld: int
     modes: tuple[Mode, ...]
-    """The available modes. The session starts in the first one."""
     controllers: tuple[str, ...]
     episodes: tuple[str, ...]
     curves: tuple[str, ...]
-    """The names of the live curves: "reward", "eval" and the task's metrics."""
+    """"reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
     """The largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s) that the user can command."""
 
@@ -67,7 +64,7 @@ class Ghost:
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """Shift of the ghost in x and y, in metres."""
+    """In x and y, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,13 +82,13 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of other worlds to draw, at most ``MOST_GHOSTS``."""
+    """The number of other worlds to draw."""
     grid: bool = False
-    """Whether to draw the other worlds side by side in a grid."""
+    """Whether to draw the other worlds side by side."""
     episodes: int = 0
     """The number of other episodes to draw, at the same step."""
     burst: int = 0
-    """The number of past (red) and future (blue) states to draw along the trajectory, at most ``MOST_BURST``."""
+    """The number of past (red) and future (blue) states to draw along the trajectory."""
     plan: bool = True
     """Whether to draw the plan's final pose and the traces of the samples."""
 
@@ -106,7 +103,7 @@ class Status:
     world: int
     step: int
     steps: int
-    """The length of the episode in playback. Otherwise the task's horizon, or 0 without a horizon."""
+    """The length of the episode in playback. Otherwise the task's horizon, or 0."""
     time: float
     """Simulated seconds since the start of the episode."""
     paused: bool
@@ -120,13 +117,11 @@ class Status:
     video: str | None
     ghosts: SetGhosts = SetGhosts()
     command: tuple[float, float, float] | None = None
-    """The command of a walking robot: forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
     """Whether the user drives the robot. Otherwise the task chooses the command."""
     planner: tuple[tuple[str, float], ...] = ()
-    """The planner's settings that the user can change."""
     params: tuple[tuple[str, float], ...] = ()
-    """The task's parameters that the user can change."""
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
@@ -149,14 +144,11 @@ class Frame:
     best: int | None = None
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """New points of the curves, (points, 2 + curves).
-
-    The columns are the simulated time in seconds, 1 at the end of an episode, and a value for each curve.
-    """
+    """(points, 2 + curves): the simulated time in seconds, 1 at the end of an episode, and a value for each curve."""
     messages: tuple[str, ...] = ()
     """Why episodes ended, faults, and why commands were refused."""
     files: tuple[str, ...] = ()
-    """The absolute paths of new videos, pages and pictures, for the page's download links."""
+    """Absolute paths of new videos, pages and pictures to offer for download."""
 
 
 def latest(older: Frame | None, newer: Frame) -> Frame:
@@ -181,9 +173,7 @@ class SetMode:
 
     mode: Mode
     controller: str | None = None
-    """None keeps the current controller."""
     episode: int | None = None
-    """None keeps the current episode."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,13 +234,13 @@ class Perturb:
     """
 
     forces: np.ndarray
-    """Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6) float64."""
+    """Forces (N) and torques (Nm) in world coordinates, (nbody, 6) float64."""
     qpos: np.ndarray | None = None
-    """Positions, (nq,) float64. They take effect only while paused."""
+    """(nq,) float64. It takes effect only while paused."""
     mocap_pos: np.ndarray | None = None
-    """Positions of mocap bodies, (nmocap, 3) float64, in metres."""
+    """(nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
-    """Orientations of mocap bodies, (nmocap, 4) float64: w, x, y, z."""
+    """(nmocap, 4) float64: w, x, y, z."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -283,7 +273,6 @@ class TakePicture:
     """Write a picture of the scene."""
 
     camera: dict[str, Any]
-    """The attributes of the ``mujoco.MjvCamera``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -315,7 +304,6 @@ class Opened:
     """Reports that the window is open."""
 
     address: str
-    """The page's address with its token."""
     instructions: tuple[str, ...] = ()
 
 

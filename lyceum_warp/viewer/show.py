@@ -98,7 +98,6 @@ class BackgroundView:
 
     def __init__(self, session: Session, window: Window) -> None:
         self.address = window.address
-        """The page's address with its token."""
         self._title, self._window = session.stage.scene.title, window
         self._thread = threading.Thread(target=session.run, args=(window,), name="lyceum_warp view", daemon=True)
         self._thread.start()

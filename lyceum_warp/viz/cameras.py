@@ -100,7 +100,7 @@ def camera_names(model: mujoco.MjModel) -> list[str]:
 
 
 def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
-    """Return a camera's values: type, index, tracked body, lookat (3), distance, azimuth, elevation, orthographic."""
+    """Return a camera's type, index, tracked body, lookat (3), distance, azimuth, elevation and orthographic."""
     return (
         int(camera.type), camera.fixedcamid, camera.trackbodyid, *map(float, camera.lookat), camera.distance,
         camera.azimuth, camera.elevation, int(camera.orthographic),

@@ -42,7 +42,6 @@ class DrawingProcess:
     """A context manager for a subprocess that renders poses with the first graphics library that works."""
 
     product = "the drawing"
-    """The name of the result in error messages."""
 
     def __init__(
         self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
@@ -94,7 +93,7 @@ class DrawingProcess:
         return pixels.reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
-        """Kill the subprocess without waiting, and do not start another one. Any thread may call this method.
+        """Kill the subprocess, and do not start another one. Any thread may call this method.
 
         The rendering thread then gets a ``NoVideoError``.
         """
@@ -124,7 +123,6 @@ class DrawingProcess:
         self._send(self._job)
 
     def _send(self, message: Any) -> bool:
-        """Send a message, and return False if the subprocess has ended."""
         assert self._process is not None and self._process.stdin is not None
         try:
             pickle.dump(message, self._process.stdin, protocol=pickle.HIGHEST_PROTOCOL)
@@ -134,7 +132,7 @@ class DrawingProcess:
         return True
 
     def _answer(self) -> str:
-        """Read the next reply of the subprocess, or "" if the subprocess has ended."""
+        """Read the next reply of the subprocess, or "" if it has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
             if line in (b"ready\n", b"frame\n"):  # drivers may print other lines
@@ -171,7 +169,7 @@ class DrawingProcess:
 
 
 class Drawing(DrawingProcess):
-    """A subprocess that draws poses into a video file; see ``write_video`` for arguments and errors."""
+    """A subprocess that draws poses into a video file; see ``write_video``."""
 
     product = "the video"
 

@@ -24,7 +24,7 @@ _AROUND, _ALONG = 24, 12  # segments of a circle and of a half circle
 _RATE = 60  # maximum frames per second
 _FLOOR = 200.0  # half the side of an infinite floor, in m
 Surface = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""The vertices and the normals of a surface, both (n, 3), and its triangles, (m, 3)."""
+"""Vertices and normals, both (n, 3), and triangles, (m, 3)."""
 
 
 def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: CameraChoice = None) -> Path:
@@ -123,7 +123,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return a geom's red, green, blue and opacity. The material counts unless the geom has its own colour."""
+    """Return a geom's colour. The material counts unless the geom has its own colour."""
     own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
     if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
         return own
@@ -131,7 +131,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's vertices, normals and triangles in the geom's coordinates. Return None if the kind is not drawn."""
+    """Make a geom's surface in the geom's coordinates. Return None if the kind is not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:

@@ -1,14 +1,13 @@
 """Draw poses into a video, or as single pictures: ``python render.py folder``.
 
-``drawing.py`` runs this program as a subprocess and writes pickled objects to its stdin. The first is a dict with
-``size``, ``fps``, ``camera`` and ``background``. A ``Shot`` for each picture and then None follow. The folder holds the
-model, ``model.mjb``. The program writes ``video.mp4``, or each picture into ``picture.raw`` if ``fps`` is None. It
-prints "ready" once it can draw, and "frame" after each picture. EOF without None means that the parent process has
-died. The program then deletes the folder.
+``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
+``size``, ``fps``, ``camera`` and ``background``, a ``Shot`` for each picture, and None. EOF without None means that the
+parent process has died. The folder holds the model, ``model.mjb``. The program writes ``video.mp4``, or each picture
+into ``picture.raw`` if ``fps`` is None. It prints "ready" once it can draw, and "frame" after each picture.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
-therefore starts a process for each graphics library that it tries. The program imports no module of the package. Exit
-code 3 means that the machine cannot draw with this graphics library. The last line on stderr then holds the reason.
+therefore starts a process for each library that it tries. Exit code 3 means that the machine cannot draw with this
+library. The last line on stderr then holds the reason. The program imports no module of the package.
 """
 
 import contextlib
@@ -26,7 +25,7 @@ CANNOT_DRAW = 3
 ABANDONED = 4
 
 VIDEO, PICTURE = "video.mp4", "picture.raw"
-"""The output files. A picture has the shape (height, width, 3) and the type uint8."""
+"""A picture has the shape (height, width, 3) and the type uint8."""
 
 
 class Shot(TypedDict):
@@ -37,9 +36,9 @@ class Shot(TypedDict):
     model_fields: dict[str, np.ndarray]
     """Values that replace the model's values, by the fields' names."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
-    """Additional poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
+    """Poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
-    """Lines, each with its points, (points, 3), its colour and its width in pixels."""
+    """Points, (points, 3), colour and width in pixels."""
     frames: int
 
 

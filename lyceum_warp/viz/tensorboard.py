@@ -1,7 +1,4 @@
-"""Write curves of a run for TensorBoard, with the extra ``tensorboard``.
-
-The files for TensorBoard contain the same numbers as ``metrics.csv``.
-"""
+"""Write a run's curves for TensorBoard, with the extra ``tensorboard``."""
 
 import importlib.util
 import math
@@ -135,7 +132,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute the samples per second without the time of evaluations. Return {} if the times are unknown."""
+    """Compute the samples per second without the time of evaluations."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

@@ -1,4 +1,4 @@
-"""Write videos of states. A subprocess renders them off-screen."""
+"""Write videos of states, rendered off-screen in a subprocess."""
 
 import contextlib
 import math
@@ -94,10 +94,8 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 class Recorder:
     """Makes a video of shots that arrive one by one, for example from the viewer.
 
-    Shots wait in a queue until a subprocess of low priority draws them, so ``add`` returns at once. If the queue is
-    full, further shots are dropped. The last shot in the queue is then displayed longer, so that the video keeps its
-    duration. The file is written when the video is complete. After ``cancel``, or if the program is killed,
-    an older file of the same name is unchanged.
+    Shots wait in a queue until a subprocess of low priority draws them. If the queue is full, further shots are
+    dropped, and the last shot in the queue is displayed longer. The file is written when the video is complete.
 
     Args:
         model: The model.
@@ -116,7 +114,7 @@ class Recorder:
         self.added = 0
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
-        """The number of frames whose own shot was dropped, and which repeat an earlier one."""
+        """The number of frames whose own shot was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
@@ -162,7 +160,7 @@ class Recorder:
         return self.out
 
     def cancel(self) -> None:
-        """Cancel the video at once, and write no file, unless the video is complete."""
+        """Cancel the video, and write no file, unless the video is complete."""
         if not self.finished:
             self._cancelled = True
             self._shots.clear()
@@ -188,7 +186,6 @@ class Recorder:
             self._done.set()
 
     def _next(self) -> Shot | None:
-        """Return the next shot, or None after the last shot."""
         with self._changed:
             self._changed.wait_for(lambda: self._shots or self._ended)
             return self._shots.popleft() if self._shots else None

@@ -33,14 +33,14 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
-"""Maximum lag of the worlds behind the wall clock, in seconds. They do not catch up a longer lag."""
+"""The worlds do not catch up a longer lag behind the wall clock, in seconds."""
 _IDLE = 0.5
 """Seconds between two frames of a paused view in which nothing changes."""
 _CHECK = 0.5
 """Seconds between two calls of the watchers."""
 
 Watcher = Callable[[], Sequence[str]]
-"""Returns new messages. It is called about twice a second."""
+"""Returns new messages."""
 
 
 class Session:
@@ -146,12 +146,10 @@ class Session:
     # real time
 
     def _by_the_clock(self) -> bool:
-        """Whether a controller of one world is in use and its plant runs in real time."""
         stage = self.stage
         return isinstance(stage.control, WorldControl) and not stage.paused and not stage.live.past.ahead
 
     def _run_plant(self) -> None:
-        """Run the plant until the episode ends, or until a command needs the plant's state."""
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()
@@ -177,7 +175,7 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Carry out a command. If it fails, show the error to the user.
+        """Carry out a command, and show an error to the user.
 
         A command that needs the plant's state stops a plant that runs in real time.
         """

@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
-"""The maximum number of a plan's samples whose paths the viewer draws."""
+"""The most samples of a plan whose paths the viewer draws."""
 
 
 class ControllerError(Exception):
@@ -32,13 +32,13 @@ class PlanView:
     """A copy of a plan and of some of its samples on the CPU."""
 
     state: torch.Tensor
-    """The initial state, (state_space.size,) float64."""
+    """(state_space.size,) float64."""
     actions: torch.Tensor
     """(horizon, nact)."""
     samples: torch.Tensor
-    """The actions of the copied samples, (horizon, samples, nact)."""
+    """(horizon, samples, nact)."""
     best: int | None
-    """The index of the copied sample with the largest return. None without samples."""
+    """The sample with the largest return."""
 
 
 class PolicyControl:
@@ -86,7 +86,7 @@ class WorldControl:
         """The part of the state with the forces of the user's push. Controllers see zeros there."""
 
     def new_run(self) -> "ControlRun":
-        """Return the controller for a new control loop. Calls from earlier control loops fail from now on."""
+        """Return the controller for a new control loop. Calls from earlier control loops then fail."""
         self._run += 1
         return ControlRun(self, self._run)
 
@@ -161,7 +161,7 @@ class ControlRun:
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
-    """Copy the last plan of a controller to the CPU. Return None for a controller without plans."""
+    """Copy the last plan of a controller to the CPU, or return None for a controller without plans."""
     plan = getattr(controller, "actions", None)
     if not isinstance(plan, torch.Tensor) or plan.ndim != 2:
         return None
@@ -202,7 +202,6 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 
 def _is_policy(controller: Any) -> bool:
-    """Whether a controller is a policy: it takes one argument, the observations."""
     function: Any = acting(controller)
     if module := isinstance(function, torch.nn.Module):
         function = function.forward

@@ -25,15 +25,12 @@ class Driving:
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
         self.limits: tuple[float, float, float] | None = None
-        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s).
-
-        None if the task has no commands.
-        """
+        """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
         self.wanted: tuple[float, float, float] | None = None
-        """The user's command. If None, the task chooses."""
+        """None if the task chooses."""
 
     def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
         """Return the commanded forward velocity, lateral velocity and yaw rate in a state, (state_space.size,)."""

@@ -39,7 +39,7 @@ class FrameMaker:
         self.messages.append(text)
 
     def forget_seen(self, live: Live) -> None:
-        """Forget the ends of episodes and the faults so far, and report only later ones."""
+        """Report only later ends of episodes and later faults."""
         self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
@@ -59,8 +59,7 @@ class FrameMaker:
             main: All worlds.
             traces: The paths of a planner's samples.
             status: A function that completes a ``Status``, given some of its fields.
-            paused: Whether the session is paused. If so, the frame shows the present state. Otherwise it may show the
-                state at the previous frame.
+            paused: Whether to show the present state. Otherwise the frame may show the state at the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
         wanted = shown if live is main else [], self.ghosts.burst
@@ -141,7 +140,6 @@ class FrameMaker:
         return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        """Place other worlds in a grid around the displayed world."""
         cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
         step = self._grid_step
         return [Ghost(self._pose(row), None, (step * x, step * y)) for row, (x, y) in zip(states, cells, strict=False)]
@@ -157,7 +155,7 @@ class FrameMaker:
         return 2.2 * float(far[moving].max(initial=0.1))
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
-        """Make ghosts along a trajectory. States near the present come first and are the most opaque."""
+        """Make ghosts along a trajectory. The first states are the most opaque."""
         return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _pose(self, state: np.ndarray) -> Any:

@@ -1,7 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-History, returns and curves stay on the worlds' device. On a GPU, steps do not wait for the device, and frames are
-copied to the host asynchronously.
+On a GPU, steps do not wait for the device, and frames are copied to the host asynchronously.
 """
 
 import dataclasses
@@ -27,20 +26,18 @@ _CURVE_ROWS = 512  # most curve points between two frames; later points overwrit
 class Past:
     """A ring buffer with the states of all worlds before each recent step.
 
-    The buffer stays empty if the memory is too small for two states of all worlds.
+    It stays empty if the memory is too small for two states of all worlds.
     """
 
     def __init__(self, env: Env, limit: int) -> None:
         n, size, device = env.nworld, env.state_space.size, env.obs.device
         length = min(HISTORY_STEPS, limit // (n * 8 * (size + 1)))
         self.length = length if length > 1 else 0
-        """Capacity in states."""
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
         self.pushed: list[int | None] = [None] * self.length
         """The world that the user was pushing in each step."""
         self.now = self.newest = self.oldest = 0
-        """The numbers of the present, the newest and the oldest step in the history."""
 
     @property
     def behind(self) -> int:
@@ -71,18 +68,18 @@ class Rows:
     """The data of a frame, copied to the host."""
 
     worlds: tuple[int, ...]
-    """The indices of the worlds. The displayed world comes first."""
+    """The displayed world comes first."""
     states: np.ndarray
     """(worlds, state_space.size) float64."""
     back: np.ndarray
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
     end: tuple[float, ...]
-    """The last episode that ended in the displayed world: its last step, bits of ``Done``, return, length, success."""
+    """The displayed world's last complete episode: its last step, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
     """The last fault in any world: its step, bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
-    """New points of the curves, (points, 2 + curves) float64."""
+    """(points, 2 + curves) float64."""
 
 
 class Live:
@@ -91,10 +88,8 @@ class Live:
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
         self.made = 0
-        """The number of steps since the session began."""
         self.world = 0
         self.pushed: int | None = None
-        """The world that the user is pushing."""
         device, n = env.obs.device, env.nworld
         self.asynchronous = device.type != "cpu"
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
@@ -130,8 +125,7 @@ class Live:
         """Make a step, or redo an undone step.
 
         Args:
-            act: A function that writes the actions of all worlds into ``env.action``. It is not called to redo a step,
-                which restores the next state from the history.
+            act: Writes the actions of all worlds into ``env.action``. It is not called to redo a step.
         """
         if self.past.ahead:
             self._move(1)
@@ -188,7 +182,6 @@ class Live:
         self._times.append(self._clock * env.timestep)
 
     def _note_ends(self, ended: torch.Tensor) -> None:
-        """Store which episodes ended and which worlds had faults, without waiting for the device."""
         env, reason = self.env, self.env.done_reason
         made = torch.full_like(self.returns, self.made)
         end = torch.stack([made, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
@@ -205,11 +198,7 @@ class Live:
     # the history
 
     def back(self, steps: int) -> int:
-        """Restore all worlds to an earlier state.
-
-        Returns:
-            Number of steps that were undone, at most ``past.behind``.
-        """
+        """Restore all worlds to an earlier state, and return how many steps were undone."""
         past = self.past
         if not past.ahead and past.behind:  # the current state is not in the history yet
             past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
@@ -249,12 +238,12 @@ class Live:
             self.pushed = None
 
     def set_row(self, state: torch.Tensor, *, new_episode: bool = False, world: int | None = None) -> None:
-        """Set the state of one world.
+        """Set the state of one world, by default the displayed world.
 
         Args:
             state: (state_space.size,) float64, on any device.
             new_episode: Whether the world's return starts from 0.
-            world: The index of the world; by default the displayed world.
+            world: The index of the world.
         """
         world = self.world if world is None else world
         mask = self._number == world
@@ -269,7 +258,7 @@ class Live:
         """Push bodies of the displayed world, until ``end_push``.
 
         Args:
-            forces: Forces (N) and torques (Nm) on all bodies in world coordinates, (nbody, 6).
+            forces: Forces (N) and torques (Nm) in world coordinates, (nbody, 6).
         """
         if self.pushed != self.world:
             self.end_push()
@@ -299,12 +288,7 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int:
-        """Return the index of the chosen world. "best" and "worst" wait for the device.
-
-        Args:
-            choice: An index, "next", "previous", "best" or "worst". The last two compare the returns of the current
-                episodes.
-        """
+        """Return the index of the chosen world. "best" and "worst" compare returns, and wait for the device."""
         if isinstance(choice, int):
             return choice
         if choice in ("next", "previous"):
@@ -345,13 +329,11 @@ class Live:
 
 
 def _index(numbers: Sequence[int], device: torch.device) -> torch.Tensor:
-    """Copy indices to a device without waiting for it."""
     index = torch.tensor(numbers, dtype=torch.long)
     return index if device.type == "cpu" else index.pin_memory().to(device, non_blocking=True)
 
 
 def _to_host(part: torch.Tensor) -> torch.Tensor:
-    """Copy a tensor to the host. A copy from a GPU is asynchronous."""
     if part.device.type == "cpu":
         return part.clone()
     host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)

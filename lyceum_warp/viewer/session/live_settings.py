@@ -10,11 +10,10 @@ _SETTINGS = ("noise", "temperature", "horizon", "samples")
 _OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that a planner sets itself
 
 Numbers = tuple[tuple[str, float], ...]
-"""Names and values."""
 
 
 def planner_numbers(controller: Any) -> Numbers:
-    """Return the settings of a planner that the user can change. Other controllers have none."""
+    """Return the settings of a planner that the user can change."""
     if not isinstance(controller, Planner):
         return ()
     found = ((name, getattr(controller.config, name)) for name in _SETTINGS)

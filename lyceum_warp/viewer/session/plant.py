@@ -47,11 +47,10 @@ def run_plant(
 
     Args:
         live: The plant.
-        control: Its controller.
+        control: The plant's controller.
         speed: Simulated seconds per second.
-        work: A function that is called while the plant waits for its next step. It may raise ``InterruptedByCommand``
-            to stop the plant.
-        on_step: A function that is called after each step.
+        work: Called while the plant waits for its next step. It may raise ``InterruptedByCommand`` to stop the plant.
+        on_step: Called after each step.
     """
     live.expect_steps()
     try:

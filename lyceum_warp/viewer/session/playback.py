@@ -27,7 +27,7 @@ class Episode:
     evals: np.ndarray
     """(steps,), NaN if unknown."""
     end: str = ""
-    """The reason for the end of the episode. Empty if it did not end or the reason is unknown."""
+    """Why the episode ended, or ""."""
 
     @property
     def steps(self) -> int:

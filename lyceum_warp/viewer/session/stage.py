@@ -32,7 +32,7 @@ class Stage:
     """Holds the worlds, controllers and episodes of a session.
 
     Policies act in all worlds. A controller of one world, such as a planner, acts in the plant, a copy of the displayed
-    world. Meanwhile the other worlds wait. ``lw.view`` explains the arguments.
+    world. Meanwhile the other worlds wait.
     """
 
     def __init__(
@@ -59,7 +59,6 @@ class Stage:
         self.paused, self.speed = bool(paused), 1.0
         self.dragging = False
         self.changed = False
-        """Whether the display has changed since the last frame."""
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -74,7 +73,6 @@ class Stage:
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
         self.shown: Frame | None = None
         self.steps = 0
-        """The number of steps since the session began, for the measured speed."""
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
         """The time of each recent frame, and the total number of steps at that time."""
         self.select(modes[0], next(iter(self.controllers), None))
@@ -118,7 +116,6 @@ class Stage:
             self.live.env.action.zero_()
 
     def _step_plant(self, current: WorldControl) -> None:
-        """Make one step of the plant. The step waits for the controller."""
         self.begin_due_episode()
         self.live.expect_steps()
         try:
@@ -189,10 +186,7 @@ class Stage:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
     def set_number(self, of: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, or a task parameter in all worlds.
-
-        A new setting makes a new planner.
-        """
+        """Change a setting of the planner in use, or a task parameter in all worlds."""
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
         if of == "planner":
             if not isinstance(self.control, WorldControl):  # the mode may have changed since the command
@@ -231,7 +225,6 @@ class Stage:
         live.set_row(state, new_episode=new_episode)
 
     def _transfer(self, before: Live, after: Live) -> None:
-        """Copy the displayed world's state, push and return from one environment to another."""
         self.go_on_from(before.row(), after)
         if before.pushed == before.world:
             after.pushed = after.world

@@ -1,8 +1,7 @@
 """Roll out a planner's plan and samples again in a thread, to get their paths.
 
-A planner does not store positions. This module rolls out some samples' actions from the plan's initial state. The
-worlds have the planner's task, model and time step. If the task draws random numbers during an episode, the paths
-differ from the planner's.
+A planner does not store positions. If the task draws random numbers during an episode, these paths differ from the
+planner's.
 """
 
 import dataclasses
@@ -22,7 +21,7 @@ from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
-"""The share of a core that the thread may use: after t seconds of CPU time, it sleeps for t / SHARE seconds."""
+"""The share of a core that the thread may use. After t seconds of CPU time, it sleeps for t / SHARE seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +29,7 @@ class TracePoint:
     """The point of a robot whose path is drawn."""
 
     field: str
-    """The field with the point's position: "site_xpos", "xpos", "xipos" or "subtree_com"."""
+    """"site_xpos", "xpos", "xipos" or "subtree_com"."""
     index: int
 
 
@@ -38,8 +37,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     """Choose the point of a robot whose path is drawn.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
-    for an arm is the last body in the longest chain of actuated bodies. The point is the body's first site, or its
-    centre of mass if it has no site.
+    for an arm is the last body in the longest chain of actuated bodies: its first site, or its centre of mass.
     """
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
@@ -88,7 +86,7 @@ class Traces:
     best: int | None
     final: Pose
     made: float
-    """The time of the rollout, from ``time.perf_counter``."""
+    """From ``time.perf_counter``."""
 
 
 class TraceRollouts:
@@ -132,7 +130,6 @@ class TraceRollouts:
         return Traces(paths, view.best, ended, time.perf_counter())
 
     def _put(self, state: torch.Tensor) -> None:
-        """Copy the planner's state into every world. Other parts of the state stay unchanged."""
         parts = self.env.state_space.parts
         state = state.to(self._states.device)
         for name, part in self._parts.items():

@@ -1,4 +1,4 @@
-"""Make videos, pictures and HTML pages of what the viewer shows. Subprocesses render the videos and pictures."""
+"""Make videos, pictures and HTML pages of what the viewer shows."""
 
 import contextlib
 import datetime
@@ -29,7 +29,7 @@ _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
 class VideoTaker:
-    """Records one video at a time; earlier videos may still be rendered in the background."""
+    """Records one video at a time. Earlier videos may still be rendered in the background."""
 
     def __init__(self, model: mujoco.MjModel, title: str, folder: Path | None = None) -> None:
         self._model, self._title, self._folder = model, title, folder or Path()
@@ -41,7 +41,6 @@ class VideoTaker:
         self._pictures: list[threading.Thread] = []
         self._done: list[str] = []  # messages about pictures and pages
         self.files: list[Path] = []
-        """Complete files. The next frame reports them to the window."""
 
     @property
     def name(self) -> str | None:

@@ -39,8 +39,8 @@ class NoWindowError(OSError):
 class Window:
     """Shows frames in a window process, and collects the user's commands.
 
-    The window process is not a fork and does not import the caller's program, so the caller needs no ``__main__``
-    guard. It ends when this process ends, even by SIGKILL. Ctrl-C does not reach it.
+    The window process is not a fork, so the caller needs no ``__main__`` guard. It ends when this process ends, even by
+    SIGKILL. Ctrl-C does not reach it.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -70,7 +70,6 @@ class Window:
                 process_group=0,  # a terminal sends Ctrl-C to a whole process group
             )
         self.error: str | None = None
-        """The error that ended the window."""
         try:
             self._connection.send(protocol.Opening(scene, host, port))
             reply = self._connection.recv() if self._connection.poll(OPENING_TIME) else None
@@ -87,7 +86,6 @@ class Window:
             reason = reply.reason if isinstance(reply, Failed) else f"its process did not start in {OPENING_TIME:.0f} s"
             raise NoWindowError(f"the viewer's window cannot be opened: {reason}")
         self.address = reply.address
-        """The page's address with its token."""
         self.instructions = reply.instructions
         """The lines to print: the page's address, and the ssh command for other machines."""
         for target in (self._send, self._receive):
@@ -105,7 +103,7 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame now. If not, the caller need not make one.
+        """Whether the window can draw another frame now.
 
         The window draws about 60 frames per second while a page is open, and about 4 while none is.
         """
@@ -120,7 +118,7 @@ class Window:
         return not self._ended
 
     def close(self) -> None:
-        """End the window process. A second call does nothing."""
+        """End the window process."""
         self._end()
         with contextlib.suppress(OSError):  # the shutdown wakes both threads and the window process
             self._socket.shutdown(socket.SHUT_RDWR)
@@ -147,7 +145,6 @@ class Window:
         self._taken.release()
 
     def _last_words(self) -> str:
-        """Say which signal ended the process, or return the process's last line of output."""
         code = self._process.returncode
         if code is None:
             return "its process closed the connection"

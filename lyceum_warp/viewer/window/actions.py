@@ -29,12 +29,9 @@ class Actions:
     def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
         self.scene, self.do = scene, do
         self.frame: Frame | None = None
-        """None before the first frame."""
         self.viewer: Any
-        """Studio's viewer. It is set when the window starts."""
         self.cameras: ViewCameras
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
-        """The titles of the open windows."""
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
         self._keys = key_table()
@@ -80,7 +77,7 @@ class Actions:
             self.do(protocol.Drive(command))
 
     def toggle_driving(self) -> None:
-        """Let the user drive, starting from a velocity of 0, or let the task choose commands again."""
+        """Let the user drive, or let the task choose commands again."""
         if self.scene.speeds is not None:
             self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
 

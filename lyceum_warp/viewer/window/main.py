@@ -23,7 +23,7 @@ IDLE_TIME = 0.25
 NICE = 5
 """A low priority, because the session's planner may need every core."""
 END_TIME = 3.0
-"""Maximum time until studio ends, in seconds."""
+"""Maximum seconds until studio ends."""
 
 
 class WindowEnd:

@@ -15,7 +15,7 @@ from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
-"""Minimum time between two models that are sent to the browser, in seconds."""
+"""Minimum seconds between two models that are sent to the browser."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
@@ -96,7 +96,6 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         )
 
     def _show_model(self, frame: Frame) -> None:
-        """Write the world's model fields into the drawn model."""
         changed, visible = self.values.set(frame.model_fields)
         if visible:
             self._model_due = True

@@ -38,11 +38,11 @@ from yarl import URL
 from lyceum_warp.viewer.window.sockets import public_sockets
 
 HEAD_SECONDS = 10.0
-"""Timeout for a request's headers and for idle connections, in seconds."""
+"""Timeout in seconds for a request's headers and for idle connections."""
 WRITE_SECONDS = 60.0
-"""Timeout for a client that does not read, in seconds."""
+"""Timeout in seconds for a client that does not read."""
 UNCHECKED = 128
-"""Maximum number of connections that have not sent the secret. Above it, the oldest ones are closed."""
+"""The most connections that have not sent the secret. Above it, the oldest ones are closed."""
 MESSAGE_BYTES = 2**20
 """Maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
@@ -58,7 +58,8 @@ PROTECTION = {
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for SharedArrayBuffer
     "Document-Isolation-Policy": "isolate-and-require-corp",  # the same in notebooks, for Chromium
 }
-"""The headers of every response. They stop other sites from reading or embedding the page, or from getting its address.
+"""These headers stop other sites from embedding the page or getting its address.
+
 Pages of this machine that know the token, such as notebooks, may embed it.
 """
 SCRIPT = """<script>
@@ -113,8 +114,8 @@ SCRIPT = """<script>
 </script>"""
 """The script that the proxy inserts into studio's page.
 
-It prefixes requested addresses with the secret path, and gives control to the visible tab while other tabs wait. It
-starts with the browser's theme, shows links to new files, and keeps the title.
+It prefixes requested addresses with the secret path. It gives control to the visible tab, shows links to new files, and
+keeps the theme and the title.
 """
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
@@ -129,8 +130,7 @@ _SocketEnd = web.WebSocketResponse | aiohttp.ClientWebSocketResponse
 class Proxy:
     """A reverse proxy that forwards requests with the secret to studio's server.
 
-    The constructor opens the port, and ``start`` begins to answer. ``close``, or the end of a ``with`` block, closes
-    the port.
+    The constructor opens the port, and ``start`` begins to answer.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -142,7 +142,6 @@ class Proxy:
         addresses = [ipaddress.ip_address(each.getsockname()[0].partition("%")[0]) for each in self._sockets]
         self.port: int = self._sockets[0].getsockname()[1]
         self.local = all(address.is_loopback for address in addresses)
-        """Whether only this machine can connect."""
         self._token, self._cookie, self._path = (secrets.token_urlsafe(32) for _ in range(3))
         machine = socket.gethostname().lower()
         self._names = {"localhost", machine, machine.partition(".")[0], host.lower()}
@@ -279,7 +278,6 @@ class Proxy:
             raise web.HTTPBadRequest(text="a request with a body\n")
 
     def _enter(self, request: web.BaseRequest) -> web.Response:
-        """Accept the token, and set the cookie for the secret path."""
         tokens = request.query.getall("token")
         if len(tokens) > 1 or not _same(tokens[0], self._token):
             raise web.HTTPForbidden(text=f"This token is not the one of this viewer. {_WHERE}\n")
@@ -367,7 +365,6 @@ class Proxy:
         return browser
 
     def _hear(self) -> None:
-        """Restart the timer that detects a closed or hidden page."""
         if self._silence is not None:
             self._silence.cancel()
         self._silence = self._loop.call_later(QUIET_SECONDS, self._on_quiet)

@@ -17,7 +17,7 @@ ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
 """Maximum number of lines of all traces. Each line costs about 600 bytes, 60 times a second."""
 FEWEST_SEGMENTS = 4
-"""Minimum number of lines of one trace. If they are too many for all traces, some traces are left out."""
+"""Minimum number of lines of one trace. If necessary, some traces are left out."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
@@ -60,7 +60,6 @@ class ExtraGeoms:
         return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
 
     def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> list[mujoco.MjvGeom]:
-        """Draw as many ghosts as fit, beginning with the first."""
         data, scene, geoms = self._data, self._scene, []
         self._place(pose)
         positions, axes = data.geom_xpos.copy(), data.geom_xmat.copy()
@@ -136,7 +135,6 @@ class ModelValues:
         self._nominal = nominal
         self._values: dict[str, np.ndarray] = {}
         self.model = copy.deepcopy(nominal)
-        """The model with the current values."""
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """Set a world's values. Return whether any value has changed, and whether the change is visible."""
@@ -172,7 +170,6 @@ class ViewCameras:
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values
         self.state = ux.UxState()
-        """Studio's state of the user interface, which includes the chosen camera."""
 
     def choose(self, index: int) -> None:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""

@@ -8,7 +8,7 @@ import stat
 from typing import Any
 
 FIRST_PORT, PORTS = 8080, 20
-"""The first port that is tried by default, and the number of ports before any free one is taken."""
+"""By default, these ports are tried before any free port."""
 
 _LOOPBACK = ("127.0.0.1", "::1")
 
@@ -27,8 +27,7 @@ class _PrivateSocket(socket.socket):
 def private_socket() -> socket.socket:
     """Listen on a free port of 127.0.0.1, and accept connections from this process only.
 
-    All users of a machine can connect to its loopback address. The socket closes connections from other processes
-    without reading.
+    All users of a machine can connect to its loopback address.
     """
     private = _PrivateSocket(socket.AF_INET, socket.SOCK_STREAM)
     private.bind(("127.0.0.1", 0))
@@ -37,7 +36,6 @@ def private_socket() -> socket.socket:
 
 
 def _is_own(connection: socket.socket) -> bool:
-    """Whether the peer of a connection is a socket of this process."""
     try:
         ends = connection.getpeername(), connection.getsockname()
     except OSError:  # the peer has closed the connection

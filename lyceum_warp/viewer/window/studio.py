@@ -1,8 +1,7 @@
 """Wrap mujoco.studio in one module, because its interface may still change.
 
-Studio draws a scene and a panel in a browser, and handles keys and the mouse. ``Screen.run`` opens studio with a
-plugin, a subclass of ``Plugin`` with handlers for ``Started``, ``Update`` and ``Gui``. Studio's own stepping, history
-and model loading are not used, because the simulation is in another process.
+Studio draws a scene and a panel in a browser, and handles keys and the mouse. Its own stepping, history and model
+loading are not used, because the simulation is in another process.
 """
 
 import socket
@@ -23,7 +22,7 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
-"""Maximum number of geoms that a browser draws in addition to the model's."""
+"""The most geoms that a browser draws in addition to the model's."""
 
 Plugin: Any = plugin.ViewerPlugin
 """The base class of plugins. After ``Started``, ``self.viewer`` is the viewer."""

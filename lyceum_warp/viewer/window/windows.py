@@ -11,9 +11,7 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""Maximum number of points of a plotted curve, and the time in seconds that it covers. Every frame sends all points to
-the browser.
-"""
+"""The most points of a plotted curve, and the seconds that it covers. Every frame sends all points to the browser."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
@@ -402,10 +400,7 @@ class Curves:
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reduce the last ``seconds`` to at most ``points`` rows.
-
-        The three results have the minimum, the mean and the maximum of successive rows.
-        """
+        """Reduce the last ``seconds`` to at most ``points`` rows: the minimum, mean and maximum of successive rows."""
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows
