@@ -26,8 +26,9 @@ _COMMANDS = {
     "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
 }
-"""The module, the class and the help line of each command. A module is imported only when its command is run, because
-most modules import torch, Warp and MuJoCo.
+"""The module, the class and the help line of each command.
+
+Only the module of the given command is imported, because most modules import torch, Warp and MuJoCo.
 """
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.

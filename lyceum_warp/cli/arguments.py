@@ -14,7 +14,6 @@ from lyceum_warp.options import OPTIONS, EnvOptions, PhysicsOptions, given_value
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
-"""A flag that takes one NAME=VALUE and may be repeated."""
 
 ParamWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -24,7 +23,6 @@ ParamWords = Annotated[
         "may be repeated.",
     ),
 ]
-"""The flag --param. ``parameters`` parses it."""
 
 Trust = Annotated[
     bool,
@@ -33,7 +31,6 @@ Trust = Annotated[
         "read the files that the run names.",
     ),
 ]
-"""The flag --trust; see ``lyceum_warp.runs.trust``."""
 
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -44,7 +41,6 @@ CameraWords = Annotated[
         "may be repeated.",
     ),
 ]
-"""The flag --camera. ``viz.cameras.parsed_camera`` parses it."""
 
 TaskWord = Annotated[
     tyro.conf.Positional[str],
@@ -53,7 +49,6 @@ TaskWord = Annotated[
         help="A task's name (see lyceum-warp tasks), or its file: path/to/file.py, or path/to/file.py:Class.",
     ),
 ]
-"""The argument TASK."""
 
 _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of such a hint)
 
@@ -62,15 +57,14 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 class OptionFlags:
     """Base class of groups of flags: each field of the given dataclasses becomes a flag.
 
-    The field's docstring becomes the flag's help text. A subclass must declare a field again if its type is a union, or
-    if its type or help text differs on the command line. Values are validated when the options are made, because the
-    parser would print errors in a multi-line box.
+    The field's docstring becomes the flag's help text. A subclass declares a field again if its type is a union, or if
+    it differs on the command line. Values are not validated here, because the parser would print errors in a multi-line
+    box.
 
     Args:
-        options: The dataclasses. If several have the same field, the first one gives its type and help text.
+        options: The dataclasses. If several have the same field, the first one counts.
         omit: Names of fields without a flag.
-        default: Text that describes the default in the help, for all flags or by field name. Flags with a text
-            default to None. Other flags have the dataclass's defaults.
+        default: The default in the help, for all flags or by field name. Flags with such a text default to None.
     """
 
     def __init_subclass__(
@@ -90,7 +84,7 @@ class OptionFlags:
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # to get None, omit the flag; the word None is not accepted
+                if value is None and flag is hints[name]:  # the default is None, but the user cannot write None
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -109,8 +103,9 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment for which no flag is generated. Commands declare flags for nworld, seed and the model.
-``Physics`` declares the flags of ``physics``. The other options can be set only in Python.
+"""Options of an environment for which no flag is generated.
+
+Commands declare flags for nworld, seed and the model, and ``Physics`` for the physics. The others exist only in Python.
 """
 
 
@@ -138,7 +133,8 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """The name of a set of physics options that the task defines (see lyceum-warp tasks), or exact for the task's
-    default physics. Flags of single options, such as --integrator, override the set."""
+    default physics. Flags of single options, such as --integrator, override the set.
+    """
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
     The default limits come from the model."""
@@ -150,7 +146,7 @@ def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str]
     Args:
         texts: The strings, each NAME=VALUE.
         command: The command's arguments. If NAME is an option instead of a parameter, the error names its flag.
-        instead: Flags by option name, for options whose flag has another name in this command.
+        instead: Flags with another name than the option, by option name.
     """
     found: dict[str, Any] = {}
     for text in texts:
@@ -169,10 +165,7 @@ def _flag_names(command: Any) -> list[str]:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit.
-
-    The path of a ``.npy`` table becomes absolute.
-    """
+    """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit."""
     name, equals, value = text.partition("=")
     if not equals or not name.strip():
         raise ValueError(f"{text!r} must be written as NAME=VALUE")

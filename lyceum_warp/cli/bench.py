@@ -14,14 +14,13 @@ import tyro
 from lyceum_warp.support.interrupts import Interrupted
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
-"""The folder bench/ of a checkout. An installed package does not have it."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Run an experiment or another program in bench/, in a checkout; without a name, list the experiments.
+    """Run an experiment or another program in bench/, in a checkout. Without a name, list the experiments.
 
-    All arguments after the name are passed to the program, which explains them with --help.
+    All arguments after the name are passed to the program. It explains them with --help.
 
     $ lyceum-warp bench
     $ lyceum-warp bench throughput --short

@@ -26,7 +26,7 @@ _TABLE_ROWS = 15
 
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-"""The standard output. In a file or a pipe, it has 120 columns, so that tables are not wrapped."""
+"""In a file or a pipe, it has 120 columns, so that tables are not wrapped."""
 
 
 def note(line: str) -> None:
@@ -104,10 +104,10 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns of metrics.csv that count problems, each with its label in messages. Algorithms may lack some of them."""
+"""Columns of metrics.csv that count problems, with their labels in messages. Algorithms may lack some of them."""
 
 _BAR_WIDTH = 36
-"""Total width of the progress bar, the iteration number and the times, in characters."""
+"""Characters of the progress bar, the iteration number and the times."""
 
 
 def counted(number: int, what: str) -> str:
@@ -121,7 +121,7 @@ _COLUMNS = [
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
-"""The columns of the table of iterations: heading, column in metrics.csv, format."""
+"""Heading, column in metrics.csv, format."""
 
 
 def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
@@ -130,7 +130,7 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
     Args:
         console: The output.
         columns: The cells of each column, by its heading. All columns but the first contain numbers.
-        omit: Headings of the columns that may be omitted, the first to go first.
+        omit: Headings of the columns that may be omitted, in this order.
     """
     table = Table()
     for count in range(len(omit) + 1):
@@ -181,7 +181,6 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
 
 
 def _known(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Copy a row without empty and NaN cells."""
     return {name: value for name, value in row.items() if value is not None and not math.isnan(value)}
 
 
@@ -202,8 +201,8 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 class PlanDisplay:
     """Shows the progress of a planner's episode: a live line on a terminal, and a line when the episode ends.
 
-    The live line shows the number of steps per second. If ``real_time`` is True, it shows the number of plans per
-    second and the age of the action. These numbers are means over the episode so far.
+    The live line shows the steps per second. With ``real_time``, it shows the plans per second and the age of the
+    action.
     """
 
     def __init__(
@@ -247,7 +246,7 @@ class PlanDisplay:
 
 
 def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """Make the table of a controller's report. The row "success" is omitted if ``success`` is False."""
+    """Make the table of a controller's report."""
     table = Table(box=rich.box.SIMPLE, show_header=False)
     for row in report.rows():
         if success or row[0] != "success":

@@ -35,8 +35,7 @@ from lyceum_warp.viz.video import check_video
 class Eval:
     """Evaluate a run's mean policy in whole episodes, by default with the run's physics, and print statistics.
 
-    If the task's file or model has moved or changed since the run started, the command uses the run's own copy and
-    prints a message.
+    If the task's file or model has moved or changed since the run started, the command uses the run's own copy.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
     $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
@@ -57,26 +56,26 @@ class Eval:
     which: str = "last"
     """The policy to evaluate: last, best, or the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The name or file of a task to use instead of the run's task, such as the current version of the run's task.
-    Physics and parameters then come from this task, not from the run. The observations and actions of both tasks must
-    have the same sizes."""
+    """The name or file of a task to use instead of the run's task. Physics and parameters then come from this task. Its
+    observations and actions must have the same sizes.
+    """
     param: ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states; training with the same seed draws different initial states."""
+    """Seed of the initial states. They differ from those of training with the same seed."""
     nworld: int = 32
-    """Maximum number of worlds; there are never more worlds than episodes."""
+    """Maximum number of worlds."""
     video: bool = False
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
     transfer: bool = False
     """Whether to play the episodes on both engines and under each set of physics options that the task defines. The
     command then prints the differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is
-    one."""
+    one.
+    """
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """A new or empty folder for the episodes, one file each, in the format of lyceum-warp plan: episode-000.npz and so
-    on."""
+    """A new or empty folder for the episodes, one file each, such as episode-000.npz."""
     trust: Trust = False
     env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=EnvFlags
@@ -170,9 +169,8 @@ def run_worlds(
 
     Args:
         run: The run.
-        words: Options that replace the run's options. If the engine is auto and no device is given, the worlds run on
-            the CPU.
-        params: Parameters that replace the run's parameters.
+        words: Options that replace the run's. With the engine auto and no device, the worlds run on the CPU.
+        params: Parameters that replace the run's.
         nworld: Number of worlds.
         task: Another task to use instead, with its own default options and parameters.
         trust: Whether to execute the run's task even if the run was not made by this user on this machine.

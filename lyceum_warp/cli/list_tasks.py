@@ -30,10 +30,8 @@ To write your own task: lyceum-warp new --help"""
 _UNKNOWN = "-"
 
 _ONE_CONTROL = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtGain.mjGAIN_AFFINE, mujoco.mjtGain.mjGAIN_MUSCLE)
-"""Types of gain of the actuators that have one control."""
 
 _WIDTH = 100
-"""Maximum width of a description, in characters."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -127,7 +125,7 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """Return the number of a model's controls. Compiling the model can take a second, so avoid it if possible."""
+    """Return the number of a model's controls. Compiling a model can take a second, so avoid it if possible."""
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu

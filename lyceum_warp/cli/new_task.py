@@ -25,7 +25,6 @@ _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "gymnasium": gymnasium_model,
     "gymnasium_robotics": gymnasium_robotics_model,
 }
-"""Functions that find a model, by the prefix before the colon in --model."""
 
 _TAKEN = ("World", "Params", "Row")
 """Names that a generated file already uses. A task's class cannot have them."""
@@ -33,11 +32,10 @@ _TAKEN = ("World", "Params", "Row")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a task file for a model, with a reward of zero; it can be checked, stepped and trained immediately.
+    """Write a task file for a model. It can be checked, stepped and trained immediately, but its reward is zero.
 
     The policy observes positions, velocities and the model's sensors, or only the sensors if they measure every joint.
-    The policy acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next
-    steps.
+    It acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next steps.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
@@ -46,23 +44,24 @@ class New:
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """The task's name in snake_case, for the file TASK.py in the working directory; or a path, path/to/task.py."""
+    """The task's name in snake_case, for TASK.py in the working directory, or a path, path/to/task.py."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
-    """An MJCF or URDF file; or a model in a package, as gymnasium:FILE.xml, gymnasium_robotics:PATH or
+    """An MJCF or URDF file, or a model in a package: gymnasium:FILE.xml, gymnasium_robotics:PATH or
     menagerie:ROBOT/FILE.xml. MuJoCo Menagerie comes from the extra "menagerie", from the package mujoco-menagerie, or
-    from a checkout to which MENAGERIE_ROOT points. In the task file, a relative path becomes relative to that file's
-    folder."""
+    from a checkout to which MENAGERIE_ROOT points.
+    """
 
     template: Literal["plain", "velocity"] = "plain"
     """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and
-    legs made of hinges with one actuator each. The file is short, because it inherits functions, rewards and most
-    parameters."""
+    legs made of hinges with one actuator each. The file is short, because it inherits most of its functions.
+    """
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """The names of the feet, for --template velocity: sites, geoms or bodies. By default, the lowest end of each leg is
-    a foot."""
+    """The names of the feet, for --template velocity: sites, geoms or bodies. By default, the lowest end of each
+    leg."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Names of the joints to control, for --template velocity; each must have one actuator. By default, all leg joints
-    with an actuator; other joints keep their pose."""
+    """Names of the joints to control, for --template velocity. By default, all leg joints with an actuator. Other
+    joints keep their pose.
+    """
 
     def run(self) -> int:
         """Run the command, and return the exit code."""
@@ -108,7 +107,6 @@ class New:
 
 
 def _class_name(path: Path) -> str:
-    """Return the name of the class for a task file."""
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
     if (

@@ -14,11 +14,10 @@ _CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
 
 
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:
-    """Parse the options of a command.
+    """Parse the options of a command, and return an instance of its class.
 
     Args:
-        command: The command's class. --help describes the options in its attribute ``USUAL``, and --help-all describes
-            all options. Without ``USUAL``, --help also describes all of them.
+        command: The command's class. --help describes only the options in its attribute ``USUAL``, if it has one.
         prog: The command's name, for messages.
         words: The arguments.
     """
@@ -35,7 +34,6 @@ def parse(command: type, prog: str, words: Sequence[str]) -> Any:
 
 
 def _print_help(command: type, prog: str) -> None:
-    """Print the help of the usual options, and the names of all other options."""
     usual = getattr(command, "USUAL", None)
     shown = command if usual is None else _with_only(command, usual)
     try:

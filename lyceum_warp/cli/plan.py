@@ -78,18 +78,16 @@ class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI; --update selects the cross-entropy method (cem) or predictive sampling. The default settings of
-    the planner come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds;
-    --physics exact gives them the same physics as the controlled world.
+    The planner is MPPI. --update selects the cross-entropy method (cem) or predictive sampling. The default settings
+    come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds.
 
     With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
     chooses the largest number of samples that meets the deadline on this machine. If no number meets it, the command
-    tries a shorter horizon, and then other physics that the task defines. Values of --samples, --horizon and --physics
-    that you give are never changed.
+    tries a shorter horizon, and then other physics that the task defines. Values that you give are never changed.
 
-    The command writes config.json, report.json, plan.png, a video of the first episode (video.mp4), and
-    one file per episode with states, actions, rewards, evaluations and times (episode-000.npz, for numpy) into a
-    folder. After Ctrl-C, the interrupted episode is saved, too, but is not part of the report.
+    The command writes config.json, report.json, plan.png, a video of the first episode (video.mp4), and one file per
+    episode (episode-000.npz, for numpy) into a folder. After Ctrl-C, the interrupted episode is saved, too, but is not
+    part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -112,23 +110,22 @@ class Plan:
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
-    """The number of steps from one plan to the next. Steps without a new plan apply the next actions of the last
-    plan."""
+    """The number of steps from one plan to the next. Steps in between apply the next actions of the last plan."""
     seed: int = 0
-    """Seed of the first episode's initial state and noise; each further episode increases it by one."""
+    """Seed of the first episode's initial state and noise. It increases by one for each further episode."""
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
     predict: bool = False
-    """With --real-time, plan from the predicted state at the end of the current step, because the plan cannot apply
-    earlier."""
+    """With --real-time, plan from the predicted state at the end of the current step, when the plan can first apply."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The folder of an NPG or PPO run of the same task. The planner adds the value of each sample's final state to the
-    sample's return."""
+    """The folder of an NPG or PPO run of the same task. Its value of a sample's final state is added to the sample's
+    return.
+    """
     param: ParamWords = ()
     planner_param: Repeated = ()
-    """A parameter of the task that only the planner's worlds use; the flag may be repeated."""
+    """A parameter of the task that only the planner's worlds use. The flag may be repeated."""
     planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The planner's model, if it differs from the controlled world's."""
     video: bool = True
@@ -191,7 +188,6 @@ class Plan:
 
 
 def _check_value_task(run: Path, task: str) -> None:
-    """Refuse the value function of a run that trained a different task."""
     try:
         config = Run.open(run.parent if run.is_file() else run).config
     except FileNotFoundError:
@@ -236,14 +232,13 @@ def _worlds(
 
 
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
-"""The numbers of samples that real-time planning tries, in addition to the task's own."""
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
     """Measure planning times to choose the settings that have no flag. Return None if all have one.
 
-    A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
-    as one step of the planner's worlds.
+    A plan must be ready within one step of the controlled world. If no setting is fast enough, it may take as long as
+    one step of the planner's worlds.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
@@ -274,7 +269,6 @@ def _suggested_physics(task: type[Task]) -> str | None:
 
 
 def _fill(words: tuple[str, ...]) -> Any:
-    """Parse --fill: a word, or one or more numbers."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
@@ -344,7 +338,6 @@ def _file(run: Run, episode: int) -> Path:
 
 
 def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
-    """Write the last episode, and the report of all episodes."""
     done[-1].save(_file(run, len(done) - 1))
     _summary(done, options).write(run.folder / "report.json")
 

@@ -25,7 +25,6 @@ _ELEMENTS = {
     "actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
     "keyframes": (mujoco.mjtObj.mjOBJ_KEY, "nkey"),
 }
-"""The kinds of elements that a comment lists, with the MjModel fields that hold their counts."""
 
 _Sensor = mujoco.mjtSensor
 
@@ -103,7 +102,7 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the ranges (first, last) of sensordata that the policy observes, without ``last``."""
+    """Return the ranges of sensordata that the policy observes."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
@@ -162,13 +161,12 @@ def _elements(model: mujoco.MjModel) -> str:
 
 
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    """Return the names of all elements of a kind. Elements without a name have the name ""."""
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
 
 
 def _listed(kind: str, names: list[str]) -> list[str]:
-    """Generate a line with as many names as fit. Without names, there is no line."""
+    """Generate a line with as many names as fit."""
     for shown in range(min(len(names), _NAMES), 0, -1):
         rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
         line = f"  {kind}: {', '.join(names[:shown])}{rest}"

@@ -51,7 +51,6 @@ _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
     "out": "--out",
 }  # fmt: skip
-"""Flags that have no effect with --resume."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +58,7 @@ class Train:
     """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
     The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt, checkpoint.pt, curve.png
-    and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current iteration; a second Ctrl-C ends
+    and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current iteration. A second Ctrl-C ends
     it immediately.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
@@ -73,9 +72,9 @@ class Train:
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
-    its local rank. The number of processes affects only the rounding of the results, and may change when a run is
-    resumed. Rank 0 writes files and messages. After Ctrl-C or SIGTERM to torchrun or to any process, all processes
-    finish the iteration and end together; torchrun waits for them for 30 s, or for its --shutdown-timeout.
+    its local rank. The number of processes changes the results only by rounding, and may differ when a run is resumed.
+    After Ctrl-C or SIGTERM, all processes finish the iteration. torchrun waits for them for 30 s, or for its
+    --shutdown-timeout.
     """
 
     USUAL = (
@@ -85,11 +84,13 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg, the natural policy gradient; ppo; or sac, soft actor-critic with a replay buffer. By default, the algorithm
-    that the task suggests, with its hyperparameters: ppo for walking robots, npg for others."""
+    """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). By default, the
+    algorithm that the task suggests: ppo for walking robots, npg for others.
+    """
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of iterations, including those before the run was resumed; by default as many as the task suggests,
-    or 100."""
+    """Total number of iterations, including those before the run was resumed. By default, as many as the task suggests,
+    or 100.
+    """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
@@ -98,45 +99,48 @@ class Train:
     """Continue the run in the given folder exactly, with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of another run. The run's settings are the
-    defaults, but a different TASK has its own parameters, and a different --algorithm has its own hyperparameters."""
+    defaults, but a different TASK has its own parameters, and a different --algorithm has its own hyperparameters.
+    """
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """End the run once the return of the mean policy reaches this number. With --mean-every 0, the mean return of the
-    sampled episodes is compared instead."""
+    """End the run once the return of the mean policy reaches this number. With --mean-every 0, the return of the
+    sampled episodes counts instead.
+    """
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Time limit in minutes: training ends after the iteration that exceeds it. --resume continues the run."""
+    """Time limit in minutes. Training ends after the iteration that exceeds it. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy in a numbered file every INT iterations; 0 saves none. The last and the best policy are always
-    saved."""
+    """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy and the complete state, from which a killed run resumes, every INT iterations. 0 saves every 30
-    s, or more often if that takes at most 1 % of the time."""
+    """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s, or more
+    often if that takes at most 1 % of the time.
+    """
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of worlds of all processes; by default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
-    samples / nworld steps per iteration: whole episodes if they fit (as in the paper, with 10 worlds, 10,000 samples
-    and episodes of 1,000 steps), otherwise segments of episodes."""
+    """Total number of worlds of all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
+    samples / nworld steps per iteration. These are whole episodes if they fit, and otherwise segments of episodes.
+    """
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
-    only if they use the same number of threads. --nthread sets the threads of the mujoco engine."""
+    only with the same number of threads. --nthread sets the threads of the mujoco engine.
+    """
     param: ParamWords = ()
     video: bool = True
     """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two videos of the mean policy, videos/000100.mp4 and so on in the run's folder; 0 writes
+    """Iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0 writes
     none."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only two
-    cheap comparisons are made: with the C engine, after training on a GPU; and with the task's default physics, after
-    training with other physics. With --transfer, the policy is also tested under each set of physics options that the
-    task defines and, after training on CPU cores, on the Warp engine, whose kernels may take minutes to compile."""
+    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
+    cheap comparisons are made: with the C engine, after training on a GPU, and with the task's default physics, after
+    training with other physics. --transfer adds each set of physics options that the task defines and, after training
+    on CPU cores, the Warp engine, whose kernels may take minutes to compile.
+    """
     trust: Trust = False
     take_over: bool = False
-    """Continue a run that another process has locked, on this or another host. The process that held the lock ends at
-    its next write."""
+    """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
     view: bool = False
     """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None

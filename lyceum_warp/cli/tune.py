@@ -15,7 +15,6 @@ from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
 
 Cell: TypeAlias = Callable[[dict[str, Any]], str]
-"""Formats one cell of a row."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -24,7 +23,7 @@ class Tune:
 
     Each setting is compared with the unchanged task: steps per second, memory, faults, the divergence of trajectories,
     and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
-    to a JSON Lines file; the same command continues a search that was stopped. docs/physics.md explains the table.
+    to a JSON Lines file, so the same command continues a stopped search. docs/physics.md explains the table.
 
     $ lyceum-warp tune hopper --short
     $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
@@ -34,30 +33,31 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """The folder of a run of the task. The run's policy also plays the episodes, and the run's task parameters are the
-    defaults."""
+    """The folder of a run of the task. Its policy also plays the episodes, and its task parameters are the defaults."""
     which: str = "last"
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
-    """How much the mean return may change: the 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
-    of the mean absolute return. The value any accepts every setting that causes no additional faults."""
+    """How much the mean return may change. The 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
+    of the mean absolute return. any accepts every setting that causes no additional faults.
+    """
     short: bool = False
-    """Compare the first 100 steps of episodes, for a few seconds for each setting, instead of whole episodes."""
+    """Compare the first 100 steps of episodes, for a few seconds per setting."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of episodes for each setting. By default, as many as the confidence interval needs, for at most a
-    minute (5 s with --short)."""
+    minute (5 s with --short).
+    """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
-    samples in the same order as the task's default physics. --nworld is then the number of samples, and --episodes the
-    number of standing, of moving and of fallen states from which the planner plans."""
+    samples in the same order. --nworld is then the number of samples. --episodes is the number of standing, of moving
+    and of fallen states from which the planner plans.
+    """
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of worlds; by default 256, or 4096 on a GPU. With --planning, the number of the planner's samples, by
-    default 64."""
+    """Number of worlds. By default 256, or 4096 on a GPU. With --planning, the number of samples, by default 64."""
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Results that the file already
-    contains are not measured again."""
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Its results are not measured
+    again."""
     param: ParamWords = ()
     env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=Placement

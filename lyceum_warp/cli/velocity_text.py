@@ -20,7 +20,7 @@ _NEAR = 0.1
 """A leg's end is a foot up to this height above the lowest end, as a fraction of the base's height."""
 
 _FLAT = 0.01
-"""A sphere of a foot is part of the sole if its bottom is at most this many metres above the foot's lowest point."""
+"""A sphere of a foot is part of the sole up to this height above the foot's lowest point, in metres."""
 
 _AT = 0.06
 """Maximum distance between the centre of a sole and a site that marks the foot, in metres."""
@@ -31,7 +31,6 @@ _Kind = mujoco.mjtObj
 @dataclasses.dataclass
 class _Foot:
     name: str
-    """The name of the foot's site, in the model or added by the task."""
     body: int
     element: str = ""
     """The name of the foot's body, or of a joint or geom in it. Empty if the model already has the site."""
@@ -112,7 +111,7 @@ class Walker:
         raise ValueError(f"the model has no site, geom or body {name!r}: give names after --feet, separated by spaces")
 
     def _foot(self, body: int, name: str) -> _Foot:
-        """Find a site near the centre of a body's sole. If there is none, describe a new site."""
+        """Find a site near the centre of a body's sole, or describe a new one."""
         spheres = self._spheres(body)
         if not len(spheres):
             raise ValueError(f"the foot {self._called(body)} has no geom that can touch the ground")
@@ -204,7 +203,6 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
 
 
 def _wrapped(start: str, parts: Sequence[str], end: str, indent: int = 4) -> list[str]:
-    """Write a Python list, in one line if it fits."""
     line = f"{start}{', '.join(parts)}{end}"
     if indent + len(line) <= 120:
         return [line]

@@ -54,11 +54,11 @@ class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
     For a task, the viewer shows its worlds, lets you push bodies with the mouse and, with --mppi, runs a planner in
-    real time. For a run, it shows the run's policy; with --follow, it shows the newest policy while the run trains.
+    real time. For a run, it shows the run's policy. With --follow, it shows the newest policy while the run trains.
     Episode files, or a folder that lyceum-warp plan has written, are played back.
 
-    The viewer is a web page. The command prints the address of the page; the address contains a secret. Over ssh, it
-    also prints the command that forwards the port.
+    The viewer is a web page. The command prints its address, which contains a secret. Over ssh, it also prints the
+    command that forwards the port.
 
     $ lyceum-warp view hopper
     $ lyceum-warp view go1_velocity --pretrained
@@ -89,7 +89,7 @@ class View:
     paused: bool = False
     """Whether to start paused."""
     host: str = "127.0.0.1"
-    """Address on which to serve the page. The default address is reachable only from this machine."""
+    """Address on which to serve the page. Other machines cannot reach the default address."""
     port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
@@ -197,7 +197,6 @@ def _planner(options: View, env: Env) -> MPPI:
 
 
 def _words(options: View) -> dict[str, Any]:
-    """Return the options of the displayed worlds. With --mppi, they are those of the planner's worlds."""
     return given(options.place) | given(options.physics)
 
 
