@@ -187,7 +187,7 @@ class BoundTask:
         ]
         self._sort_model_fields(of_model, dynamics)
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
-        """The state at which a reset starts, (integration_size,) float64. None for the model's default."""
+        """The state at which a reset starts, (integration_size,) float64."""
         self.parameters = Parameters(
             self.source.params, self.source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
             given=params or {}, weights=self.source.terms.weights,

@@ -1,7 +1,7 @@
 """Generate the source of a task's kernels, which call the task's functions for every world of a batch.
 
-The generated source defines a struct whose fields have an additional axis for the worlds, and a function that returns
-a view of one world. The code is generated as text, because Warp compiles functions from their source.
+The source defines a struct whose fields have an additional axis for the worlds, and a function that returns a view of
+one world. It is generated as text, because Warp compiles functions from their source.
 """
 
 import dataclasses

@@ -6,14 +6,13 @@ from lyceum_warp.task import FUNCTIONS
 
 
 def explained(error: Exception, task: str) -> Exception:
-    """Return a one-line error if Warp could not compile the functions of a task. Return other errors unchanged."""
+    """Shorten an error to one line if Warp could not compile the functions of a task."""
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
     # Warp's message names the kernel that Warp compiled first, perhaps one of another task
     flat = " ".join(text.split())
-    # the last function in Warp's message has the error; if it is a kernel, a function of the task returns the wrong
-    # type
+    # the last function in Warp's message has the error; a kernel means that a function returns the wrong type
     innermost = flat.rpartition("while parsing function")[2]
     call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
     kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)

@@ -33,11 +33,9 @@ class TaskSource:
         self._variant = variant_of(name, self._owners, self.world, self.params, own)
         self.memory: dict[str, Part] = self._memory()
         self.shared, self.sums = self._shared_structs()
-        """None if the worlds of the task share no memory."""
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        """None for missing functions."""
         self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
@@ -123,8 +121,7 @@ class TaskSource:
     def _with_functions(self, own: Any) -> Any:
         """Return the parameter struct that functions take.
 
-        If the task's struct differs from a base task's only in defaults, it is the base task's struct. Such tasks share
-        functions and kernels.
+        A task that changes only defaults uses the struct of its base task, to share functions and kernels with it.
         """
         fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
         for owner in reversed(self._owners):
@@ -199,7 +196,7 @@ class TaskSource:
         return function
 
     def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function that takes another file's World or Params."""
+        """Refuse a function that takes the World or Params of another file."""
         for kind in structs:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
@@ -224,7 +221,7 @@ class TaskSource:
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse a name that is similar to one in ``FUNCTIONS``. Such a function would never be called."""
+        """Refuse a name that is similar to one in ``FUNCTIONS``, because it is probably misspelt."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
         for name in vars(self.task):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):

@@ -10,7 +10,7 @@ from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""The modification time and the size of each file. None if the file does not exist."""
+"""The modification time and the size of each file."""
 
 _taken: dict[str, Stamps] = {}
 """For each module that a task's file imported from its folder, the stamp of the module's file."""

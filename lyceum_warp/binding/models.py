@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Load a model as an MjSpec. It still compiles after a change of the working directory.
+    """Load a model as an MjSpec that does not depend on the working directory.
 
     Args:
         source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
@@ -94,8 +94,8 @@ def compile_model(
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors. Without
       such fields, all sensors are turned off. The energy is computed if a function reads it.
-    - If ``contact`` lists a pair of geoms twice, only the first entry is kept. MuJoCo would make the contact twice, and
-      MuJoCo Warp once.
+    - If ``contact`` lists a pair of geoms twice, only the first entry is kept. MuJoCo would make the contact twice,
+      and MuJoCo Warp once.
 
     Args:
         spec: The model. It is changed.

@@ -227,7 +227,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace model elements in a table by their indices. With ``field``, replace names, too."""
+        """Replace model elements in a table, and with ``field`` also names, by their indices."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):

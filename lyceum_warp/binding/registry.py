@@ -73,10 +73,9 @@ def package_task_names() -> list[str]:
 
 @functools.cache
 def _package_modules() -> dict[str, str]:
-    """The modules of the package's tasks, by task name. They are not imported.
+    """Find the modules of the package's tasks without importing them.
 
-    A module contains the task of the same name. A folder contains a family of tasks, and declares their modules in
-    ``TASKS``.
+    A module contains the task of the same name. A folder declares the modules of its tasks in ``TASKS``.
     """
     found: dict[str, str] = {}
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):

@@ -105,7 +105,7 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Find a builtin function of Warp or Python. Some of Warp's are not attributes of the module ``warp``."""
+    """Find a builtin function of Warp or Python. Not all of Warp's are attributes of the module ``warp``."""
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 
@@ -131,7 +131,7 @@ _module_names: set[str] = set()
 
 
 def free_module_name(name: str) -> str:
-    """Return an unused name for a Warp module. It must be the same in every process, so that Warp's cache works."""
+    """Return an unused name for a Warp module. Warp's cache needs the same name in every process."""
     free = name = re.sub(r"[^\w.]", "_", name)
     number = 0
     while free in _module_names:

@@ -22,22 +22,13 @@ _STATE = {"s": "s", "s1": "s", "p": "p"}
 """Names of a termination's arguments in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
-"""Other names in the generated text. Terms cannot use them."""
+"""Names that terms cannot have, because the generated text uses them."""
 
 _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float]"
 
 
 class Terms:
-    """The terms of a task: its ``rewards``, its ``terminations``, and those metrics that ``measure`` does not write.
-
-    Args:
-        task: The task's class.
-        name: The task's name, for messages.
-        lookup: Finds a function by name in the task's class, its base classes, and their modules.
-        written: The task's functions by their names in ``FUNCTIONS``.
-        world: The task's World.
-        params: The task's Params.
-    """
+    """The terms of a task: its ``rewards``, its ``terminations``, and those metrics that ``measure`` does not write."""
 
     def __init__(
         self,

@@ -89,13 +89,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels.
-
-    Args:
-        task: The task's name, for messages.
-        owners: The task's class and its base classes, without ``Task``.
-        world: The task's World.
-        params: The task's Params, which its functions take.
-        own: ``params`` itself, or a struct that differs from it only in defaults.
+    ``own`` is the task's declaration of Params. It is ``params``, or differs from it only in defaults.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -139,7 +133,7 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the attributes of a module's tasks, the globals when each task was defined, and the globals now."""
+    """Yield the attributes of a module's tasks and the module's globals, now and when each task was defined."""
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
@@ -157,7 +151,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Refuse a replacement with other arguments than the function that it replaces."""
+    """Check that a replacement takes the same arguments as the function that it replaces."""
     wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
     same = len(wanted) == len(given) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)

@@ -26,7 +26,7 @@ _UNWRITTEN = 0x7FA5C3E1
 class GuardedRows:
     """Holds an array of n rows, with guard memory around each row.
 
-    The rows are filled with sentinels, or with the first n rows of ``values``.
+    The rows contain ``_UNWRITTEN``, or the first n rows of ``values``.
     """
 
     def __init__(self, shape: Sequence[int], dtype: Any, device: wp.Device, values: wp.array | None = None) -> None:

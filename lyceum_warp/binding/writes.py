@@ -35,7 +35,7 @@ class Write:
     replaced: bool = False
     """Whether the write assigns the field, as ``s.time = 0.0`` does, instead of an element of its row."""
     use: str | None = None
-    """An expression that may write the row but cannot be analysed. None for a definite write."""
+    """An expression that may write the row but cannot be analysed."""
 
 
 @functools.cache
@@ -108,7 +108,7 @@ class _Place:
     position: int
     field: str | None
     kind: Any
-    """The type of a struct; (number of axes, element type) of an array; None for an element, which is read by value."""
+    """A struct's type, or the number of axes and the element type of an array. None for an element."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):

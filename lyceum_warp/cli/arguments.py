@@ -58,7 +58,7 @@ class OptionFlags:
     """Base class of groups of flags: each field of the given dataclasses becomes a flag.
 
     The field's docstring becomes the flag's help text. A subclass declares a field again if its type is a union, or if
-    it differs on the command line. Values are not validated here, because the parser would print errors in a multi-line
+    it differs on the command line. Values are validated later, because the parser would print errors in a multi-line
     box.
 
     Args:
@@ -103,7 +103,7 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment for which no flag is generated.
+"""Options of an environment without a generated flag.
 
 Commands declare flags for nworld, seed and the model, and ``Physics`` for the physics. The others exist only in Python.
 """

@@ -63,7 +63,7 @@ class Eval:
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states. They differ from those of training with the same seed."""
+    """Seed of the initial states. Training with the same seed draws different ones."""
     nworld: int = 32
     """Maximum number of worlds."""
     video: bool = False

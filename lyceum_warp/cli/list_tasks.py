@@ -79,7 +79,6 @@ class Tasks:
 class _Entry:
     name: str
     task: type[Task] | None = None
-    """None if importing the task's file raises an error."""
     about: str = ""
     source: str = _UNKNOWN
     note: str = ""

@@ -235,7 +235,7 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Measure planning times to choose the settings that have no flag. Return None if all have one.
+    """Measure planning times to choose the settings that no flag gives.
 
     A plan must be ready within one step of the controlled world. If no setting is fast enough, it may take as long as
     one step of the planner's worlds.

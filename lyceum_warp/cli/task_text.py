@@ -77,7 +77,7 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
     """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation.
 
-    The observation has only sensors if they measure every joint. Otherwise it has positions, velocities and sensors.
+    Positions and velocities are omitted if sensors measure every joint.
     """
     fields = ["qpos: Row[float]", "qvel: Row[float]"]
     sensed = _sensor_places(model)

@@ -38,7 +38,7 @@ class Tune:
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
     """How much the mean return may change. The 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
-    of the mean absolute return. any accepts every setting that causes no additional faults.
+    of the mean absolute return. The value any accepts every setting that causes no additional faults.
     """
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""

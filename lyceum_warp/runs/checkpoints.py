@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced, unknown_format
 
 FORMAT = 1
-"""Format version of run folders. It increases when older releases cannot read new files."""
+"""Format of run folders. The number increases when older releases cannot read new files."""
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
@@ -161,7 +161,7 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""The checks of a checkpoint's entries, by name."""
+"""Functions that check a checkpoint's entries."""
 
 
 def _first_sentence(error: BaseException) -> str:

@@ -68,7 +68,7 @@ class Saver:
         """Write an iteration's metrics, and its policy if it is the best so far or needs a numbered file.
 
         Returns:
-            The iteration's return, by which policies are compared. It may be None.
+            The iteration's return, or None.
         """
         assert self.run is not None and self._check is not None
         self._check()

@@ -34,9 +34,9 @@ _APART = 2
 into separate folders.
 """
 _LARGEST = 512 * 2**20
-"""Larger models, in bytes, are not copied."""
+"""Maximum size of a model that is copied, in bytes."""
 _MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Maximum number and total size in bytes of a task's modules. Above either, none of them is copied."""
+"""Maximum number of a task's modules that are copied, and their maximum total size in bytes."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
@@ -79,7 +79,7 @@ def json_value(name: str, value: Any) -> Any:
 
 
 def _table(value: Any) -> Any:
-    """Get the file or the array of a table parameter. Other parameters give None."""
+    """Get the file or the array of a table parameter. Return None for other parameters."""
     if is_table(value):
         return Path(value)
     array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
@@ -213,7 +213,7 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Check whether the model has changed since the run started. Another version of MuJoCo does not count."""
+    """Check whether the model has changed since the run started. With another version of MuJoCo, the answer is no."""
     known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
     # runs of earlier releases have no versions in config.json
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
@@ -225,7 +225,7 @@ def _digest(content: bytes) -> str:
 
 
 def _model_hash(env: Env) -> str:
-    """Hash the compiled model, without what depends on processes and paths."""
+    """Hash the compiled model, except for fields with paths."""
     found = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):

@@ -30,7 +30,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
         folder: The run's folder.
         config: Content of the run's config.json.
         named: The file to name in the error message.
-        runs: Whether the command executes the run's task. Otherwise it only reads files.
+        runs: Whether the command executes the run's task, or only reads files.
         trust: Whether to trust and record the run.
     """
     if os.path.exists(_record(folder, config)):

@@ -14,15 +14,15 @@ WorldChoice: TypeAlias = int | Literal["next", "previous", "best", "worst"]
 """The number of a world, or a rule that selects one. "best" and "worst" compare the returns of unfinished episodes."""
 
 MOST_GHOSTS = 32
-"""The most other worlds or episodes that are drawn at once."""
+"""Maximum number of other worlds or episodes that are drawn at once."""
 MOST_BURST = 50
-"""The most states along a trajectory that are drawn at once."""
+"""Maximum number of states along a trajectory that are drawn at once."""
 
 TRACE_COLOUR = (0.6, 0.65, 0.75, 0.5)
 BEST_COLOUR = (0.1, 0.75, 0.3, 1.0)
 
 MAX_POINTS, MAX_MESSAGES = 20_000, 200
-"""The most curve points and messages in one frame."""
+"""Maximum number of curve points and of messages in one frame."""
 
 
 # messages to the window
@@ -30,7 +30,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """The constants of a session."""
+    """What stays the same during a session."""
 
     title: str
     model: bytes
@@ -64,7 +64,7 @@ class Ghost:
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
-    """In x and y, in metres."""
+    """Shift in x and y, in metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Status:
     world: int
     step: int
     steps: int
-    """The length of the episode in playback. Otherwise the task's horizon, or 0."""
+    """The length of the episode in playback, or the task's horizon."""
     time: float
     """Simulated seconds since the start of the episode."""
     paused: bool
@@ -119,7 +119,7 @@ class Status:
     command: tuple[float, float, float] | None = None
     """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
-    """Whether the user drives the robot. Otherwise the task chooses the command."""
+    """Whether the user, not the task, chooses the command."""
     planner: tuple[tuple[str, float], ...] = ()
     params: tuple[tuple[str, float], ...] = ()
     seekable: tuple[int, int] = (0, 0)
@@ -136,7 +136,7 @@ class Frame:
     state: np.ndarray
     """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]
-    """Model fields that differ between this world and the model."""
+    """The model fields whose values differ from the model's."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
@@ -296,7 +296,7 @@ class Opening:
     scene: Scene
     host: str
     port: int | None
-    """None means the first free port from 8080."""
+    """By default the first free port from 8080."""
 
 
 @dataclasses.dataclass(frozen=True)

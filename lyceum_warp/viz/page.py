@@ -123,7 +123,7 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return a geom's colour. The material counts unless the geom has its own colour."""
+    """Return a geom's own colour, or its material's colour."""
     own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
     if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
         return own
@@ -131,7 +131,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's surface in the geom's coordinates. Return None if the kind is not drawn."""
+    """Make a geom's surface in the geom's coordinates. Some kinds of geoms are not drawn."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:

@@ -32,9 +32,9 @@ class Shot(TypedDict):
     """What to draw in one or several successive frames."""
 
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """qpos, mocap_pos and mocap_quat."""
+    """The arrays qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """Values that replace the model's values, by the fields' names."""
+    """New values of the model's fields."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
     """Poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]

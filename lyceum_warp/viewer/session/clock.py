@@ -33,7 +33,7 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
-"""The worlds do not catch up a longer lag behind the wall clock, in seconds."""
+"""Seconds of delay that the worlds catch up; longer delays are ignored."""
 _IDLE = 0.5
 """Seconds between two frames of a paused view in which nothing changes."""
 _CHECK = 0.5
@@ -46,8 +46,8 @@ Watcher = Callable[[], Sequence[str]]
 class Session:
     """Show worlds in a window.
 
-    A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world runs in real
-    time in the plant, a single world. While the plant runs, commands and frames are handled between its steps.
+    A policy acts in all worlds, which the session steps at the chosen speed. A controller of one world acts in the
+    plant, a single world that runs in real time. The session handles commands and frames between the plant's steps.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Session:
 
     @torch.no_grad()
     def run(self, window: Window) -> None:
-        """Run until the window is closed. An exception closes the window and the session."""
+        """Run until the window is closed."""
         self._window = window
         now = time.perf_counter()
         self._next_frame = self._next_check = now

@@ -11,7 +11,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
     """Carry out a command.
 
     Raises:
-        ValueError: The command names an unknown world, or perturbs a playback. The message is for the user.
+        ValueError: The command names an unknown world, or perturbs a playback.
         NoVideoError: A video cannot be made.
         ControllerError: A controller raised an exception.
     """

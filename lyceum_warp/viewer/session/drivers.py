@@ -16,11 +16,11 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 MOST_SAMPLES = 24
-"""The most samples of a plan whose paths the viewer draws."""
+"""Maximum number of samples whose paths the viewer draws."""
 
 
 class ControllerError(Exception):
-    """Raised if a controller raises an exception, which becomes the ``__cause__``. The message is a single line."""
+    """A controller raised an exception, which is the ``__cause__``. The message is a single line."""
 
     def __init__(self, name: str, error: BaseException) -> None:
         text = next(iter(str(error).splitlines()), "")

@@ -30,7 +30,6 @@ class Driving:
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
         self.wanted: tuple[float, float, float] | None = None
-        """None if the task chooses."""
 
     def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
         """Return the commanded forward velocity, lateral velocity and yaw rate in a state, (state_space.size,)."""

@@ -68,7 +68,7 @@ class Rows:
     """The data of a frame, copied to the host."""
 
     worlds: tuple[int, ...]
-    """The displayed world comes first."""
+    """The indices of the worlds. The displayed world comes first."""
     states: np.ndarray
     """(worlds, state_space.size) float64."""
     back: np.ndarray
@@ -77,7 +77,7 @@ class Rows:
     end: tuple[float, ...]
     """The displayed world's last complete episode: its last step, bits of ``Done``, return, length, success."""
     fault: tuple[float, ...]
-    """The last fault in any world: its step, bits of ``Done``, the world, and the number of faults so far."""
+    """The last fault: its step, bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
     """(points, 2 + curves) float64."""
 
@@ -316,7 +316,7 @@ class Live:
             self._event.record()
 
     def take(self) -> Rows | None:
-        """Wait for the requested data. Return None without a request."""
+        """Wait for the data of the last request."""
         if self._reading is None:
             return None
         (worlds, times, parts), self._reading = self._reading, None

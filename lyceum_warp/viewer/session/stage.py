@@ -153,7 +153,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that came back with an undone state, before the worlds continue from there."""
+        """End a push that came back with a restored state, unless the user still pushes."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()

@@ -21,7 +21,7 @@ from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
-"""The share of a core that the thread may use. After t seconds of CPU time, it sleeps for t / SHARE seconds."""
+"""The share of a core that the thread may use."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Traces:
     best: int | None
     final: Pose
     made: float
-    """From ``time.perf_counter``."""
+    """Time of the rollout, from ``time.perf_counter``."""
 
 
 class TraceRollouts:

@@ -39,8 +39,8 @@ class NoWindowError(OSError):
 class Window:
     """Shows frames in a window process, and collects the user's commands.
 
-    The window process is not a fork, so the caller needs no ``__main__`` guard. It ends when this process ends, even by
-    SIGKILL. Ctrl-C does not reach it.
+    The window process does not import the caller's program, so the caller needs no ``__main__`` guard. It ends when
+    this process ends, even by SIGKILL. Ctrl-C does not reach it.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.

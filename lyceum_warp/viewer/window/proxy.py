@@ -42,7 +42,7 @@ HEAD_SECONDS = 10.0
 WRITE_SECONDS = 60.0
 """Timeout in seconds for a client that does not read."""
 UNCHECKED = 128
-"""The most connections that have not sent the secret. Above it, the oldest ones are closed."""
+"""Maximum number of connections without the secret. Further connections close the oldest ones."""
 MESSAGE_BYTES = 2**20
 """Maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
@@ -392,13 +392,7 @@ class _Server(web.Server):
 
 
 async def _relay(source: _SocketEnd, sink: _SocketEnd, heard: Callable[[], None] | None = None) -> None:
-    """Forward messages until the source is closed. Then close the sink with the same code.
-
-    Args:
-        source: The receiving end.
-        sink: The sending end.
-        heard: A function that is called for each message.
-    """
+    """Forward messages until the source is closed. Then close the sink with the same code."""
     code, reason = int(aiohttp.WSCloseCode.GOING_AWAY), ""
     with contextlib.suppress(ConnectionError):  # the sink is already closed
         while True:

@@ -22,7 +22,7 @@ __all__ = [
 ]  # fmt: skip
 
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
-"""The most geoms that a browser draws in addition to the model's."""
+"""Maximum number of geoms that a browser draws in addition to the model's."""
 
 Plugin: Any = plugin.ViewerPlugin
 """The base class of plugins. After ``Started``, ``self.viewer`` is the viewer."""

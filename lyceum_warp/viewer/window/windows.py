@@ -11,7 +11,7 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""The most points of a plotted curve, and the seconds that it covers. Every frame sends all points to the browser."""
+"""Maximum number of points of a plotted curve, and its length in seconds. Every frame sends all points."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
@@ -49,14 +49,7 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw an open window. The main window can only be folded.
-
-        Args:
-            title: The window's title.
-            place: The left edge, the top edge, the width and the height in pixels.
-            cond: When the place is set, an ``ImGuiCond``.
-            content: A function that draws the content.
-        """
+        """Draw an open window. ``place`` is its left edge, top edge, width and height in pixels."""
         left, top, width, height = place
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
