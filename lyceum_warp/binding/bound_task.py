@@ -134,12 +134,8 @@ class BoundTask:
     """A task with its compiled model, its parameters and its kernels.
 
     Args:
-        task: The task's class.
-        nworld: Number of worlds.
-        model: A model to use instead of the task's own.
         fields: Fields that the engine provides in addition to those in ``World``.
         dynamics: Model fields that may differ between worlds in addition to those that the task writes.
-        physics: Options of the simulation.
         params: Values for the fields of ``Params``: one value, or one value per world.
     """
 
@@ -168,7 +164,6 @@ class BoundTask:
         for name in named:
             check_field_name(name)
         self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
-        """The Warp types of one world's fields and rows of memory."""
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
         """The fields of World and the rows of memory that each function writes."""

@@ -97,7 +97,6 @@ class TaskSource:
 
     @property
     def _has_structs(self) -> bool:
-        """Whether structs, instead of the task's ``obs``, define the layout of the observations."""
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
@@ -132,7 +131,6 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        """Return the fields of World that are memory."""
         counted = [name for name in MEMORIES if hasattr(self.task, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:

@@ -43,7 +43,6 @@ def local_modules(file: Path) -> dict[str, Path]:
 
 
 def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    """Yield the full names of everything that a module imports: modules, and names within modules."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

@@ -33,13 +33,7 @@ class Parameters:
     A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
     Args:
-        struct: The task's ``Params``.
         owner: The class with the defaults as attributes.
-        task_name: The task's name, for messages.
-        model: The compiled model.
-        nworld: Number of worlds.
-        timestep: Seconds in a step.
-        given: Values that replace defaults.
         weights: The weights of the task's terms, which are set like parameters.
     """
 
@@ -68,7 +62,6 @@ class Parameters:
             )
         found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
         self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
-        """Parameters that are computed from the model."""
         self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
         self.values = self.changed(given).values
         self._computed -= set(given)

@@ -66,8 +66,7 @@ class FunctionSource:
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
         """Return a call's kind and its callee.
 
-        A helper has Python source. A native function is a ``wp.func_native``. Other callees are types, Python
-        functions, or None if unknown.
+        A helper has Python source, and a native function is a ``wp.func_native``.
         """
         callee = self.value(node.func)
         if self.is_static(node):

@@ -132,10 +132,8 @@ class _Reader:
     """Reads the source of one function and of its callees.
 
     Args:
-        function: The function.
         places: What the caller has passed for each argument: an argument of the analysed function or a part of it.
         arguments: Names of the arguments of the analysed function.
-        writes: The dict to which writes are added.
         seen: The functions that were already read, each with the places of its arguments.
     """
 

@@ -84,7 +84,6 @@ class _Entry:
     note: str = ""
 
     def has(self, word: str) -> bool:
-        """Whether the entry contains a word, in any case."""
         return word.lower() in " ".join((self.name, self.about, self.source)).lower()
 
 
@@ -131,7 +130,6 @@ def _controls(spec: mujoco.MjSpec) -> int:
 
 
 def _source(task: type[Task]) -> str:
-    """Describe the source of a task's model, and name the extra that the model needs."""
     model: Any = task.model() if callable(task.model) else task.model
     if not isinstance(model, str | ModelFile):
         return f"made in {task.__module__.rpartition('.')[2]}.py"

@@ -140,7 +140,6 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 
 
 def _title(file: str) -> str:
-    """Describe a model for the docstring of a task file."""
     plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
 

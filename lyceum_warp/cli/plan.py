@@ -324,7 +324,6 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
 
 
 def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    """Say where the episodes are if the command is interrupted after ``whole`` complete ones."""
     steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
     if not whole:
         where = f"it is in {path}" if path else f"{run.folder} holds no episode"

@@ -102,7 +102,6 @@ def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list
 
 
 def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Return the ranges of sensordata that the policy observes."""
     places: list[tuple[int, int]] = []
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return places
@@ -140,7 +139,6 @@ def _all_joints_are_sensed(model: mujoco.MjModel) -> bool:
 
 
 def _elements(model: mujoco.MjModel) -> str:
-    """Generate a comment that names the model's elements and shows an example of their use."""
     names = {kind: [name for name in _names(model, kind) if name.isprintable() and name] for kind in _ELEMENTS}
     names["bodies"] = [name for name in names["bodies"] if name != "world"]
     mocap = {name for i, name in enumerate(_names(model, "bodies")) if model.body_mocapid[i] >= 0}
@@ -166,7 +164,6 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
 
 
 def _listed(kind: str, names: list[str]) -> list[str]:
-    """Generate a line with as many names as fit."""
     for shown in range(min(len(names), _NAMES), 0, -1):
         rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
         line = f"  {kind}: {', '.join(names[:shown])}{rest}"

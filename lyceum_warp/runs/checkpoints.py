@@ -106,7 +106,6 @@ def check_sizes(policy: Any, env: Env, path: Path) -> None:
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    """Describe the first difference between the weight shapes of a module and of a file, or return ""."""
     own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
     saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
     for name in {**own, **saved}:
@@ -161,7 +160,6 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-"""Functions that check a checkpoint's entries."""
 
 
 def _first_sentence(error: BaseException) -> str:

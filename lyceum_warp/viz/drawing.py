@@ -140,7 +140,6 @@ class DrawingProcess:
         return ""
 
     def _ended(self) -> tuple[int, str]:
-        """Return the exit code of the subprocess, and the last line of its stderr."""
         assert self._process is not None
         code = self._process.wait()
         self._errors.seek(0)
@@ -207,7 +206,6 @@ class Drawing(DrawingProcess):
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and its children, such as ffmpeg."""
     if process.poll() is not None:
         return
     with contextlib.suppress(ProcessLookupError):

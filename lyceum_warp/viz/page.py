@@ -184,7 +184,6 @@ def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
 
 
 def _round(kind: mujoco.mjtGeom, size: np.ndarray) -> Surface:
-    """Make a sphere, an ellipsoid, a capsule or a cylinder, along z."""
     types = mujoco.mjtGeom
     if kind == types.mjGEOM_CYLINDER:  # one cap, the side, the other cap
         height, radius = np.array([-1, -1, -1, 1, 1, 1.0]), np.array([0, 1, 1, 1, 1, 0.0])

@@ -34,7 +34,6 @@ class Shot(TypedDict):
     pose: tuple[np.ndarray, np.ndarray, np.ndarray]
     """The arrays qpos, mocap_pos and mocap_quat."""
     model_fields: dict[str, np.ndarray]
-    """New values of the model's fields."""
     ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
     """Poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]

@@ -124,7 +124,7 @@ class FrameMaker:
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
-        """Report the end of an episode, and faults. ``plant_of`` is the world that a plant copies."""
+        """Report faults and the end of an episode. ``plant_of`` is the world that a plant copies."""
         number, bits, returned, length, success = rows.end
         if number > self._seen_end:
             why = "success" if success else reasons(int(bits))
@@ -165,7 +165,6 @@ class FrameMaker:
         return state[: mujoco.mj_stateSize(self._env.task.model, mujoco.mjtState.mjSTATE_INTEGRATION)].copy()
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the values of a state's model fields, except those that equal the model's."""
         found = {}
         for field in self._env.task.dynamics:
             owner = self._env.task.model if hasattr(self._env.task.model, field.name) else self._env.task.model.opt

@@ -36,7 +36,6 @@ class Past:
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
         self.pushed: list[int | None] = [None] * self.length
-        """The world that the user was pushing in each step."""
         self.now = self.newest = self.oldest = 0
 
     @property

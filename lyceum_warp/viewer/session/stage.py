@@ -74,7 +74,6 @@ class Stage:
         self.shown: Frame | None = None
         self.steps = 0
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
-        """The time of each recent frame, and the total number of steps at that time."""
         self.select(modes[0], next(iter(self.controllers), None))
 
     @property

@@ -46,9 +46,7 @@ UNCHECKED = 128
 MESSAGE_BYTES = 2**20
 """Maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
-"""The page in control counts as hidden after this many seconds without input. An open page sends input with every
-frame.
-"""
+"""A page without input for this many seconds counts as hidden. An open page sends input with every frame."""
 PROTECTION = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
@@ -345,7 +343,6 @@ class Proxy:
             return answer
 
     async def _bridge(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Forward the messages of a WebSocket in both directions."""
         browser = web.WebSocketResponse(heartbeat=_HEARTBEAT, compress=False, max_msg_size=MESSAGE_BYTES)
         browser.headers.update(PROTECTION)
         await browser.prepare(request)  # refuses malformed handshakes
