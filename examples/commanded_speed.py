@@ -1,6 +1,6 @@
-"""Define a cheetah that runs at a commanded speed, with most features that a task can have.
+"""Define a cheetah that runs at a commanded speed; the task uses most features that a task can have.
 
-``python examples/commanded_speed.py`` checks the task; ``lyceum-warp train examples/commanded_speed.py`` trains a
+``python examples/commanded_speed.py`` checks the task. ``lyceum-warp train examples/commanded_speed.py`` trains a
 policy.
 """
 
@@ -18,7 +18,7 @@ GAIT = 0.4 * np.sin(np.pi * np.arange(20)[:, None] / 10 + np.array([0.0, 0.8, 1.
 
 
 def cheetah() -> mujoco.MjSpec:
-    """Gymnasium's model with a touch sensor under each foot and a crouched keyframe."""
+    """Add a touch sensor to each foot of Gymnasium's cheetah, and a crouched keyframe."""
     spec = lw.gymnasium_model("half_cheetah.xml").spec()
     for foot in ("bfoot", "ffoot"):
         spec.body(foot).add_site(name=foot, pos=[0.0, 0.0, -0.1], size=[0.15, 0.15, 0.15])

@@ -23,7 +23,7 @@ class Feedback(nn.Module):
         self.gains = nn.Linear(nobs, nact)
         self.correction = nn.Sequential(nn.Linear(nobs, 32), nn.LayerNorm(32), nn.ELU(), nn.Linear(32, nact))
         for last in (self.gains, self.correction[-1]):
-            nn.init.normal_(last.weight, std=0.01)  # initial mean actions are near the middle of the range
+            nn.init.normal_(last.weight, std=0.01)  # start near the middle of the range
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return self.middle + self.extent * torch.tanh(self.gains(obs) + self.correction(obs))
@@ -33,7 +33,7 @@ def main(
     task: str = "point_mass", nworld: int = 40, samples: int = 10_240, iterations: int = 15, seed: int = 0
 ) -> None:
     """Train the policy and evaluate it."""
-    torch.manual_seed(seed)  # seed of the network's initial weights
+    torch.manual_seed(seed)
     env = lw.make(task, nworld=nworld, seed=seed)
     nobs, nact = env.obs_space.size, env.action_space.size
     low, high = torch.tensor(env.action_space.low), torch.tensor(env.action_space.high)

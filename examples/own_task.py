@@ -1,6 +1,6 @@
 """Define a task and its model in one file: a pendulum that must swing up with a weak motor.
 
-``python examples/own_task.py`` checks and steps the task; docs/own_task.md shows the command line and model files.
+``python examples/own_task.py`` checks and steps the task. See docs/own_task.md for the command line and model files.
 """
 
 import mujoco
@@ -48,11 +48,11 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 @lw.register
 class Pendulum(lw.Task):
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))  # the model may also be a file name
-    frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # 20 substeps of 2 ms in a step
+    frame_skip, horizon, obs = 20, 250, {"direction": 2, "velocity": 1}  # a step has 20 substeps of 2 ms
 
 
 if __name__ == "__main__":
-    print(check_task(Pendulum, steps=100))  # check the rules that the package's own tasks follow
+    print(check_task(Pendulum, steps=100))
     env = lw.make(Pendulum, nworld=4, effort_weight=0.1)
     env.action[:] = 0.5  # Nm
     env.step()

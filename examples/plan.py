@@ -1,4 +1,4 @@
-"""Control an arm with MPPI: plan at every step, apply the plan's first action, and report the results.
+"""Control an arm with MPPI, which makes a new plan at every step.
 
     python examples/plan.py
     python examples/plan.py --task half_cheetah --steps 200 --samples 64
@@ -23,12 +23,12 @@ def main(
     Args:
         task: Name of a task, or a file that defines one.
         episodes: Number of episodes.
-        steps: Number of steps in an episode; by default the task's horizon.
+        steps: Number of steps per episode; by default the task's horizon.
         samples: Number of samples per plan; by default the task's setting.
-        seed: Seed of the first episode; it increases by 1 with each episode.
+        seed: Seed of the first episode. Each later episode has the next seed.
     """
     plant = lw.make(task, autoreset=False)  # the controlled world
-    # the planner has its own worlds, one for each sample
+    # the planner simulates its samples in worlds of its own
     plan = lw.MPPI(task) if samples is None else lw.MPPI(task, samples=samples)
 
     trajectories = []

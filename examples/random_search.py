@@ -3,7 +3,7 @@
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
 
-The class needs no code for files: lw.train writes the run folder, with metrics, policies, checkpoints and videos.
+``lw.train`` writes the run folder with metrics, policies, checkpoints and videos, so the class has no code for files.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ class SearchConfig:
     """Hyperparameters."""
 
     step: float = 1.0
-    """Learning rate of the weights, with returns in units of their standard deviation."""
+    """Learning rate of the weights, for returns divided by their standard deviation."""
     noise: float = 0.5
     """Standard deviation of the perturbations of the weights."""
 
 
 class RandomSearch(lw.Learner):
-    """Perturbs a linear policy's weights; each pair of worlds evaluates one perturbation with both signs."""
+    """Perturbs the weights of a linear policy. Each pair of worlds tries one perturbation with both signs."""
 
     algorithm = "random-search"
 

@@ -3,7 +3,7 @@
     python examples/td3.py
     python examples/td3.py --task half_cheetah --nworld 8 --iterations 200
 
-lw.train keeps the replay buffer in the run's folder, so the run resumes bit for bit.
+``lw.train`` stores the replay buffer in the run's folder, so a resumed run equals an uninterrupted one bit for bit.
 """
 
 import copy
@@ -18,29 +18,29 @@ import lyceum_warp as lw
 
 @dataclasses.dataclass(frozen=True)
 class TD3Config:
-    """Hyperparameters; noise is in units of scaled actions, which lie between -1 and 1."""
+    """Hyperparameters. Noise is in units of scaled actions, which lie between -1 and 1."""
 
     hidden: tuple[int, ...] = (64, 64)
     num_steps: int = 125
     """Steps of each world per iteration."""
     warmup: int = 1000
-    """Number of samples with random actions, taken before learning starts."""
+    """Number of random actions before learning starts."""
     batch: int = 256
     n_step: int = 1
     gamma: float = 0.99
     tau: float = 0.005
-    """Step size of the target networks: each update moves them by this fraction towards the networks."""
+    """Fraction by which an update moves the target networks towards the networks."""
     learning_rate: float = 1e-3
     noise: float = 0.2
     """Standard deviation of the exploration noise."""
     target_noise: float = 0.2
     noise_limit: float = 0.5
     actor_every: int = 2
-    """Number of updates of the critics for each update of the actor."""
+    """Updates of the critics per update of the actor."""
 
 
 class TD3(lw.Learner):
-    """Learns a deterministic policy from a replay buffer; its targets use the smaller of two critics' values."""
+    """Learns a deterministic policy. The targets use the smaller value of two critics."""
 
     algorithm = "td3"
 
@@ -79,14 +79,14 @@ class TD3(lw.Learner):
         )  # fmt: skip
 
     def update(self) -> torch.Tensor:
-        """Update the critics and, in every second call, the actor and the target networks; return the critics' loss."""
+        """Update the critics, and in every second call the actor and the target networks. Return the critics' loss."""
         config, (actor, critic), (actor_step, critic_step) = self.config, self.targets, self.optimizers
         batch = self.replay.sample(config.batch, n_step=config.n_step, gamma=config.gamma, generator=self.generator)
         obs, next_obs = batch.obs["policy"], batch.next_obs["policy"]
         with torch.no_grad():
             noise = config.target_noise * self.normal(batch.action)
             unit = actor.unit(actor.act(next_obs)) + noise.clamp(-config.noise_limit, config.noise_limit)
-            # discount is 0 after a termination, but not after a time limit
+            # discount is 0 after a termination and 1 after a time limit
             target = batch.reward + batch.discount * critic(next_obs, unit.clamp(-1.0, 1.0)).amin(0)
         loss = (self.value(obs, self.policy.unit(batch.action)) - target).square().mean(1).sum()
         descend(critic_step, loss)

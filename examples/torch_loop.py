@@ -3,7 +3,7 @@
     python examples/torch_loop.py
     python examples/torch_loop.py --device cuda --nworld 4096
 
-The environment updates its tensors in place. Clone a tensor to keep its values beyond the next step.
+The environment updates its tensors in place. Clone a tensor to keep its values.
 """
 
 import torch
@@ -29,18 +29,17 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
             obs = env.obs.clone()  # env.obs changes in place
             with torch.no_grad():
                 action = torch.normal(actor(obs), log_std.exp())
-            env.step(action)  # the step copies the action, and restarts worlds at the end of their episode
+            env.step(action)  # the step restarts worlds whose episode ended
             with torch.no_grad():
-                # env.obs may already belong to a new episode; env.final_obs is the observation after this step.
-                # Bootstrap from the value of env.final_obs unless the task terminated: a time limit only truncates the
-                # episode.
+                # env.obs may already belong to a new episode, but env.final_obs is the observation after this step. A
+                # time limit only truncates the episode, so bootstrap unless the task terminated.
                 next_value = critic(env.final_obs) * ~env.terminated
             outcome = env.reward.clone(), env.done.clone(), env.eval.clone()
             samples.append((obs, action, next_value, *outcome))
 
         obs, action, next_value, reward, done, distance = map(torch.stack, zip(*samples, strict=True))
         target = reward + gamma * next_value
-        for t in reversed(range(steps - 1)):  # accumulate returns backwards until the episode or the rollout ends
+        for t in reversed(range(steps - 1)):  # sum up rewards backwards until an episode ends
             target[t] = torch.where(done[t], target[t], reward[t] + gamma * target[t + 1])
         value = critic(obs.flatten(0, 1))
         advantage = target.flatten() - value.detach()
@@ -50,7 +49,7 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-        if done.any():  # the task's metric, env.eval, is the distance to the target
+        if done.any():  # env.eval is the distance to the target
             print(f"iteration {iteration:3d}: {done.sum()} episodes ended {distance[done].mean():.3f} m off the target")
 
 

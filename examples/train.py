@@ -1,4 +1,4 @@
-"""Train a policy with NPG, print its learning curve, then evaluate and save it.
+"""Train a policy with NPG, print the learning curve, then evaluate and save the policy.
 
     python examples/train.py
     python examples/train.py --task half_cheetah --nworld 64 --iterations 100
@@ -37,12 +37,12 @@ def main(
     env = lw.make(task, nworld=nworld, device=device, seed=seed)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=samples), seed=seed)
 
-    for it in npg:  # this iterator never ends: each iteration samples, updates the policy, and yields statistics
+    for it in npg:  # the iterator never ends; each iteration samples and updates the policy
         print(f"iteration {it.iteration:3d}  return {it.return_mean:7.1f}  {it.samples_per_second:8,.0f} samples/s")
         if it.iteration == iterations:
             break
 
-    # evaluation without exploration noise: a policy called with observations returns its mean actions
+    # a policy called with observations returns its mean actions, without noise
     episodes = lw.evaluate(env, npg.policy, 20, seed=seed + 1)
     print(f"mean policy: return {episodes.returns.mean():.1f} in {episodes.lengths.mean():.0f} steps")
 

@@ -1,6 +1,6 @@
 """Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch.
 
-Importing the package loads neither torch nor Warp nor MuJoCo: each public name loads its module at first use (PEP 562).
+The package imports torch, Warp and MuJoCo only when a name that needs them is first used (PEP 562).
 """
 
 import importlib
@@ -145,7 +145,7 @@ _NAMES = {
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
-"""Map modules to their public names. Type checkers read the imports above instead."""
+"""Public names by module. Type checkers read the imports above instead."""
 # isort: on
 # fmt: on
 
@@ -154,8 +154,7 @@ _MODULES = {name: module for module, names in _NAMES.items() for name in names.s
 
 
 def __getattr__(name: str) -> Any:
-    """Load a public name."""
-    if name in ("terms", "walkers"):  # functions of these modules are used as lw.terms.NAME, not as lw.NAME
+    if name in ("terms", "walkers"):  # users write lw.terms.NAME, not lw.NAME
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Make, step, reset and observe an environment: one task in many worlds."""
+"""Make, step, reset and observe an environment, which runs one task in many worlds."""
 
 import functools
 import inspect
@@ -48,7 +48,7 @@ Raises:
 
 
 def _document_arguments(function: Any) -> Any:
-    """Insert the arguments of ``make`` into a function's docstring and signature, for ``help``."""
+    """Insert the arguments of ``make`` into a function's docstring and signature."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -67,19 +67,18 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 @_document_arguments
 @document_attributes
 class Env:
-    """One task in many worlds; every array is allocated once and shared with torch.
+    """One task in many worlds. Every array is allocated once and shared with torch.
 
-    Write ``action``, call ``step``, and read the other buffers, which are updated in place. When an episode ends, the
-    world starts a new random episode within the same step: ``obs`` is then the new episode's first observation, and
+    Write ``action``, call ``step``, and read the other buffers. They are updated in place. When an episode ends, the
+    world starts a new random episode in the same step. ``obs`` is then the new episode's first observation, and
     ``final_obs`` is the old episode's last observation.
 
-    A world with a fault (see ``Done``) restarts, and ``fault_counts`` counts the fault; no bit of any other world
-    changes. A transition with a fault has the reward 0 and the last valid observation as ``final_obs``. In the Warp
-    engine, all worlds share a pool of contacts. If the pool overflows, every world whose contacts did not fit has a
-    fault.
+    A world with a fault (see ``Done``) restarts and leaves all other worlds unchanged. ``fault_counts`` counts the
+    faults. After a fault, the reward is 0, and ``final_obs`` is the last valid observation. On the Warp engine, all
+    worlds share a pool of contacts. If the pool is full, every world whose contacts do not fit has a fault.
 
-    On a GPU, use an environment's tensors on torch's default stream, which is synchronised with Warp's stream.
-    Synchronise any other stream yourself.
+    On a GPU, use the tensors on torch's default stream, which is synchronised with Warp's stream. Synchronise any other
+    stream yourself.
 
     {arguments}
     """
@@ -87,11 +86,11 @@ class Env:
     obs: torch.Tensor
     """Observations, (nworld, nobs), float32."""
     final_obs: torch.Tensor
-    """Observations at the end of the last step, before any reset, (nworld, nobs), float32."""
+    """Observations after the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations by group, each (nworld, size of the group); the group ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, group size). The group ``policy`` is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` for each group of observations, by the group's name."""
+    """``final_obs`` of each group."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -103,20 +102,19 @@ class Env:
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]
-    """The task's metrics summed over the episode up to the last step, each (nworld,), float32."""
+    """Sums of the metrics over the episode so far, each (nworld,), float32."""
     episode_metric_sums: torch.Tensor
-    """``episode_metrics`` as one tensor (nworld, number of metrics) in the order of ``metrics``."""
+    """``episode_metrics`` as one tensor, (nworld, number of metrics)."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name; only ``update_shared``, which calls the task's ``share``, changes the
-    memory."""
+    """The memory that all worlds share, by name. Only ``update_shared`` changes it."""
     success: torch.Tensor
-    """Whether the task's goal has been met for ``success_steps`` steps in a row, (nworld,), bool."""
+    """Whether the goal was met in each of the last ``success_steps`` steps, (nworld,), bool."""
     done: torch.Tensor
     """Whether the episode ended for any reason, (nworld,), bool."""
     done_reason: torch.Tensor
     """Reasons why the episode ended, as bits of ``Done``, (nworld,), int32."""
     action: torch.Tensor
-    """Actions of the next step, (nworld, nact), float32. A non-finite action is a fault and is replaced by zero."""
+    """Actions of the next step, (nworld, nact), float32. A non-finite action is a fault and becomes zero."""
     episode_step: torch.Tensor
     """Steps since the reset, (nworld,), int32."""
     time: torch.Tensor
@@ -124,22 +122,22 @@ class Env:
     nworld: int
     """Number of worlds."""
     timestep: float
-    """Simulated duration of a step with all its substeps, in seconds."""
+    """Simulated duration of a step, in seconds."""
     device: wp.Device
-    """The Warp device; ``obs.device`` is the same device in torch."""
+    """The Warp device. ``obs.device`` is the same device in torch."""
     options: EnvOptions
-    """The options of the environment. If physics options were given by name, ``options.physics`` contains the options
-    themselves."""
+    """The options of the environment. ``options.physics`` has the physics options themselves, even if they were given
+    by name."""
     task: BoundTask
-    """The task, with its model, its parameters (``task.params``) and its kernels."""
+    """The task with its model, its parameters (``task.params``) and its kernels."""
     engine: Engine
     """The physics engine; ``engine.name`` is "mujoco" or "warp"."""
     worlds: Worlds
-    """The arrays and phases of the environment, for internal use."""
+    """The arrays of the environment, for internal use."""
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """The spaces of all groups of observations; the space of ``policy`` is ``obs_space``."""
+    """Spaces of all groups of observations. The space of ``policy`` is ``obs_space``."""
     action_space: Space
     """Names, columns and bounds of actions."""
     state_space: Space
@@ -193,10 +191,10 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            # find writes out of bounds now, before the task's functions run on the environment's own arrays
+            # find writes out of bounds before the task's functions run on the environment's own arrays
             probe.check_bounds()
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # later resets report invalid values as faults
+            if self.task.dynamics and not _replica:  # later, invalid values are faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -222,26 +220,27 @@ class Env:
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model, which is read-only because the engine uses its own copy.
+        """The compiled model. It is read-only, because the engine has its own copy.
 
-        To change the physics, list model fields in the task's ``World`` and write them in ``startup`` or ``randomize``,
-        or pass an edited MjSpec as ``model=``. ``copy.copy(env.model)`` is an ordinary MjModel that can be edited.
+        To change the physics, pass an edited MjSpec as ``model=``. To change model fields per world, list them in the
+        task's ``World`` and write them in ``startup`` or ``randomize``. ``copy.copy(env.model)`` is an ordinary MjModel
+        that can be edited.
         """
         return read_only(self.task.model)
 
     @property
     def horizon(self) -> int:
-        """Number of steps after which an episode is truncated; 0 means never."""
+        """Number of steps after which an episode is truncated, or 0 for never."""
         return self.worlds.horizon
 
     @property
     def first_world(self) -> int:
-        """Index of the first world among the worlds of all processes; 0 with a single process."""
+        """Index of the first world among the worlds of all processes."""
         return self.options.first_world
 
     @property
     def autoreset(self) -> bool:
-        """Whether worlds start a new episode within the step that ends an episode."""
+        """Whether a world starts a new episode in the step that ends the old one."""
         return self.worlds.autoreset
 
     # the step
@@ -281,7 +280,7 @@ class Env:
         """Reset worlds to random initial states, and zero their actions.
 
         Args:
-            seed: Seed that restarts the worlds' random streams; by default each world continues its stream.
+            seed: Seed of the worlds' random streams. By default, each world continues its stream.
             mask: Worlds to change, (nworld,) bool; by default all.
         """
         worlds = self.worlds
@@ -297,10 +296,9 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Get the complete state of every world, (nworld, state_space.size), float64.
 
-        A state contains everything that determines the future of its world: the engine's integration state, fields left
-        by the last substep, model fields that differ between worlds, the step and episode counters, the random stream,
-        the task's memory, the metric sums, and the count for ``success_steps``. ``state_space.parts`` names the columns
-        of a state.
+        A state has everything that determines the future of its world. That includes the engine's integration state,
+        model fields that differ between worlds, counters, the random stream and the task's memory.
+        ``state_space.parts`` names the columns of a state.
 
         Args:
             out: Tensor into which the states are written.
@@ -321,14 +319,14 @@ class Env:
         return torch.where(worlds.mask_view[:, None], worlds.state_view, out, out=out)
 
     def set_state(self, state: torch.Tensor, mask: torch.Tensor | None = None, *, check: bool = True) -> None:
-        """Set worlds exactly to states from ``get_state``; every getter then returns values of these states.
+        """Set worlds to states from ``get_state``. All getters then return the values of these states.
 
-        The reward becomes 0, because setting a state is not a transition.
+        The reward becomes 0, because there was no transition.
 
         Args:
             state: States, (nworld, state_space.size), float64.
             mask: Worlds to change, (nworld,) bool; by default all.
-            check: Whether to refuse states that are not finite. On a GPU, the check waits for the device.
+            check: Whether to refuse states that are not finite. On a GPU, this waits for the device.
 
         Raises:
             ValueError: The state has the wrong shape or type, or is not finite.
@@ -363,22 +361,22 @@ class Env:
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Get the evaluation metric after the last step, or of given states, (nworld,)."""
+        """Get the evaluation metric after the last step or of given states, (nworld,)."""
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Check whether the last step terminated the episode, or whether given states are terminal, (nworld,) bool."""
+        """Get whether the last step terminated the episode or whether given states are terminal, (nworld,) bool."""
         return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
         self, before: torch.Tensor | None = None, action: torch.Tensor | None = None,
         after: torch.Tensor | None = None, out: torch.Tensor | None = None,
     ) -> torch.Tensor:  # fmt: skip
-        """Get the rewards of the last step, or of given transitions, (nworld,).
+        """Get the rewards of the last step or of given transitions, (nworld,).
 
-        Scratch worlds compute the rewards of given transitions, so that the environment's worlds do not change. The
-        result differs from ``env.reward`` if an event of the task changed fields that the reward reads, because events
-        run after the reward is computed.
+        Scratch worlds compute the rewards of given transitions, so the environment does not change. Events of the task
+        run after the reward, so the result differs from ``env.reward`` if an event changed fields that the reward
+        reads.
 
         Args:
             before: States before the transitions, (nworld, state_space.size).
@@ -405,7 +403,7 @@ class Env:
         return _copied(self.action, out)
 
     def set_action(self, action: torch.Tensor) -> None:
-        """Check and set the actions of the next step. ``env.action.copy_(...)`` skips the checks.
+        """Check and set the actions of the next step. ``env.action.copy_(...)`` does the same without a check.
 
         Raises:
             ValueError: The action has the wrong shape or type, or is not finite.
@@ -425,14 +423,14 @@ class Env:
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
 
-        The view of ``time``, of ``ctrl`` and of every field that the task reads is always available. Request other
-        fields when making the environment, as in ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write
-        into the view: use ``set_state`` or ``set_dynamics``.
+        The views of ``time``, ``ctrl`` and the fields that the task reads are always available. Request other fields
+        with ``make("hopper", fields=["site_xpos", "body_mass"])``. Do not write to the view: use ``set_state`` or
+        ``set_dynamics``.
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
-            element: A name from the model: a joint for "qpos" or "qvel", a sensor for "sensordata", or a body, site,
-                geom or camera.
+            element: A name from the model. For example, a joint for "qpos" or "qvel", a sensor for "sensordata", or a
+                body or site.
 
         Raises:
             ValueError: The environment has no such field, or the model has no element of this name.
@@ -453,20 +451,19 @@ class Env:
         return view[:, where.start] if one_object else view[:, where]
 
     def set_dynamics(self, mask: torch.Tensor | None = None, **fields: Any) -> None:
-        """Set the values of model fields in some or all worlds, and update constants derived from the fields.
+        """Set model fields of some or all worlds, and update constants that MuJoCo derives from them.
 
-        The task must randomize the fields, or the option ``dynamics`` must list them. Each reset first restores the
-        nominal values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep
-        the new values until ``rand_reset(seed=...)``.
+        The task must randomize the fields, or the option ``dynamics`` must list them. A reset restores the nominal
+        values of fields that the task's ``initialize``, ``randomize`` or ``event`` writes. Other fields keep the new
+        values until ``rand_reset(seed=...)``.
 
         Args:
             mask: Worlds to change, (nworld,) bool; by default all.
-            fields: Values of model fields by name, as in ``body_mass=masses``, with one row per world or one row for
-                all worlds.
+            fields: Values by name, as in ``body_mass=masses``, with one row per world or one row for all worlds.
 
         Raises:
-            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size, is not finite, or is
-                negative although the field must be positive.
+            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size, is not finite, or may
+                not be negative.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))
@@ -477,7 +474,6 @@ class Env:
         return {field.name: state[:, self.state_space.parts[field.name]] for field in self.task.dynamics}
 
     def _check_dynamics(self, state: torch.Tensor, names: Collection[str]) -> None:
-        """Refuse model fields that MuJoCo cannot simulate."""
         columns = self._columns_of_dynamics(state)
         for field in self.task.dynamics:
             if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
@@ -488,32 +484,31 @@ class Env:
     def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
         """Update ``shared`` with the task's ``share``, which reads sums over the transitions since the last update.
 
-        The update includes observations that depend on ``shared``. Learners call this method after each rollout. The
-        host does not wait for the device.
+        Observations that depend on ``shared`` are updated, too. Learners call this method after each rollout. It does
+        not wait for the device.
 
         Args:
             total: Function that sums an int64 tensor over several processes in place, such as ``Team.sum``. All
-                processes must call ``update_shared``.
+                processes must then call ``update_shared``.
         """
         if self.shared and total is not None:
             total(torch_view(self.worlds.sums))
         self.worlds.update_shared()
 
     def get_shared(self) -> torch.Tensor:
-        """Copy the memory that all worlds share, and the sums for the memory's next update.
+        """Copy the memory that all worlds share, and the sums for its next update.
 
         Returns:
-            The shared memory, followed by the sums for the next update, float64; empty if the task has no shared
-            memory.
+            One vector, float64; empty if the task has no shared memory.
         """
         parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
         return torch.cat([part.double() for part in parts])
 
     def set_shared(self, state: torch.Tensor) -> None:
-        """Set the memory that all worlds share, and the sums for the memory's next update.
+        """Set the memory that all worlds share, and the sums for its next update.
 
         Args:
-            state: The result of ``get_shared`` of an environment of the same task.
+            state: A result of ``get_shared`` for the same task.
 
         Raises:
             ValueError: The state has the wrong size or type.
@@ -531,11 +526,11 @@ class Env:
 
     @property
     def given_params(self) -> dict[str, Any]:
-        """The task parameters that were set explicitly, by name; all others have their defaults."""
+        """The task parameters that were given by the user."""
         return dict(self._given_params)
 
     def set_params(self, **params: Any) -> None:
-        """Change parameters of the task in place, from the next step on.
+        """Change parameters of the task, from the next step on.
 
         Raises:
             ValueError: A parameter is unknown, or the size of the observation would change.
@@ -557,13 +552,13 @@ class Env:
         self._copy_shared(other)
 
     def replicate(self, *, nworld: int | None = None, **changes: Any) -> "Env":
-        """Make another environment of the same task, with the same options and parameters except for the given changes.
+        """Make another environment with the same task, options and parameters, except for the given changes.
 
         By default, ``seed`` and ``first_world`` become 0. If the number of worlds differs, parameters with one value
         per world are repeated or cut.
         """
         nworld = self.nworld if nworld is None else nworld
-        # pass the parsed model, because the model's file may have changed
+        # the model's file may have changed, so pass the parsed model
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
@@ -572,22 +567,20 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with only a few worlds; engine="auto" selects the C engine.
+        """Replicate the environment with only a few worlds. engine="auto" becomes the C engine.
 
-        On a GPU, a step of a few worlds takes nearly as long as a step of thousands of worlds.
+        On a GPU, a step of a few worlds takes nearly as long as a step of thousands.
         """
         return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
-        """Get the values of the named parameters, for ``nworld`` worlds."""
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # return a parameter as it was given, such as an element's name instead of its index, unless it is a table
+        # prefer a parameter as it was given, such as an element's name
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
 
     def _scratch_at(self, given: torch.Tensor) -> "Env":
-        """Set scratch worlds of the same task to the given states; the first call makes the scratch worlds."""
         if self._scratch is None:
             self._scratch = self.replicate()
         self._scratch._copy_shared(self)
@@ -602,14 +595,14 @@ class Env:
 
     @property
     def bytes_per_world(self) -> float:
-        """Estimate the bytes of memory per world. The model is not counted, because all worlds share it."""
+        """Estimate the memory per world in bytes, without the model, which all worlds share."""
         physics = self.options.engine, self.task.model, self.device, self.task.fields
         engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
         return engine + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:
-        """Count the faults of each kind since construction; the host waits for the device."""
+        """Count the faults of each kind since construction. This waits for the device."""
         counts = self.worlds.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 

@@ -1,4 +1,4 @@
-"""Describe the fields of MjData by their Warp types and by the stages that compute and update the fields."""
+"""Describe the fields of MjData: their Warp types, and the stages that compute them."""
 
 import dataclasses
 import difflib
@@ -43,13 +43,13 @@ STATE_FIELDS = {
 """Fields of the integration state, each with its mjtState component."""
 
 INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "userdata")
-"""Fields of the state that the engine reads but never changes. A task may write these fields before a step."""
+"""Fields of the state that the engine only reads. A task may write these fields before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
 """Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
-"""Fields of the integration state that only the engine writes: delayed samples and deformations."""
+"""Fields of the integration state that only the engine writes."""
 
 _POSITION = (
     "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat cam_xpos cam_xmat "
@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""Kind of the objects of a field that has one row per object, by the field's name or prefix."""
+"""Kinds of objects by a field's name or prefix, for fields with one row per object."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -128,9 +128,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields in which an object may have several rows, by the field's name or prefix. The three entries are the kind of
-object, the MjModel array with the index of each object's first row, and the name of either an array of row counts or
-the total number of rows."""
+"""Fields with several rows per object, by name or prefix. The entries are the kind of object, the MjModel array of
+first rows, and the array of row counts or the total number of rows."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -151,23 +150,23 @@ _COUNTS = {
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One field of a model, with the stages that update the field."""
+    """One field of a model."""
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world. The axis of the elements of a vector or quaternion is omitted."""
+    """Shape of the field in one world. A vector or quaternion counts as one element."""
     dtype: type
     """Warp type of an element: float, wp.vec3, quat (w, x, y, z), ..."""
     refresh: Stage
-    """The stage of the forward pass that updates the field after a step, so that it matches the new state."""
+    """The stage that updates the field after a step."""
     reset: Stage
-    """The stage that updates the field after a reset; ``Stage.NONE`` for a field that a reset sets to zero."""
+    """The stage that updates the field after a reset; ``Stage.NONE`` if a reset sets it to zero."""
     lagged: bool
-    """Whether the field keeps the value left by ``mj_step``, which lags one substep behind the state."""
+    """Whether the field keeps the value from ``mj_step``, which is one substep older than the state."""
     snapshot: bool
-    """Whether states include the field, because it is not a function of the integration state."""
+    """Whether states include the field because the integration state does not determine it."""
     written: bool = False
-    """Whether the task writes the field before a step; only for ``INPUTS``."""
+    """Whether the task writes the field before a step."""
 
     @property
     def size(self) -> int:
@@ -180,12 +179,12 @@ _KNOWN = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
 
 
 def similar_data_fields(name: str) -> list[str]:
-    """List MjData fields with similar names, closest first."""
+    """List MjData fields with similar names, the closest first."""
     return difflib.get_close_matches(name, _KNOWN, 3)
 
 
 def is_data_field(name: str) -> bool:
-    """Check whether a name is the name of an MjData field that an environment can keep."""
+    """Return whether an environment can keep an MjData field of this name."""
     return name in STATE_FIELDS or name in DERIVED_FIELDS or name in SENSED
 
 
@@ -194,23 +193,22 @@ def describe(
 ) -> Field:
     """Describe a field of a model.
 
-    Fields of the position and velocity stages match the current state after every step, restart and event. Fields of
-    the acceleration stage, such as ``qacc``, ``cfrc_ext`` or actuator forces, come from the last substep, which
-    computes them from the state before the substep. At the start of an episode, the fields of this stage are computed
-    from the first state. In ``sensordata``, each sensor's columns belong to the stage that computes the sensor.
+    Fields of the position and velocity stages always match the current state. Fields of the acceleration stage, such as
+    ``qacc`` or ``cfrc_ext``, come from the last substep, which computes them before it moves the state. At the start of
+    an episode, they are computed from the first state. In ``sensordata``, each sensor's columns belong to the sensor's
+    stage.
 
     Args:
         model: The compiled model.
         name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the value left by ``mj_step``. This value lags one substep behind the state. Fields of
-            the acceleration stage always lag; fields of the integration state never do.
-        cleared: Whether the field is 0 at the start of an episode instead of being computed from the first state.
+        lagged: Whether to keep the value from ``mj_step``, which is one substep older than the state. Fields of the
+            acceleration stage always lag, and fields of the integration state never do.
+        cleared: Whether the field is 0 at the start of an episode.
         written: Whether the task writes the field before a step. Controls are always written.
 
     Raises:
-        ValueError: There is no field of this name; MuJoCo computes the field only for a sensor, and no enabled sensor
-            needs it; ``written`` is True, but the field is not in ``INPUTS``; or ``cleared`` is True, but the field
-            describes the current state.
+        ValueError: There is no such field, MuJoCo computes it only for a sensor that is missing or disabled, or
+            ``written`` or ``cleared`` is not possible for it.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -251,27 +249,26 @@ def describe(
 
 
 def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:
-    """Get the columns of ``sensordata`` for sensors of the position and velocity stages, (n,) int."""
+    """Get the columns of ``sensordata`` that belong to the position and velocity stages, (n,) int."""
     early = np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION)
     ranges = [np.arange(model.sensor_adr[i], model.sensor_adr[i] + model.sensor_dim[i]) for i in early]
     return np.concatenate([np.zeros(0, int), *ranges])
 
 
 def state_columns(model: mujoco.MjModel, name: str) -> slice:
-    """Get the columns of a state field in the integration state (mjSTATE_INTEGRATION)."""
+    """Get a field's columns in the integration state (mjSTATE_INTEGRATION)."""
     component = STATE_FIELDS[name].value
     start = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value & (component - 1))
     return slice(start, start + mujoco.mj_stateSize(model, component))
 
 
 def _sensed(model: mujoco.MjModel, name: str) -> bool:
-    """Check whether a sensor of the model makes MuJoCo compute a field."""
     if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
         return False
     if name == "sensordata":
         return True
     kind = mujoco.mjtSensor
-    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # one pass of MuJoCo computes accelerations and forces
+    if ON_DEMAND[name] == kind.mjSENS_FRAMELINACC:  # MuJoCo computes accelerations and forces in the same pass
         kinds = [kind.mjSENS_ACCELEROMETER, kind.mjSENS_FORCE, kind.mjSENS_TORQUE, kind.mjSENS_FRAMELINACC,
                  kind.mjSENS_FRAMEANGACC]  # fmt: skip
     else:
@@ -280,15 +277,13 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 
 
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
-    """Get the rows that a named element of the model has in a field of MjData or MjModel.
+    """Get the rows of a named element in a field of MjData or MjModel.
 
-    The following objects may have several rows: a joint (coordinates in ``qpos``; degrees of freedom in ``qvel``,
-    ``dof_damping`` and similar fields), a sensor (``sensordata``), an actuator (controls in ``ctrl``, activations in
-    ``act``, outputs in ``actuator_force``) and a flex (vertices). A mocap body has one row in ``mocap_pos``. In all
-    other fields, each object has one row.
+    A joint may have several rows in ``qpos``, ``qvel``, ``dof_damping`` and similar fields. A sensor, an actuator and a
+    flex may have several, too. A mocap body has one row in ``mocap_pos``. In all other fields, each object has one row.
 
     Raises:
-        ValueError: The model has no element of this name, or the element has no rows in the field.
+        ValueError: The model has no such element, or the element has no rows in the field.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
@@ -314,12 +309,12 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Check whether an object may have several rows in a field, as a ball joint has three in ``cdof``."""
+    """Return whether an object may have several rows in a field. A ball joint has three in ``cdof``, for example."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 
 def rows(model: mujoco.MjModel, name: str) -> int:
-    """Get the length of a field of MjData or MjModel along the axis of its named elements."""
+    """Get the length of a field along its elements' axis."""
     owner = model if hasattr(model, name) else mujoco.MjData(model)
     return len(getattr(owner, name))
 

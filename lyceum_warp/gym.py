@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
-Importing this module registers each task under the name of its class, such as ``lyceum/HalfCheetah-v0``. A task's file
-is loaded when an environment is made. ``register`` adds a task of your own.
+Importing this module registers each task under its class name, such as ``lyceum/HalfCheetah-v0``. A task's file is
+loaded when an environment is made. ``register`` adds a task of your own.
 """
 
 import re
@@ -19,10 +19,10 @@ __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
 def register(task: str | Path | type[Task]) -> str:
     """Register a task with Gymnasium, and return its id, such as "lyceum/MyHopper-v0".
 
-    A task with the same id is replaced.
+    An older task with the same id is replaced.
 
     Args:
-        task: Name of a task, path of a task file, or a task class.
+        task: A task's name, file or class.
 
     Raises:
         ValueError: The task does not exist.
@@ -31,7 +31,7 @@ def register(task: str | Path | type[Task]) -> str:
     known = isinstance(task, str) and task in task_names()
     name = str(task) if known else task_name(find_task(task))
     id = f"lyceum/{''.join(map(str.capitalize, re.split('[_/]', name)))}-v0"
-    gymnasium.registry.pop(id, None)  # Gymnasium warns if an id is registered twice
+    gymnasium.registry.pop(id, None)  # Gymnasium warns about an id that is registered twice
     gymnasium.register(
         id,
         entry_point="lyceum_warp.gym:GymnasiumEnv",

@@ -1,4 +1,4 @@
-"""Declare how the parts of observations, actions and states change if left and right are exchanged."""
+"""Declare how observations, actions and states change if left and right are exchanged."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -7,22 +7,21 @@ from typing import Any
 import numpy as np
 
 Reflection = tuple[Sequence[int], Sequence[float]]
-"""Order and signs of columns; the mirror image of a row is ``signs * row[order]``."""
+"""Order and signs of columns: the mirror image of a row is ``signs * row[order]``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
-    """The mirror image of a task in the plane between left and right, for ``lw.Task.mirror``.
+    """A task's left-right mirror image, for ``lw.Task.mirror``.
 
-    A reflection applies to all parts with the given name in observations, actions and states. A reflection may consist
-    of the signs of the part's columns: ``"command": (1, -1, -1)`` keeps the forward velocity, and inverts the lateral
-    velocity and the yaw rate. A reflection may also consist of an order of the columns and their signs: ``"foot_force":
-    ([1, 0], [1, 1])`` exchanges the left and the right foot. In the base's axes, a vector has the signs (1, -1, 1), and
-    an angular velocity has the signs (-1, 1, -1). If the parts of an action are actuators, one reflection named
-    "action" applies to the whole action.
+    A reflection applies to the parts with its name in observations, actions and states. A reflection may list only the
+    signs of columns: ``"command": (1, -1, -1)`` keeps the forward velocity, and inverts the lateral velocity and the
+    yaw rate. Or it lists an order and signs: ``"foot_force": ([1, 0], [1, 1])`` exchanges the left and the right foot.
+    In the base's axes, a velocity has the signs (1, -1, 1), and an angular velocity has the signs (-1, 1, -1). If
+    actions are controls, one reflection named "action" applies to the whole action.
 
     Args:
-        parts: Reflections by the names of parts.
+        parts: Reflections by name of the part.
 
     Raises:
         ValueError: A reflection is not its own inverse.
@@ -31,7 +30,7 @@ class Mirror:
     parts: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """If a reflection has only signs, add the order of its columns; then check all reflections."""
+        """Add the order to reflections that list only signs, and check all reflections."""
         parts = {name: _complete(part) for name, part in self.parts.items()}
         for name, (order, signs) in parts.items():
             places, factors = np.asarray(order), np.asarray(signs)
@@ -44,15 +43,15 @@ class Mirror:
         object.__setattr__(self, "parts", parts)
 
     def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
-        """Combine the reflections of all parts of an observation, an action or a state into one reflection.
+        """Combine the reflections of all parts into one reflection of an observation, an action or a state.
 
         Args:
-            parts: The columns of each part, in the format of ``Space.parts``.
-            task: Name of the task for error messages.
-            whole: Name of a reflection that, if the task declares it, replaces the reflections of all parts.
+            parts: Columns of each part, as in ``Space.parts``.
+            task: Name of the task, for error messages.
+            whole: Name of a reflection that replaces those of the parts, if the task declares it.
 
         Raises:
-            ValueError: A part has no reflection, or its reflection has a different size.
+            ValueError: A part has no reflection, or one of a different size.
         """
         if whole is not None and whole in self.parts:
             parts = {whole: slice(0, max(part.stop for part in parts.values()))}

@@ -1,4 +1,4 @@
-"""Change a model's actuators, in a task's ``edit_model``."""
+"""Change the actuators of a model in a task's ``edit_model``."""
 
 import mujoco
 
@@ -6,14 +6,14 @@ from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
-    """Turn a position servo into an actuator whose control is the velocity at which the servo's target moves.
+    """Turn a position servo into an actuator that moves the servo's target at the velocity given by its control.
 
-    The actuator's gains do not change. The target becomes an activation of the model (``act``), limited to the
-    actuator's old control range.
+    The gains do not change. The target becomes an activation of the model (``act``), which stays in the old control
+    range.
 
     Args:
-        actuator: A position servo with a control range; the servo is changed in place.
-        speed: Limit of the new controls, which range from -speed to speed, in m/s or rad/s.
+        actuator: A position servo with a control range. It is changed in place.
+        speed: Controls range from -speed to speed, in m/s or rad/s.
 
     Raises:
         ValueError: The actuator is not a position servo, has no control range, or the speed is not positive.

@@ -1,4 +1,4 @@
-"""Describe the model fields that can differ between worlds, and the constants derived from them."""
+"""Describe the model fields that can differ between worlds, and the constants that follow from them."""
 
 import dataclasses
 import difflib
@@ -15,7 +15,7 @@ from lyceum_warp.support.validate import described
 
 
 class Constants(enum.IntFlag):
-    """Groups of model constants that MuJoCo computes from other fields (mj_setConst)."""
+    """Groups of constants that MuJoCo computes from other fields of a model (mj_setConst)."""
 
     NONE = 0
     FIXED = 1
@@ -25,14 +25,13 @@ class Constants(enum.IntFlag):
     INERTIAL = 4
     """Inverse weights and unit accelerations at ``qpos0``."""
     PRIVATE = 8
-    """Constants that only the C engine uses: bounding volumes of bodies, indices, and flags for frames that
-    coincide."""
+    """Constants that only the C engine uses, such as bounding volumes of bodies."""
 
 
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
-"""Geom fields that affect a tendon wrapping around the geom."""
+"""Geom fields that matter to tendons that wrap around the geom."""
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
@@ -66,10 +65,9 @@ _FIELDS = (
     | dict.fromkeys(("cam_pos", "cam_quat"), Constants.KINEMATIC | Constants.PRIVATE)
     | {"body_mass": _ALL, "geom_size": Constants.FIXED | Constants.PRIVATE}
 )
-"""Fields that can differ between worlds on every engine, each with the constants derived from the field."""
+"""Fields that can differ between worlds, each with the constants that follow from it."""
 
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
-"""The fields that are attributes of MjModel.opt."""
 
 _COMPUTED = set(
     "body_subtreemass body_invweight0 dof_invweight0 dof_M0 tendon_invweight0 tendon_length0 actuator_acc0 "
@@ -91,13 +89,13 @@ _REASONS = (
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
-"""Fields with elements that must be positive if the nominal values are positive."""
+"""Fields that must be positive if their nominal values are."""
 
 NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "
     "tendon_damping tendon_armature tendon_frictionloss actuator_damping actuator_armature density viscosity".split()
 )
-"""Fields with elements that must not be negative."""
+"""Fields that must not be negative."""
 
 _TYPES = {
     2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
@@ -107,19 +105,19 @@ _TYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class ModelField:
-    """One field of a model that can differ between worlds."""
+    """A model field that can differ between worlds."""
 
     name: str
     shape: tuple[int, ...]
-    """Shape of the field in one world. The axis of the elements of a vector or quaternion is omitted."""
+    """Shape of the field in one world. A vector or quaternion counts as one element."""
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
-    """The constants derived from the field."""
+    """The constants that follow from the field."""
 
     @property
     def size(self) -> int:
-        """Number of floats of the field in one world."""
+        """Number of scalars of the field in one world."""
         return int(np.prod(self.shape, dtype=int)) * wp.types.type_size_in_bytes(self.dtype) // 4
 
     @property
@@ -129,16 +127,11 @@ class ModelField:
 
     @property
     def follows(self) -> bool:
-        """Whether MuJoCo computes the field from other fields of the model."""
+        """Whether MuJoCo computes the field from other fields."""
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
-        """Describe in one line the first value that MuJoCo cannot simulate; None if all values are valid.
-
-        Args:
-            model: The compiled model.
-            rows: A row for each world, (nworld, size).
-        """
+        """Describe the first value that MuJoCo cannot simulate, or return None."""
         nominal = self.value(model).ravel()
         bad = ~np.isfinite(rows)
         if self.name in NOT_NEGATIVE:
@@ -161,23 +154,18 @@ class ModelField:
         )
 
     def value(self, model: mujoco.MjModel) -> np.ndarray:
-        """Get the field's value in a model, float64; an array is a view into the model."""
+        """Get the field's value in a model, float64. An array is a view."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
-    """Write the given values of model fields into a batch of states.
-
-    Args:
-        model: The compiled model.
-        values: Values by field name, each with one row per world or one row for all worlds.
-        columns: Views of the states, (nworld, size), by the names of the model fields that differ between worlds.
+    """Write values of model fields into a batch of states.
 
     Raises:
-        ValueError: A field is unknown or not in ``columns``, or a value has the wrong size.
+        ValueError: A field is unknown or shared by all worlds, or a value has the wrong size.
     """
     for name, value in values.items():
-        field = describe_model_field(model, name)  # raises an error if the name is misspelt
+        field = describe_model_field(model, name)  # refuse a misspelt name
         if name not in columns:
             raise ValueError(
                 f"the model field {name!r} is the same in every world of this environment: make the environment with "
@@ -195,12 +183,12 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
 
 def similar_model_fields(name: str) -> list[str]:
-    """List similarly named fields that can differ between worlds, closest first."""
+    """List similar names of fields that can differ between worlds, the closest first."""
     return difflib.get_close_matches(name, _FIELDS, 3)
 
 
 def is_model_field(name: str) -> bool:
-    """Check whether MjModel or MjModel.opt has an attribute of a given name."""
+    """Return whether MjModel or MjModel.opt has an attribute of this name."""
     return name in _FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
@@ -209,12 +197,12 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
 
     Args:
         model: The compiled model.
-        name: MuJoCo's name of the field. A field is an attribute of MjModel or of MjModel.opt, such as "gravity".
-        varies: Whether to accept only fields that can differ between worlds.
+        name: An attribute of MjModel or MjModel.opt, such as "body_mass" or "gravity".
+        varies: Whether the field must be able to differ between worlds.
 
     Raises:
-        ValueError: There is no field of this name, its values are not floating-point numbers, or it cannot differ
-            between worlds.
+        ValueError: There is no such field, its values are not floating-point numbers, or it cannot differ between
+            worlds.
     """
     if not varies and name not in _FIELDS:
         value: Any = getattr(model, name, None)
@@ -233,7 +221,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     constants = _FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
-    # a scalar becomes an array of one element, so that a task can write it
+    # a task can write a scalar only as an array of one element
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
     return _described(name, shape, constants)
 
@@ -245,11 +233,11 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that cannot differ between worlds if a body is "simple", that is, if its inertial frame is its body frame."""
+"""Fields that cannot differ between worlds if a body's inertial frame is its body frame ("simple" in MuJoCo)."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Raise an error if a field would move the inertial frame of a simple body (``body_simple``).
+    """Refuse to move the inertial frame of a simple body (``body_simple``).
 
     Raises:
         ValueError: The field moves the inertial frame, and the model has a simple body.

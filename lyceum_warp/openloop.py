@@ -1,4 +1,4 @@
-"""Roll out given actions in every world, and compute rewards and terminations."""
+"""Roll out given actions in every world, with rewards and terminations."""
 
 from collections.abc import Iterable, Mapping
 from functools import partial
@@ -28,36 +28,36 @@ from lyceum_warp.world_arrays import memory_columns, own_parts
 
 @document_attributes
 class OpenLoop:
-    """Rolls out an environment's worlds from one or several states under given actions, and stores rewards.
+    """Rolls out an environment's worlds from one or more states under given actions.
 
-    Write ``state`` and ``actions``, call ``run``, and read the other tensors, which are updated in place. Episodes
-    continue to the horizon even after a termination; the caller decides how to treat terminations. The C engine
-    simulates the whole horizon in one native call if this gives exactly the same results and if the task has neither
-    ``control`` nor ``substep``; otherwise it simulates step by step. On the Warp engine, the rollout is one graph.
+    Write ``state`` and ``actions``, call ``run``, and read the other tensors. They are updated in place. Episodes
+    continue after a termination, up to the horizon. The C engine simulates the whole horizon in one native call if the
+    results are exactly the same. Tasks with ``control`` or ``substep`` are simulated step by step. On the Warp engine,
+    the rollout is one graph.
 
     Args:
-        env: Environment of the worlds to roll out; do not use it for anything else.
+        env: Environment of the worlds. Do not use it for anything else.
         horizon: Number of steps.
-        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device, read at every run. By
-            default, each world uses the key in ``state`` and draws the same numbers as with ``env.step``.
-        nominal_model: Whether to simulate with the nominal values of model fields that differ between worlds, instead
-            of the values in ``state``.
-        models: Values for model fields that differ between worlds, by name, each (n, size) float64 on the environment's
-            device. World w uses row w % n instead of the values in ``state``. Every run reads the values again.
-        states: Number of initial states. Each state is the start of nworld / states consecutive worlds.
+        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. Every run reads them. By
+            default, each world draws the same numbers as ``env.step`` from its state.
+        nominal_model: Whether to use the nominal values of model fields that differ between worlds, instead of the
+            values in ``state``.
+        models: Other values for model fields that differ between worlds, by name, each (n, size) float64 on the
+            environment's device. World w uses row w % n. Every run reads the values.
+        states: Number of initial states. Each state starts nworld / states consecutive worlds.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, ``keys`` has the wrong shape, type or device, the
-            number of worlds is not a multiple of the number of states, or the buffers do not fit into memory.
+        ValueError: The environment resets its worlds automatically, ``keys`` does not fit, the number of worlds is not
+            a multiple of the number of states, or the memory is too small.
     """
 
     state: torch.Tensor
-    """The initial state of every world, (state_space.size,) float64; the same tensor as ``states`` if there are several
-    initial states."""
+    """The initial state of every world, (state_space.size,) float64. With several initial states, it is the same tensor
+    as ``states``."""
     states: torch.Tensor
     """The initial states, (states, state_space.size) float64."""
     actions: torch.Tensor
-    """Actions of each step, (horizon, nworld, nact); non-finite actions are replaced by zero."""
+    """Actions of each step, (horizon, nworld, nact). Non-finite actions become zero."""
     reward: torch.Tensor
     """Reward of each step, (horizon, nworld)."""
     terminated: torch.Tensor
@@ -65,11 +65,11 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after the last step by group; the group ``policy`` is ``final_obs``."""
+    """Observations after the last step by group. The group ``policy`` is ``final_obs``."""
     fault: torch.Tensor
-    """Faults of each world as bits of ``Done``, (nworld,) int32; ignore the rewards of a world with a fault."""
+    """Faults of each world as bits of ``Done``, (nworld,) int32. Ignore the rewards of a world with a fault."""
     phases: tuple[Phase, ...]
-    """The phases of ``run``, for callers that add phases to the same graph."""
+    """The phases of ``run``, so that callers can add phases to its graph."""
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,
@@ -98,7 +98,7 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # stepwise rollouts convert the actions in each step, and need no buffer of controls
+            # stepwise rollouts need no controls for the whole horizon
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
@@ -108,7 +108,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # each field has one buffer; the batches before, after and last contain views of the buffer
+            # the batches before, after and last are views of one buffer per field
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:
@@ -144,12 +144,11 @@ class OpenLoop:
             call()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
-        """Turn phases into calls, in as few graphs as the engine allows."""
+        """Turn phases into calls, with as few graphs as possible."""
         return self.worlds.programs.graphs.sequence(phases)
 
     @staticmethod
     def _bytes_per_world(env: Env, horizon: int) -> int:
-        """Estimate the bytes of the buffers per world."""
         fields = [field for field in env.task.fields if field.name in env.task.types]
         numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
         numbers += sum(own_parts(env.task).values())
@@ -169,7 +168,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """List the phases for tasks whose functions ``control`` or ``substep`` need the current state at every call."""
+        """List the phases for tasks with ``control`` or ``substep``, which need the current state."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),
@@ -185,7 +184,6 @@ class OpenLoop:
         return (*phases, Phase("end", partial(self._end, worlds.after)))
 
     def _start(self) -> None:
-        """Write the initial states into the worlds' states, and map all actions to controls."""
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
         if self._nominal_model:
@@ -210,7 +208,6 @@ class OpenLoop:
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
 
     def _overwrite_model(self) -> None:
-        """Overwrite the model fields in every world's state with nominal values."""
         columns, states = self.env.state_space.parts, self.worlds.state
         nominal: Mapping[str, wp.array] = self.env.engine.nominal
         for name, row in nominal.items():
@@ -219,12 +216,11 @@ class OpenLoop:
             wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
-        """Get the states before and after all transitions of the horizon, the parameters, and the actions."""
+        """Get states before and after all transitions, the parameters, and the actions."""
         actions = self._actions.reshape((-1, self._actions.shape[2]))
         return [self._before, self._after, self.worlds.params, actions]
 
     def _advance_memory(self) -> None:
-        """Advance the task's memory over all steps of the horizon."""
         n, kernels = self.env.nworld, self.env.task.kernels
         if kernels.advance_rows is not None:
             rows = (self.horizon + 1) * n
@@ -240,13 +236,11 @@ class OpenLoop:
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        """Compute the rewards and terminations of all transitions of the horizon at once."""
         rows, (*batches, actions) = self.horizon * self.env.nworld, self._transitions()
         args = [*batches, self.worlds.weights, actions, self._reward, self._terminated]
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
-        """Advance the step counters, collect the worlds' faults, and observe the worlds' last states."""
         wp.launch(planning.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
         self._end(self._last)
 
@@ -265,7 +259,6 @@ class OpenLoop:
         launch_worlds(kernels.judge_rows, n, args, device)
 
     def _end(self, batch: object) -> None:
-        """Collect the worlds' faults, and observe the worlds' last states."""
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)

@@ -1,7 +1,7 @@
 """Define the options of an environment and of its physics.
 
-The arguments of ``make``, ``replicate`` and MPPI, the command line, the help texts and the suggestions for misspelt
-names are generated from ``EnvOptions`` and ``PhysicsOptions``. To add an option, add a field to one of the classes.
+The arguments of ``make``, ``replicate`` and MPPI, the command line and the help texts follow from ``EnvOptions`` and
+``PhysicsOptions``. To add an option, add a field to one of these classes.
 """
 
 import dataclasses
@@ -18,7 +18,6 @@ from lyceum_warp.support.docstrings import attribute_docs, document_attributes, 
 from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
-"""Source of a model: a file or an MjSpec."""
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {
@@ -32,11 +31,11 @@ JACOBIANS = {
     "auto": mujoco.mjtJacobian.mjJAC_AUTO,
 }  # fmt: skip
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
-"""Limits that the option ``solver`` accepts, each with its smallest value."""
+"""Limits in the option ``solver``, each with its smallest value."""
 
 
 def _for_engine(default: Any) -> Any:
-    """Make the dataclass field of an option that is passed to the engine's constructor."""
+    """Make the field of an option that goes to the engine's constructor."""
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
@@ -73,15 +72,15 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
-    """Options of the simulation. If an option is None, the setting of the task or the model applies.
+    """Options of the simulation. None means the setting of the task or the model.
 
     Raises:
         ValueError: A value is unknown or out of range.
     """
 
     base: str | None = None
-    """Name of a set of options in the task's ``physics``; other options that are given override the set. "exact" means
-    the options of the task's model."""
+    """Name of a set of options in the task's ``physics``. Other options override this set. "exact" means the options of
+    the task's model."""
     frame_skip: int | None = None
     """Substeps in a step."""
     timestep: float | None = None
@@ -91,25 +90,23 @@ class PhysicsOptions:
     integrator: str | None = None
     """Integrator: euler, rk4, implicit or implicitfast."""
     jacobian: str | None = None
-    """Constraint Jacobian: dense, sparse or auto. The choice of Jacobian affects speed and memory, and affects results
-    only by rounding."""
+    """Constraint Jacobian: dense, sparse or auto. It changes speed and memory, and results only by rounding."""
     impratio: float | None = None
-    """Ratio of a contact's frictional impedance to its normal impedance, for elliptic cones."""
+    """Ratio of frictional to normal impedance of contacts, for elliptic cones."""
     solver: Mapping[str, int] | None = None
-    """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 turns
-    the noslip solver off)."""
+    """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 for no
+    noslip solver)."""
     nconmax: int | None = _for_engine(None)
-    """Average contact capacity per world (Warp engine); the default is twice the peak number of contacts in random
+    """Average number of contacts per world that fit into the Warp engine; by default twice the peak in random
     rollouts."""
     njmax: int | None = _for_engine(None)
-    """Constraint capacity of each world (Warp engine); the default is twice the peak number of constraints in random
-    rollouts, plus room for inactive equality constraints."""
+    """Number of constraints of each world that fit into the Warp engine; by default twice the peak in random rollouts,
+    plus room for inactive equality constraints."""
     deterministic: bool = _for_engine(False)
-    """Make runs on a CUDA device reproducible bit for bit, as runs on the CPU always are. Reproducible runs of hopper,
-    half_cheetah and humanoid take 5 to 18 times as much time and 5 to 7 times as much memory as other runs."""
+    """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, this
+    takes 5 to 18 times as much time and 5 to 7 times as much memory."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         check_kind("base", self.base, str | None, "the name of one of the task's physics, as 'exact'")
         for name, low in (("frame_skip", 1), ("nconmax", 1), ("njmax", 1)):
             _whole(self, name, low)
@@ -129,10 +126,7 @@ class PhysicsOptions:
         return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
-        """Replace ``base`` by the named physics options.
-
-        Args:
-            named: The task's physics options by name.
+        """Replace ``base`` by the physics options of this name.
 
         Raises:
             ValueError: The task has no physics options of this name.
@@ -148,7 +142,7 @@ class PhysicsOptions:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """Options of an environment: the number of worlds, device, engine, and start and end of episodes.
+    """Options of an environment: number of worlds, device, engine, start and end of episodes.
 
     Raises:
         ValueError: A value is of the wrong type or out of range.
@@ -159,42 +153,39 @@ class EnvOptions:
     device: str | None = None
     """cpu (the default), or a CUDA device such as cuda:0."""
     engine: str | Callable[..., Any] = "auto"
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. For an engine of
-    your own, pass a callable with the signature of ``lyceum_warp.engines.base.Engine``."""
+    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU. To use your own
+    engine, pass a callable with the signature of ``lyceum_warp.engines.base.Engine``."""
     nthread: int | None = _for_engine(None)
     """Threads of the C engine; by default all cores."""
     seed: int = 0
     """Seed of the worlds' random streams."""
     first_world: int = 0
-    """Index of this environment's first world, if several processes simulate one batch of worlds. A world's random
-    stream depends on the world's index in the whole batch."""
+    """Index of the first world in a batch that several processes simulate. A world's random stream depends on its index
+    in the batch."""
     autoreset: bool = True
-    """Whether a world starts its next episode within the step that ends an episode. If False, finished worlds keep
-    stepping with ``done`` set until a reset; only worlds with a fault restart at once."""
+    """Whether a world starts its next episode in the step that ends an episode. If False, finished worlds keep stepping
+    with ``done`` set until a reset. Only worlds with a fault restart at once."""
     horizon: int | None = None
-    """Steps after which an episode is truncated, or 0 for no limit; by default the task's horizon."""
+    """Steps after which an episode is truncated, or 0 for never; by default the task's horizon."""
     graphs: bool = True
-    """Whether kernel launches are captured as graphs and replayed. Results without graphs are the same; turn graphs off
-    to debug."""
+    """Whether to capture kernel launches as graphs and replay them. Turn graphs off to debug: results stay the same."""
     model: ModelSource | None = None
     """File or MjSpec that replaces the task's model."""
     fields: Collection[str] = ()
-    """Names of additional fields that ``env.field`` returns."""
+    """Further fields that ``env.field`` returns."""
     dynamics: Collection[str] = ()
-    """Model fields that ``env.set_dynamics`` may set in each world, in addition to the fields that the task
-    randomizes."""
+    """Model fields that ``env.set_dynamics`` may set, besides the fields that the task randomizes."""
     physics: PhysicsOptions = PhysicsOptions()
-    """Physics options, or the name of a set of options in the task's ``physics``; "exact" means the options of the
-    task's model."""
+    """Physics options, or the name of options in the task's ``physics``. "exact" means the options of the task's
+    model."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         for name, low in (("nworld", 1), ("nthread", 0), ("seed", 0), ("first_world", 0), ("horizon", 0)):
             _whole(self, name, low)
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # binding the task raises a clearer error for an MjModel
+        # an MjModel gets a clearer error when the task is bound
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
@@ -207,18 +198,13 @@ class EnvOptions:
 
     @classmethod
     def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
-        """Split keyword arguments into options and task parameters.
-
-        Args:
-            words: The keyword arguments.
-            base: The options to which the keywords are applied; by default ``EnvOptions()``.
-        """
+        """Split keyword arguments into options and task parameters."""
         rest = {name: value for name, value in words.items() if name not in OPTIONS}
         options = {name: value for name, value in words.items() if name in OPTIONS}
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """Copy the options with changes by name, including physics options."""
+        """Copy the options with changes by name."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:
@@ -226,12 +212,12 @@ class EnvOptions:
         return dataclasses.replace(self, **others)
 
     def for_engine(self) -> dict[str, Any]:
-        """Get the options of the engine's constructor, by name."""
+        """Get the options for the engine's constructor, by name."""
         both = [(options, field) for options in (self, self.physics) for field in dataclasses.fields(options)]
         return {field.name: getattr(options, field.name) for options, field in both if field.metadata.get("engine")}
 
     def given(self) -> dict[str, Any]:
-        """Get the options that differ from their defaults, by name, including physics options."""
+        """Get the options that differ from their defaults, by name, including those of the physics."""
         own = given_values(self)
         own.pop("physics", None)
         return own | self.physics.given()
@@ -246,34 +232,29 @@ def _physics(given: Any) -> PhysicsOptions:
 
 _PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions) if field.name != "base")
 OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
-"""Names of all options, in the order of the help text."""
+"""Names of all options."""
 
 _DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
 
 OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
-"""Docstrings of all options, as the body of an ``Args:`` section."""
+"""Docstrings of all options, for an ``Args:`` section."""
 
 _OTHER_WORDS = {
     "num_envs": "nworld", "n_envs": "nworld", "xml_file": "model", "max_episode_steps": "horizon", "record": "graphs",
     "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
     "noslip_iterations": "solver={'noslip_iterations': ...}",
 }  # fmt: skip
-"""Map names of options in other packages and earlier releases to names in this release."""
+"""Names of options in other packages and earlier releases, with the names in this release."""
 
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
-    """Return a hint "did you mean ...?" for an unknown name, or "" if no known name is similar.
-
-    Args:
-        word: The unknown name.
-        others: Known names in addition to the options.
-    """
+    """Return "did you mean ...?" for an unknown name, or "" if no name is similar."""
     close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
     return f"did you mean {' or '.join(close)}?" if close else ""
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """Make a function's signature with a keyword argument for each option instead of ``**words``."""
+    """Give a function's signature a keyword argument for each option instead of ``**words``."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

@@ -13,18 +13,18 @@ from lyceum_warp.model_fields import ModelField
 
 @dataclasses.dataclass(frozen=True)
 class Space:
-    """Vector of one world with named parts, a dtype and optional bounds.
+    """A world's vector with named parts, a dtype and optional bounds.
 
-    A scalar has no axis. An environment's arrays have an additional leading axis over worlds.
+    A scalar has no axis. Arrays of an environment have another axis in front, over worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
-    """Columns of each named part, in order."""
+    """Columns of each part, in order."""
     dtype: torch.dtype = torch.float32
     low: np.ndarray | None = None
-    """Lower bounds, of shape ``shape``; None without bounds."""
+    """Lower bounds, of shape ``shape``."""
     high: np.ndarray | None = None
-    """Upper bounds, of shape ``shape``; None without bounds."""
+    """Upper bounds, of shape ``shape``."""
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
@@ -37,7 +37,7 @@ class Space:
 
     @property
     def size(self) -> int:
-        """Length of the vector; 1 for a scalar."""
+        """Length of the vector, or 1 for a scalar."""
         return max((part.stop for part in self.parts.values()), default=1)
 
     @property
@@ -47,7 +47,7 @@ class Space:
 
     @property
     def columns(self) -> list[str]:
-        """Name of each column: the part's name, or ``name[i]`` if the part has several columns."""
+        """Names of the columns: the part's name, or ``name[i]`` if the part has several columns."""
         return [
             name if part.stop - part.start == 1 else f"{name}[{i}]"
             for name, part in self.parts.items()
@@ -55,28 +55,28 @@ class Space:
         ]
 
     def part_at(self, column: int) -> str:
-        """Get the name of the part that contains a column."""
+        """Get the name of the part at a column."""
         return next(name for name, part in self.parts.items() if part.start <= column < part.stop)
 
     def split(self, values: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Get views of the parts of (..., size) values, by name."""
+        """Split values, (..., size), into views of the parts."""
         return {name: values[..., part] for name, part in self.parts.items()}
 
 
 COUNTERS = ("step", "key", "episode", "done_reason")
-"""Counters in a state: steps since the reset, key of the random stream, episode number, bits of ``Done``."""
+"""Counters in a state: steps since the reset, key of the random stream, number of the episode, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
-"""Parts of a state that come neither from MuJoCo nor from the task's memory."""
+"""Parts of a state from neither MuJoCo nor the task's memory."""
 
 
 def action_space(
     model: mujoco.MjModel, action_range: tuple[float, float] | None, actions: Mapping[str, int] | None = None
 ) -> Space:
-    """Make the space of actions: by default controls, bounded by ``action_range`` or by the controls' ranges.
+    """Make the space of actions, which are controls unless the task declares ``actions``.
 
-    An actuator may have several controls or none. An actuator without a name is named after its index. If the task
-    declares ``actions``, these parts replace the controls, and have bounds only if ``action_range`` is given.
+    An actuator without a name is named after its index. Controls are bounded by ``action_range`` or by their ranges.
+    Other actions are bounded only by ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -88,12 +88,12 @@ def action_space(
 
 
 def _controls(model: mujoco.MjModel) -> dict[str, int]:
-    """Count the controls of each actuator by name, in the order of the controls."""
+    """Count the controls of each actuator, by name."""
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # the name must differ from all names of actuators
+        while not given[i] and name in given:  # do not use the name of another actuator
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])
@@ -101,10 +101,10 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:
-    """Compute the scale and the offset that map actions to controls, (nu, 2).
+    """Compute scales and offsets from actions to controls, (nu, 2).
 
     Raises:
-        ValueError: A control has no range, although ``action_range`` is given.
+        ValueError: ``action_range`` is given, but a control has no range.
     """
     if action_range is None:
         return np.tile((1.0, 0.0), (model.nu, 1))
@@ -121,21 +121,14 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Get the lower and upper bound of each control, (nu, 2); infinite without a bound in the model."""
+    """Get the bounds of each control, (nu, 2). They are infinite if the model has none."""
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 
 def state_space(
     model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
 ) -> Space:
-    """Make the space of states: integration state in MuJoCo's order, snapshots, model fields, counters, other parts.
-
-    Args:
-        model: The compiled model.
-        snapshots: Fields that states include in addition to the integration state.
-        dynamics: Model fields that differ between worlds.
-        own: Additional parts and their sizes, such as the task's memory.
-    """
+    """Make the space of states: integration state in MuJoCo's order, snapshots, model fields, counters, other parts."""
     sizes = {}
     names = {component.value: name for name, component in STATE_FIELDS.items()}
     components = mujoco.mjtState.mjSTATE_INTEGRATION.value

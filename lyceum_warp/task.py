@@ -1,4 +1,4 @@
-"""Define the base class of tasks, and the table of task functions."""
+"""Define the base class of tasks and the table of task functions."""
 
 import dataclasses
 import inspect
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     T = TypeVar("T")
 
     class Row(Generic[T]):
-        """Values of a field in one world; inside a kernel, a one-dimensional Warp array."""
+        """One world's values of a field. Inside a kernel, it is a one-dimensional Warp array."""
 
         shape: tuple[int, ...]
 
@@ -37,39 +37,38 @@ class TaskFunction:
 
     name: str
     arguments: str
-    """The arguments, in the syntax of a task's file."""
+    """The arguments, written as in a task's file."""
     result: type | None
-    """Type of the function's result: float, bool, or None for a function that writes into its arguments."""
+    """Type of the result: float, bool, or None for a function that writes into its arguments."""
     about: str
-    """Purpose and default of the function, for the documentation."""
+    """Purpose and default, for the documentation."""
     default: str | None = None
     """Body of the default function; None if there is no default."""
     optional: str = ""
-    """Optional last arguments, in the syntax of a task's file."""
+    """Last arguments that a task may omit, written as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Maps each argument to the kind of fields that the function may write: "inputs", "memory", "lasting" (lasting
-    memory and the model), or "start" (every field that a reset may write). A function may always write into rows for
-    results, such as ``obs``."""
+    """What the function may write into each argument: "inputs", "memory", "lasting" (lasting memory and the model), or
+    "start" (every field that a reset may write). Arguments for results, such as ``obs``, are always writable."""
 
     @property
     def signature(self) -> str:
-        """Get the first line of the function's definition, without ``def``."""
+        """Get the first line of the function's definition without ``def``."""
         return f"{self.name}({self.arguments})" + (f" -> {self.result.__name__}" if self.result else "")
 
     @property
     def argument_names(self) -> tuple[str, ...]:
-        """List the names of all arguments, in order."""
+        """List the names of all arguments."""
         arguments = ", ".join(filter(None, (self.arguments, self.optional)))
         return tuple(argument.partition(": ")[0] for argument in arguments.split(", "))
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """List the annotations of the required arguments, in order."""
+        """List the annotations of the required arguments."""
         return _kinds(self.arguments)
 
     @property
     def all_kinds(self) -> tuple[str, ...]:
-        """List the annotations of all arguments, in order."""
+        """List the annotations of all arguments."""
         return self.kinds + _kinds(self.optional)
 
 
@@ -131,18 +130,17 @@ FUNCTIONS = {
                      "``env.update_shared`` calls this function. Default: no change."),
     )
 }  # fmt: skip
-"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` use this table of
-functions."""
+"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` use this table."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
-"""Arguments into which a function writes its results; each is one world's row of an array."""
+"""Arguments for results: each is one world's row of an array."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Kinds of memory that World declares. Each world has one row of floats per kind."""
+"""Kinds of memory that World declares, with one row of floats per world and kind."""
 
 GROUP_PREFIX = "observe_"
-"""Prefix of functions that write a group of observations; ``observe_critic`` writes the group ``critic``."""
+"""Prefix of functions that write a group of observations: ``observe_critic`` writes the group ``critic``."""
 
 
 def observer_name(group: str) -> str:
@@ -151,7 +149,7 @@ def observer_name(group: str) -> str:
 
 
 def _document_functions(cls: type["Task"]) -> type["Task"]:
-    """Decorate a class by inserting the table of functions into its docstring."""
+    """Insert the table of functions into a class's docstring."""
     rows = []
     for function in FUNCTIONS.values():
         rows += [f"    {function.signature}", *textwrap.wrap(function.about, 108, initial_indent=" " * 8,
@@ -162,55 +160,54 @@ def _document_functions(cls: type["Task"]) -> type["Task"]:
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """Part of a world's memory or of an observation; made by ``memory``, ``lasting_memory`` or ``part``."""
+    """A part of a world's memory or of an observation."""
 
     kind: str
-    """Kind of the part: one of ``MEMORIES``, or "obs"."""
+    """One of ``MEMORIES``, or "obs"."""
     size: int | str
-    """Number of elements, or the name of a table in Params with one row per element."""
+    """Number of elements, or the name of a table in Params with a row per element."""
 
 
 def memory(size: int | str = 1) -> Any:
-    """Declare task memory; use the result as a default in World.
+    """Declare memory of a task, as a default in World.
 
-    ``advance`` or ``substep`` writes the memory, and a reset clears it. Task memory belongs to the state. The field's
+    ``advance`` or ``substep`` writes the memory, and a reset clears it. The memory is part of the state. The field's
     type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
-        size: Number of elements, or the name of a table in Params with one row per element.
+        size: Number of elements, or the name of a table in Params with a row per element.
     """
     return Part("memory", size)
 
 
 def lasting_memory(size: int | str = 1) -> Any:
-    """Declare memory that outlives episodes, such as a curriculum's level; use the result as a default in World.
+    """Declare memory that outlives episodes, such as a curriculum's level, as a default in World.
 
-    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``), and ``startup`` may
-    then write it.
+    It is cleared only when a world's random stream starts (``rand_reset(seed=...)``). ``startup`` may then write it.
 
     Args:
-        size: Number of elements, or the name of a table in Params with one row per element.
+        size: Number of elements, or the name of a table in Params with a row per element.
     """
     return Part("lasting_memory", size)
 
 
 def part(size: int | str = 1) -> Any:
-    """Declare a part of an observation group, of Shared or of Sums; use the result as a default in the struct.
+    """Declare a part of an observation group, of Shared or of Sums, as a default in the struct.
 
     Args:
-        size: Number of elements, or the name of a table in Params with one row per element.
+        size: Number of elements, or the name of a table in Params with a row per element.
     """
     return Part("obs", size)
 
 
 class Element(int):
-    """Name of an element of the model, made by ``site`` and similar functions; the index replaces the name."""
+    """Name of an element of the model, from ``site`` and similar functions. The element's index replaces the name."""
 
     field: str
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """Make an integer with the element's name; the integer's value is not used."""
+        """Make an integer with the element's name. The integer's value is not used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
@@ -331,20 +328,20 @@ def mocap(body: str) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class FromModel:
-    """Parameter that is computed from the compiled model; made by ``from_model``."""
+    """A parameter that is computed from the compiled model; see ``from_model``."""
 
     function: Callable[[mujoco.MjModel, Any], Any]
 
 
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
-    """Make a default for Params: a function computes the parameter from the compiled model and other parameters.
+    """Make a default for Params that a function computes from the compiled model and other parameters.
 
-    ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the robot. The
-        parameter is recomputed if another parameter changes, unless a value was given explicitly.
+    For example, ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the
+    robot. The parameter is computed again when another parameter changes, unless the user gave it a value.
 
     Args:
-        function: Function of two arguments: the MjModel, and an object with parameters as attributes. These attributes
-            are the parameters with ordinary defaults, and the computed parameters that Params declares earlier.
+        function: Function of the MjModel and of an object with parameters as attributes. The attributes are all
+            parameters with ordinary defaults, and computed parameters that Params declares earlier.
     """
     return FromModel(function)
 
@@ -352,7 +349,7 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
-    """Settings of a task for MPPI: settings of the planner, and options and parameters of the planner's worlds.
+    """Settings of a task for MPPI: settings of the planner, and options and parameters of its worlds.
 
     Raises:
         ValueError: A part is not a dict.
@@ -363,11 +360,10 @@ class Planning:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the planner's worlds, by their names in ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by their names in the task's ``Params``. If MPPI has a value function, the
-    parameters in ``Planning`` are ignored, because the function was fitted to the rewards of the unchanged task."""
+    """Parameters of the planner's worlds, by their names in the task's ``Params``. They are ignored if MPPI has a value
+    function, which was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
-        """Check the type of every part."""
         for field in dataclasses.fields(self):
             if not isinstance(part := getattr(self, field.name), Mapping):
                 raise ValueError(f"{field.name} of lw.Planning must be a dict, not {part!r}")
@@ -376,7 +372,7 @@ class Planning:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Training:
-    """A task's settings for ``lyceum-warp train``; flags override the settings.
+    """A task's settings for ``lyceum-warp train``. Flags override them.
 
     Raises:
         ValueError: ``settings`` is not a dict.
@@ -385,13 +381,12 @@ class Training:
     algorithm: str = "npg"
     """Name of the algorithm: npg, ppo or sac."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the algorithm, by the names of ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. These
-    hyperparameters do not apply if a flag chooses another algorithm."""
+    """Hyperparameters of the algorithm, by their names in ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. They
+    are ignored if a flag chooses another algorithm."""
     iterations: int = 100
     """Number of iterations."""
 
     def __post_init__(self) -> None:
-        """Check the type of ``settings``."""
         if not isinstance(self.settings, Mapping):
             raise ValueError(f"settings of lw.Training must be a dict, not {self.settings!r}")
 
@@ -401,138 +396,132 @@ class Training:
 class Task:
     """Base class of tasks: a model, the fields that functions read, and a few functions of one world.
 
-    A subclass names its model and the parts of its observation. The subclass's module has two Warp structs and the
-    task's functions. The struct ``World`` lists the fields that the functions read. The struct ``Params`` lists the
-    keyword arguments of ``make``, with defaults; its fields ``dt`` and ``substep_dt`` are filled with the seconds of a
-    step and a substep. Each function is a ``wp.func``. Structs and functions may also be attributes of the class.
+    A subclass names its model and the parts of its observation. Its module has two Warp structs and the task's
+    functions. Both may also be attributes of the class. The struct ``World`` lists the fields that the functions read.
+    The struct ``Params`` lists the keyword arguments of ``make`` with defaults. Its fields ``dt`` and ``substep_dt``
+    are the seconds of a step and a substep. Each function is a ``wp.func``.
 
-    ``World`` lists fields of MjData, such as ``qpos`` and ``site_xpos``, and fields of MjModel, such as ``body_mass``
-    and ``geom_friction``, under MuJoCo's names. A model field differs between worlds, and belongs to the state, if
-    ``startup``, ``initialize``, ``randomize`` or ``event`` writes it; all worlds share the other model fields.
-    ``World`` also declares the task's memory: ``air_time: Row[float] = lw.memory(4)``, or ``lw.lasting_memory(4)``.
+    ``World`` lists fields of MjData and MjModel by MuJoCo's names, such as ``qpos``, ``site_xpos`` and ``body_mass``. A
+    model field differs between worlds, and is part of the state, if ``startup``, ``initialize``, ``randomize`` or
+    ``event`` writes it. Otherwise all worlds share it. ``World`` also declares memory: ``air_time: Row[float] =
+    lw.memory(4)``, or ``lw.lasting_memory(4)``.
 
-    A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``; the functions then
-    get the element's index. ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
-    ``lw.actuator``, ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap`` work
-    likewise. A field of type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or a similar type is a table that all worlds
-    share, such as a motion to follow. The default of a table is a nested list or an array. A table of named elements is
-    declared by ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")``, or with ``lw.bodies``, ``lw.geoms``,
-    ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` or ``lw.sensors``. ``lw.from_model`` computes a default
-    from the compiled model.
+    A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``. Functions get the
+    element's index. There are also ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
+    ``lw.actuator``, ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap``. A field of
+    type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or similar is a table that all worlds share, such as a motion to
+    follow. Its default is a nested list or an array. ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")`` is a
+    table of elements; ``lw.bodies``, ``lw.geoms``, ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` and
+    ``lw.sensors`` work in the same way. ``lw.from_model`` computes a default from the compiled model.
 
-    Functions:
-    {functions}
+    Functions: {functions}
 
-    The argument ``s`` holds one world's fields in the current state, ``s0`` in the state before the step, and ``s1`` in
-    the state after the step. In these arguments, fields of the position and velocity stages belong to the state itself;
-    fields of the acceleration stage (forces, accelerations) come from the last substep. A sensor belongs to the stage
-    that computes the sensor's quantity. Controls are clipped to the model's ranges, but ``reward`` gets the unclipped
-    action. Pass the argument ``rng``, the world's random stream, to ``lw.uniform`` and ``lw.normal``.
+    The argument ``s`` has one world's fields in the current state, ``s0`` before the step, and ``s1`` after the step.
+    Fields of the position and velocity stages belong to this state. Fields of the acceleration stage (forces,
+    accelerations) come from the last substep. A sensor belongs to the stage that computes its quantity. Controls are
+    clipped to the model's ranges, but ``reward`` gets the unclipped action. The argument ``rng`` is the world's random
+    stream, for ``lw.uniform`` and ``lw.normal``.
 
-    A function may write the following fields if ``World`` lists them; any other write is refused:
+    A function may write only the following fields, and only if ``World`` lists them:
 
     - ``control``: the inputs xfrc_applied, qfrc_applied, mocap_pos, mocap_quat and userdata. An input keeps its value
       until the next write or reset.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting memory
-      and model fields. Every reset restores the nominal values of model fields before ``initialize`` runs, so that
-      random changes do not accumulate over episodes. ``initialize`` and ``randomize`` must not read derived fields
-      (``xpos``, ``site_xpos``, ``sensordata``), which are computed afterwards.
-    - ``startup``: model fields and lasting memory. Resets do not change these values.
+      and model fields. Every reset first restores the nominal values of model fields, so random changes do not
+      accumulate. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+      ``sensordata``), because these are computed afterwards.
+    - ``startup``: model fields and lasting memory. Resets do not change them.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    ``reject`` is called before the substeps of ``settle``. ``substep`` is not called in the substeps of ``settle``.
+    A reset calls ``reject`` before the substeps of ``settle``, and does not call ``substep`` during them.
 
-    An event runs after the reward and the termination of a step and before the next observation, but not in worlds that
-    restart. Open-loop rollouts and planners run no events.
+    An event runs after the reward and the termination of a step, and before the next observation. It does not run in
+    worlds that restart. Open-loop rollouts and planners run no events.
 
-    Quaternions in fields have MuJoCo's order w, x, y, z, and the type ``Row[lw.quat]``. Warp's own quaternion functions
+    Quaternions in fields have MuJoCo's order w, x, y, z and the type ``Row[lw.quat]``. Warp's quaternion functions
     expect the order x, y, z, w and refuse ``lw.quat``: use ``lw.quat_rotate``, ``lw.quat_mul``,
     ``lw.quat_from_axis_angle`` and others.
     """
 
     model: ClassVar[Any]
-    """The model: a file (relative to the task's file, or one of gymnasium's models), ``lw.package_model(...)`` for a
-    file of another package, an MjSpec, or a static method without arguments that returns any of these."""
+    """The model: a file (relative to the task's file, or one of gymnasium's models), ``lw.package_model(...)``, an
+    MjSpec, or a static method without arguments that returns one of these."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
-    """Parts of the observation and their sizes, in order, such as ``{"position": 5, "velocity": 6}``; or a static
-    method that computes the sizes from the Params. A task may have several groups of observations, such as ``{"policy":
-    {"position": 5}, "critic": {"position": 5, "mass": 1}}``: ``observe`` writes the group ``policy`` (``env.obs``).
-    ``observe_critic`` has the same arguments, and writes the group ``critic``. Omit ``obs`` if the last argument of
-    ``observe`` is a Warp struct with the default ``lw.part(size)`` for each field."""
+    """Parts of the observation and their sizes, such as ``{"position": 5, "velocity": 6}``, or a static method that
+    computes them from the Params. A task may have several groups of observations, such as ``{"policy": {"position": 5},
+    "critic": {"position": 5, "mass": 1}}``. Then ``observe`` writes the group ``policy`` (``env.obs``).
+    ``observe_critic`` has the same arguments and writes the group ``critic``. Omit ``obs`` if the last argument of
+    ``observe`` is a Warp struct whose fields have the default ``lw.part(size)``."""
     rewards: ClassVar[Mapping[str, float]] = {}
-    """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``, in place of
-    ``reward``. A term is a function that returns a float; it belongs to the task's module. The arguments of a term are
-    found by name: ``s0``, ``action``, ``s1`` (or ``s``), ``p``, the result of another function, a parameter, or a field
-    of World. The reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params``
-    change weights. Each term, multiplied by its weight and dt, is also a metric. ``env.task.reward_text`` shows the
-    generated source."""
+    """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``. They replace
+    ``reward``. A term is a function in the task's module that returns a float. Its arguments are found by name. A name
+    may be ``s0``, ``action``, ``s1`` (or ``s``) or ``p``, another function, a parameter, or a field of World. The
+    reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params`` change weights.
+    Each term times its weight and dt is also a metric. ``env.task.reward_text`` is the generated source."""
     terminations: ClassVar[tuple[str, ...]] = ()
-    """Names of functions that end the episode if any of them returns True, in place of ``terminated``. The functions
-    may take the arguments ``s`` and ``p``, and arguments that are found by name, as in terms. Each function is also a
-    metric, which is 1 if the function returns True after the step, and otherwise 0."""
+    """Names of functions that end the episode if one of them returns True. They replace ``terminated``. Their arguments
+    are ``s``, ``p`` and others that are found by name, as in terms. Each function is also a metric: 1 if it returns
+    True after the step, and 0 otherwise."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. If the task has no ``measure``, each name is the name of a function
-    that returns a float or a bool, and takes arguments as a term does."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, these are functions that return a float or a
+    bool and take arguments as a term does."""
     horizon: ClassVar[int] = 1000
-    """Number of steps after which an episode is truncated; 0 means never."""
+    """Number of steps after which an episode is truncated, or 0 for never."""
     success_steps: ClassVar[int] = 1
-    """Number of successive steps that must end in success before ``env.success`` is True. If ``success_steps`` is more
-    than 1, the state has a part ``success_steps`` with the current count; a reset clears the count."""
+    """Number of successes in a row before ``env.success`` is True. If it is more than 1, the state has a part
+    ``success_steps`` with the current count, which a reset clears."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values left by ``mj_step``, which lag one substep behind the state, as in some Gymnasium
+    """Fields that keep the values from ``mj_step``, which are one substep older than the state, as in some Gymnasium
     tasks."""
     cleared: ClassVar[tuple[str, ...]] = ()
-    """Fields of the last substep, such as contact forces, which a reset must clear before ``initialize`` runs. For all
-    other fields of the last substep, a forward pass computes the values in the worlds that restart."""
+    """Fields of the last substep, such as contact forces, that a reset clears before ``initialize``. A forward pass
+    computes all other fields in worlds that restart."""
     actions: ClassVar[Mapping[str, int | str] | None] = None
-    """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls; ``control``
-    then converts actions to inputs. A size may be the name of a table in Params; the part then has one number per row
-    of the table. If ``actions`` is None, an action has one number for each control."""
+    """Parts of an action and their sizes, such as ``{"speed": 1, "turn": 1}``, if actions are not controls. ``control``
+    converts them. A size may be the name of a table in Params. The part then has one number per row. With None, an
+    action has one number for each control."""
     action_range: ClassVar[tuple[float, float] | None] = None
-    """The range of actions. The default ``control`` scales this range to the model's control ranges. If
-    ``action_range`` is None, actions are not scaled; they are unbounded if the task declares ``actions``."""
+    """The range of actions. The default ``control`` scales it to the model's control ranges. With None, actions are not
+    scaled, and are unbounded if the task declares ``actions``."""
     keyframe: ClassVar[str | None] = None
-    """Name of the model's keyframe to which ``reset`` sets the state before ``initialize``; None means ``qpos0``."""
+    """Name of the keyframe that a reset starts from before ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If it accepts none of them, the
-    reset uses the last one."""
+    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If it accepts none, the reset
+    uses the last one."""
     settle: ClassVar[int] = 0
-    """Number of substeps that are simulated from an initial state before the first observation of the episode, so that
-    the objects come to rest. These substeps use the initial state's controls, and do not call ``substep``. The
-    episode's time starts at 0 after these substeps."""
+    """Number of substeps that are simulated before the first observation of an episode, so that objects come to rest.
+    They use the initial state's controls and do not call ``substep``. The episode's time starts afterwards."""
     gymnasium: ClassVar[str | None] = None
-    """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5"; None without such an
-    environment. Model, observation, reward, termination, reset and parameters are the same as in that environment.
-    Subclasses do not inherit this attribute."""
+    """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5". Model, observation, reward,
+    termination, reset and parameters are the same as there. Subclasses do not inherit this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of a site or body. For a planner's samples, the viewer draws the path of this site or body. If None, the
-    viewer draws the path of the centre of mass if the robot has a floating base, or else of the end of the arm."""
+    """Name of a site or body whose path the viewer draws for a planner's samples. By default, it draws the path of the
+    centre of mass if the robot has a floating base, or else of the end of the arm."""
     mirror: ClassVar[Any] = None
-    """The task's mirror image, for learning symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model,
-    p)`` that returns an ``lw.Mirror``. None means that the task has no mirror image."""
+    """The task's mirror image, for symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that
+    returns an ``lw.Mirror``."""
     physics: ClassVar[Mapping[str, PhysicsOptions]] = {}
-    """Physics options by name, such as ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}`` for ``lw.make(task,
-    physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""
+    """Physics options by name. For example, ``{"fast": lw.PhysicsOptions(integrator="implicitfast")}`` is for
+    ``lw.make(task, physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # World, Params and the Warp functions of the task's module, as they were when the class was defined
+    # World, Params and the Warp functions of the module when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Change the task's model, or the model passed to ``make``, before compilation. By default, nothing changes."""
+        """Change the task's model, or the model passed to ``make``, before it is compiled."""
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return metadata for ONNX files as JSON values by name, such as gains that a robot needs to run a policy.
+        """Return metadata for ONNX files as JSON values by name, such as gains that a robot needs.
 
-        By default, the metadata are empty. The argument ``model`` is the compiled model, and ``p`` has the parameters
-        as attributes.
+        The argument ``model`` is the compiled model, and ``p`` has the parameters as attributes.
         """
         return {}
 
@@ -540,7 +529,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # store a copy, because a later cell of a notebook may define another task with the same names
+        # a later cell of a notebook may define another task with the same names
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

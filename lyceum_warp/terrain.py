@@ -1,4 +1,4 @@
-"""Make rough ground as a height field of patches with increasing difficulty, for models and for kernels."""
+"""Make rough ground from a height field with patches of increasing difficulty."""
 
 import dataclasses
 import difflib
@@ -12,9 +12,9 @@ import numpy as np
 from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
-"""Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the coordinates
-of the points relative to the patch's centre. The heights and both coordinates are arrays (n, n) in m. The outline of a
-patch is set to 0 afterwards, so that patches meet without a step."""
+"""Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the points'
+coordinates relative to the patch's centre. Heights and coordinates are arrays (n, n) in m. The outline of a patch is
+then set to 0, so that patches meet without a step."""
 
 _PLATFORM = 1.0
 """Half the side of the flat square at the centre of a patch, in m."""
@@ -24,7 +24,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from the outline of a patch, in m; it stays constant on the flat platform."""
+    """Compute the distance of points from a patch's outline, in m. It is constant on the flat platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -83,7 +83,7 @@ _KINDS: dict[str, tuple[Shape, float]] = {
     "stairs_up": (_stairs, -0.2), "stairs_down": (_stairs, 0.2),
     "steps": (_steps, 0.2), "rough": (_rough, 0.08), "waves": (_waves, 0.2), "stones": (_stones, 0.4),
 }  # fmt: skip
-"""Shapes of patches by kind, each with the value of ``amount`` at difficulty 1."""
+"""Shapes of patches by name, each with its ``amount`` at difficulty 1."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Terrain:
     """Rough ground: a grid of square patches. Difficulty increases along y, and each column has one kind of patch.
 
     The difficulty of level i is (i + 1) / ``levels``. A patch depends only on the seed and on the patch's level and
-    column. All patches have height 0 along their outline, and a flat border surrounds all patches.
+    column. Patches have height 0 along their outline, and a flat border surrounds them.
 
     =================== ======================================================== ===================
     kind                ground around the middle of a patch                      at difficulty 1
@@ -107,29 +107,23 @@ class Terrain:
     """
 
     kinds: Mapping[str | Shape, int]
-    """Kinds of patches, in order, each with a number of columns. A kind is a name from the table, or a function
-    ``shape(x, y, difficulty, rng)`` that returns the heights of a patch, (n, n) in m. The arguments x and y are the
-    coordinates of the points relative to the patch's centre, (n, n)."""
+    """Kinds of patches, each with a number of columns. A kind is a name from the table or a function ``shape(x, y,
+    difficulty, rng)`` that returns the heights of a patch, (n, n) in m. Its arguments x and y are the points'
+    coordinates relative to the patch's centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
-    """Side of a patch, in m; a multiple of ``resolution``."""
+    """Side of a patch in m, a multiple of ``resolution``."""
     resolution: float = 0.1
-    """Distance between neighbouring points of the field, in m. A vertical wall becomes a slope of the width
-    ``resolution``."""
+    """Distance between points of the field, in m. A vertical wall becomes a slope of this width."""
     border: float = 4.0
-    """Width of the border, in m; a multiple of ``resolution``."""
+    """Width of the border in m, a multiple of ``resolution``."""
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind, instead of the sizes in the table."""
+    """Sizes at difficulty 1, by kind, that replace those in the table."""
 
     def __post_init__(self) -> None:
-        """Check the description.
-
-        Raises:
-            ValueError: A kind is unknown, a number is not positive, or a length is not a multiple of the resolution.
-        """
         for name in [*self.kinds, *self.scale]:
             if isinstance(name, str) and name not in _KINDS:
                 close = difflib.get_close_matches(name, _KINDS, 3) or _KINDS
@@ -153,7 +147,7 @@ class Terrain:
 
     @functools.cached_property
     def heights(self) -> np.ndarray:
-        """Compute the heights of all points, (points along y, points along x) in m."""
+        """Compute all heights, (points along y, points along x) in m."""
         cells, edge = self._cells, round(self.border / self.resolution)
         found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
         for level in range(self.levels):
@@ -166,9 +160,9 @@ class Terrain:
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
-        """Compute the patches' centres relative to the plane that the field replaces, (levels, columns, 3) in m.
+        """Compute the patches' centres, relative to the plane that the field replaces, (levels, columns, 3) in m.
 
-        The z coordinate of a centre is the greatest height within 0.5 m of the centre.
+        The z coordinate is the greatest height within 0.5 m of the centre.
         """
         cells, edge, around = self._cells, round(self.border / self.resolution), round(0.5 / self.resolution)
         around = min(around, cells // 2)
@@ -182,13 +176,13 @@ class Terrain:
     def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
         """Add the ground to a model in place of the world's plane.
 
-        The plane becomes the height field and keeps its name, friction and material; without a plane, the model gets a
-        geom called ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners
-        have height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras
-        depend, does not change.
+        The plane becomes the height field, with its name, friction and material. Without a plane, the model gets a geom
+        called ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners have
+        height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend,
+        does not change.
 
         Args:
-            spec: The model, which is changed in place, for example in a task's ``edit_model``.
+            spec: The model. It is changed in place, for example in a task's ``edit_model``.
             name: Name of the height field.
 
         Raises:
@@ -211,16 +205,13 @@ class Terrain:
 
     @property
     def _cells(self) -> int:
-        """Return the number of intervals between points along the side of a patch."""
         return round(self.patch / self.resolution)
 
     @property
     def _corner(self) -> np.ndarray:
-        """Return the corner of the first patch, (2,) in m."""
         return -self.patch * np.array([len(self.columns) // 2, self.levels // 2])
 
     def _patch(self, level: int, column: int) -> np.ndarray:
-        """Compute the heights of one patch, (n, n) in m."""
         kind, difficulty = self.columns[column], (level + 1) / self.levels
         side = self.resolution * (np.arange(self._cells + 1) - self._cells / 2)
         x, y = np.meshgrid(side, side)
@@ -242,8 +233,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
-        ValueError: The model has no height field of this name, or the height field does not belong to exactly one fixed
-            and upright geom.
+        ValueError: There is no such height field, or it does not belong to exactly one geom that is fixed and upright.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:
@@ -272,13 +262,13 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 def height_field(name: str) -> Any:
     """Make a default for Params: the table of a model's height field.
 
-    Pass the table to ``lw.ground_height`` and ``lw.height_scan``. The table has the shape (1 + points along y, 1 +
-    points along x). The table's first row has the x coordinates of the points, and the first column has their y
-    coordinates. All other elements are heights z. Coordinates are in the world's frame, in m. All worlds share the
-    table. Declare the table as in ``ground: wp.array2d[float] = lw.height_field("terrain")``.
+    Pass it to ``lw.ground_height`` and ``lw.height_scan``. It has the shape (1 + points along y, 1 + points along x).
+    The first row has the points' x coordinates, and the first column has their y coordinates. All other elements are
+    heights. The coordinates are in the world's frame, in m. For example: ``ground: wp.array2d[float] =
+    lw.height_field("terrain")``.
 
     Args:
-        name: Name of the height field in the model. ``lw.Terrain.add_to`` uses the name "terrain" by default.
+        name: Name of the height field in the model. ``lw.Terrain.add_to`` calls it "terrain" by default.
     """
     return from_model(lambda model, _: height_table(model, name))
 
@@ -287,8 +277,7 @@ def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarra
     """Make a default for Params: a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
-    ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. Declare the grid as in ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6,
-    1.0)``.
+    ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. For example: ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.
 
     Args:
         length: Extent along x, forwards, in m.

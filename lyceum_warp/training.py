@@ -34,22 +34,22 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Function that is called with an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
+"""Function of an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
 
 
 class Display:
-    """Shows the progress of training; the base class only logs messages."""
+    """Shows the progress of training. This base class only logs messages."""
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Make a context for training up to a total number of iterations."""
+        """Return a context for training up to a total number of iterations."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
-        """Show a complete iteration."""
+        """Show a finished iteration."""
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
-        """Show the progress of work between two iterations, such as rendering a video."""
+        """Show the progress of work between iterations, such as rendering a video."""
 
     def note(self, line: str) -> None:
         """Show a message."""
@@ -77,51 +77,49 @@ def train(
 ) -> Run:
     """Train a learner, and write metrics, policies and checkpoints into a run folder, as ``lyceum-warp train`` does.
 
-    The call ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` returns the policy with
-    the best return. Returns are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise, they
-    are compared by ``return_mean`` of the iteration's episodes, which were sampled by the policy before the update.
+    ``lw.load(folder)`` returns the last policy, and ``lw.load(folder, which="best")`` the policy with the best return.
+    Policies are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise they are compared by
+    ``return_mean``, the return of episodes under the policy before the update.
 
-    The policy and the complete state are saved at the start, at the end, and every 30 s, or more often if saving takes
+    The policy and the complete state are saved at the start, at the end, and every 30 s or more often, if saving takes
     at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
-    same numbers. On Ctrl-C, SIGTERM or SIGHUP, the run is saved and ends after the current iteration; a second signal
-    ends the run at once.
+    same numbers. After Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and ends. A second
+    signal ends it at once.
 
     Args:
-        learner: The algorithm, such as ``NPG(env)`` or another ``lyceum_warp.algos.learner.Learner``.
-        folder: The run's folder, which is new or empty.
-        iterations: Total number of iterations, including iterations before resuming.
-        callback: Function of an iteration, called after the iteration's row was written. Training ends if the callback
-            returns True. If the callback raises an error, the run is saved and the error is raised again.
+        learner: The algorithm, such as ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
+        folder: The run's folder. It must be new or empty.
+        iterations: Total number of iterations, including those before resuming.
+        callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
+            an error, the run is saved and the error is raised again.
         target_return: Training ends when the return that selects the best policy reaches this number.
-        minutes: Time limit; training ends after the iteration that exceeds the limit. A limit of None means no limit.
-        keep_every: Iterations between two policies that are saved in numbered files; 0 saves none.
-        save_every: Iterations between two saves; 0 to save by time.
-        tensorboard: Whether to also write the metrics for TensorBoard.
-        video_every: Iterations between two videos of the policy, such as ``videos/000100.mp4`` in the folder; 0 for no
-            videos. If a video fails, a warning is logged, and training continues without videos.
+        minutes: Training ends after the iteration that exceeds this time limit.
+        keep_every: Iterations between policies that are saved in numbered files, or 0 for none.
+        save_every: Iterations between saves, or 0 to save by time.
+        tensorboard: Whether to write the metrics for TensorBoard, too.
+        video_every: Iterations between videos of the policy, such as ``videos/000100.mp4`` in the folder, or 0 for
+            none. If a video fails, a warning is logged, and training continues without videos.
         camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
-            for MuJoCo's default free camera.
-        transfer: Whether to judge the policy's transfer at the end with ``lw.transfer``, and to write ``transfer.json``
-            into the folder. By default, only comparisons that take seconds are made: with the C engine, after training
-            on a GPU; and with the task's exact physics, after training with different physics options.
-            ``transfer=True`` adds comparisons with each set of physics options that the task defines and, after
-            training on CPU cores, with the Warp engine.
-        resume: Whether to continue the run in the folder. To resume, make the learner with the same arguments as
-            before.
-        take_over: Whether to continue a run that another process has locked, on the same or another host. The process
-            that held the lock then ends at its next write.
-        entries: Additional JSON entries for config.json.
-        display: Object that shows the progress; by default, only messages are logged.
+            for MuJoCo's default camera.
+        transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
+            only comparisons that take seconds are made: with the C engine after training on a GPU, and with the task's
+            exact physics after training with other physics options. ``transfer=True`` also compares each set of the
+            task's physics options and, after training on CPU cores, the Warp engine.
+        resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
+        take_over: Whether to continue a run that another process has locked, on this or another host. That process then
+            ends at its next write.
+        entries: More JSON entries for config.json.
+        display: Shows the progress; by default, only messages are logged.
 
     Returns:
-        The run. ``run.rows()`` returns the metrics.
+        The run; ``run.rows()`` returns its metrics.
 
     Raises:
         ValueError: The folder is not empty, an argument is out of range, the run does not fit the learner, or another
             process has locked or taken over the run.
-        ImportError: ``tensorboard`` is True, but the extra ``tensorboard`` is not installed.
-        NoVideoError: ``video_every`` is given, but the extra ``viz`` is not installed.
-        OSError: The folder cannot be written; the run can be resumed from the last save later.
+        ImportError: ``tensorboard`` needs the extra ``tensorboard``.
+        NoVideoError: ``video_every`` needs the extra ``viz``.
+        OSError: The folder cannot be written. The run can later be resumed from its last save.
         FloatingPointError: An update of the learner is not finite.
         Interrupted: One of several ranks received a signal.
     """
@@ -189,11 +187,11 @@ def train(
 
 
 _PAIRS = 64
-"""Number of episodes for the transfer verdict at the end of training; each episode is played under both settings."""
+"""Number of episodes in the comparison at the end of training. Each is played under both settings."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Judge the policy's transfer and write ``transfer.json``, if requested or if the comparison takes only seconds."""
+    """Write ``transfer.json`` if it was requested or if the comparison takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -215,7 +213,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate until the target, the last iteration or the time limit is reached; all ranks save and end together."""
+    """Iterate until the target, the last iteration or the time limit. All ranks save and end together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
@@ -249,7 +247,7 @@ def _learn(
 
 
 def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> None:
-    """Load a run's checkpoint into the learner, and prepare the run's files for more iterations."""
+    """Load a run's checkpoint into the learner, and prepare the files for more iterations."""
     folder, content = run.folder, run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
@@ -272,7 +270,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # delete rows of iterations that a killed run did not save
+        cut_rows(run.metrics, done)  # a killed run may have rows that were not saved
         now = versions(run.config["device"])
         then = run.config.get("versions", now)  # runs of earlier releases have no versions in config.json
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:
@@ -283,12 +281,11 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
 
 
 def _check_equal(run: Run, learner: Learner) -> None:
-    """Check that a learner has the run's settings."""
     then, now, env = Configuration.of(run), describe(learner), learner.env
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # omit options that do not affect results; omit the model, because note_changes compares it
+    # options that do not affect results may differ, and note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | dict(then.params)
     # runs of earlier releases lack the newest hyperparameters

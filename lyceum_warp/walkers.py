@@ -1,7 +1,7 @@
 """Compute the tables of a walking robot from its compiled model, and prepare models for walking.
 
 Functions with the arguments ``(model, p)`` are for ``lw.from_model``. The parameters ``p.joints`` and ``p.feet`` are
-the indices of the joints and of the feet's sites. The base is the body of the first joint, which must be a free joint.
+indices of the joints and of the feet's sites. The base is the body of the first joint, which must be a free joint.
 """
 
 import functools
@@ -25,7 +25,7 @@ _FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # contact se
 
 
 def base(model: mujoco.MjModel, p: Any = None) -> int:
-    """Get the floating base, the body of the free joint.
+    """Get the base, which is the body of the free joint.
 
     Raises:
         ValueError: The first joint of the model is not free.
@@ -70,7 +70,7 @@ def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def quarter_of_force(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Compute mjlab's scale of actions, 0.25 * limit / kp, (joints,) in rad.
 
-    The scale is a quarter of the position error at which a joint's servo reaches its force limit.
+    This is a quarter of the position error at which a servo reaches its force limit.
 
     Raises:
         ValueError: A servo has no force limit.
@@ -92,7 +92,7 @@ def force_limits(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def home_qpos(model: mujoco.MjModel) -> np.ndarray:
-    """Get the coordinates of the keyframe "home", or ``qpos0`` without this keyframe."""
+    """Get the coordinates of the keyframe "home", or ``qpos0`` if there is none."""
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, "home")
     return model.qpos0 if key < 0 else model.key_qpos[key]
 
@@ -113,13 +113,13 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     All lists are in the order of ``joints``.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    # damping of the joint itself, which adds to the servo's damping
+    # the joint's own damping adds to the servo's
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
     return clock | {
         "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position on base, in m
+        "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -137,8 +137,8 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     """Make the mirror image of a velocity task in the plane y = 0 of the base, for ``lw.Task.mirror``.
 
-    The partner of a joint is the corresponding joint on the other side, or the joint itself. With all joints at 0, the
-    positions and axes of two partners must be mirror images. The masses of the robot need not be symmetric.
+    A joint's partner is the corresponding joint on the other side, or the joint itself. With all joints at 0, positions
+    and axes of partners must be mirror images. Masses need not be symmetric.
 
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
@@ -174,7 +174,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     found: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
-        "clock": (-1.0, -1.0),  # left and right are half a cycle apart, so mirroring shifts the clock by half a cycle
+        "clock": (-1.0, -1.0),  # left and right are half a cycle apart, so the clock moves by half a cycle
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
         # qpos and qvel also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
@@ -191,7 +191,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """List the joints from the base to each foot, (feet, most joints of a leg); -1 fills the rows of shorter legs.
+    """List the joints from the base to each foot, (feet, most joints of a leg), with -1 after a shorter leg.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -202,42 +202,41 @@ def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the index of each of ``leg_joints`` in ``qpos``; -1 fills the rows of shorter legs."""
+    """Get the indices of ``leg_joints`` in ``qpos``, with -1 after a shorter leg."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_qposadr[joints])
 
 
 def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the index of each of ``leg_joints`` in ``qvel``; -1 fills the rows of shorter legs."""
+    """Get the indices of ``leg_joints`` in ``qvel``, with -1 after a shorter leg."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_dofadr[joints])
 
 
 def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the axis of each of ``leg_joints``, (feet, most joints of a leg, 3)."""
+    """Get the axes of ``leg_joints``, (feet, most joints of a leg, 3)."""
     data = _straight(model)
     return data.xaxis[leg_joints(model, p)]
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each of ``leg_joints`` relative to the leg's previous joint, or to the base, in m."""
+    """Get the positions of ``leg_joints`` relative to the previous joint of the leg, or to the base, in m."""
     anchors = _straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the position of each foot's site relative to the foot's last joint, (feet, 3) in m."""
+    """Get each foot's position relative to its last joint, (feet, 3) in m."""
     data = _straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
 
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Compute spheres that replace each foot: they touch a plane if and only if the foot does.
+    """Compute spheres that touch a plane if and only if the foot does.
 
-    The result has the shape (feet, most spheres, 4), and contains centres and radii in m. Centres are relative to the
-    foot's last joint. A capsule becomes spheres at both ends, a box becomes spheres at its corners, and any other geom
-    becomes spheres at the corners of its bounding box. Radii include the margin at which a contact starts to exert
-    force.
+    The result, (feet, most spheres, 4), has centres relative to the foot's last joint and radii, in m. A capsule
+    becomes a sphere at each end, and a box becomes a sphere at each corner. Any other geom becomes a sphere at each
+    corner of its bounding box. Radii include the margin at which a contact starts to exert force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -256,7 +255,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """List the geoms of the feet's bodies that can touch the ground (any geom of the world body).
+    """List the geoms of the feet that can touch the ground (any geom of the world body).
 
     Raises:
         ValueError: A foot has no geom that can touch the ground.
@@ -271,7 +270,7 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
 
 
 def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
-    """List the geoms of a body that can touch a geom of the world body."""
+    """List a body's geoms that can touch a geom of the world body."""
     ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
     geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
@@ -319,7 +318,7 @@ def _last_joint(model: mujoco.MjModel, foot: int) -> int:
 
 
 def _straight(model: mujoco.MjModel) -> mujoco.MjData:
-    """Compute the model's kinematics with the base at the world's origin and all other coordinates 0."""
+    """Compute the kinematics with the base at the world's origin and all other coordinates 0."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
     start = int(model.jnt_qposadr[0])
@@ -334,7 +333,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add the contact margin with the ground, minus the gap, to the radii of a geom's spheres."""
+    """Add the contact margin with the ground, minus the gap, to the spheres' radii."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -342,7 +341,7 @@ def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.nd
 
 
 def spheres_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> np.ndarray:
-    """Compute the spheres that replace a geom in ``soles``, in the world's axes, (spheres, 4)."""
+    """Compute the spheres of a geom for ``soles``, in the world's axes, (spheres, 4)."""
     size, kind = model.geom_size[geom], mujoco.mjtGeom
     radius, middle = 0.0, np.zeros(3)
     if model.geom_type[geom] == kind.mjGEOM_SPHERE:
@@ -373,18 +372,18 @@ def prepare_walker(
 ) -> None:
     """Prepare a model for a velocity task: add force sensors to the feet, and ignore the friction of the ground.
 
-    The model's own sensors are removed, because sensors cost time and the task reads none of the model's sensors. Geoms
-    of the feet get priority in contacts, so that the feet's randomized friction applies. Ordinary contacts replace
-    explicit contact pairs of a foot with the ground.
+    The model's own sensors are removed, because they cost time and the task does not read them. Geoms of the feet get
+    priority in contacts, so their randomized friction applies. Ordinary contacts replace explicit contact pairs of a
+    foot with the ground.
 
     Args:
-        spec: The model, which is changed in place.
+        spec: The model. It is changed in place.
         feet: Names of the sites of the feet.
-        timestep: Seconds in a substep; None keeps the model's time step.
-        iterations: Maximum numbers of iterations of the solver and of the line search; None keeps the model's limits.
+        timestep: Seconds in a substep, or None for the model's time step.
+        iterations: Maximum iterations of the solver and of the line search, or None for the model's limits.
 
     Raises:
-        ValueError: A site of a foot is missing.
+        ValueError: A foot's site is missing.
     """
     if timestep is not None:
         spec.option.timestep = timestep
@@ -419,8 +418,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: Maps the name of each new site to the name of a body (or of one of its joints or geoms) and the site's
-            position in this body, in m.
+        feet: For each new site, the name of a body (or of a joint or geom of it), and the site's position in this body,
+            in m.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -434,15 +433,14 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
 
 def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
-    """Turn joints' motors into position servos in place; existing servos do not change.
+    """Turn the motors of joints into position servos in place. Existing servos do not change.
 
-    The servo's force limit does not change. A servo reaches the limit at a position error of ``reach`` rad, so kp =
-    limit / reach. The servo is critically damped for the joint's inertia M at ``qpos0``, so M s^2 + kd s + kp has a
-    double root.
+    A servo keeps the motor's force limit and reaches it at a position error of ``reach`` rad, so kp = limit / reach. It
+    is critically damped for the joint's inertia M at ``qpos0``: M s^2 + kd s + kp has a double root.
 
     Args:
         spec: The model.
-        joints: Names of the joints, which have one actuator each.
+        joints: Names of joints with one actuator each.
         reach: Position error at which a servo's force reaches its limit, in rad.
 
     Raises:
@@ -475,14 +473,13 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 
 
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
-    """Replace each colliding box of a foot by two capsules along the box's longer side, to use height fields.
+    """Replace each colliding box of a foot by two capsules along its longer side, for use on height fields.
 
-    MuJoCo Warp 4.0 finds contacts of boxes and height fields with wrong normals and depths. Wrong contacts throw robots
-    into the air. The capsules lie within the outline of the foot's sole and touch the sole's lowest plane; masses do
-    not change.
+    MuJoCo Warp 4.0 finds wrong normals and depths for contacts between boxes and height fields, which throw robots into
+    the air. The capsules lie within the outline of the sole and touch its lowest plane. Masses do not change.
 
     Args:
-        spec: The model after ``prepare_walker``. The model is changed in place.
+        spec: The model after ``prepare_walker``. It is changed in place.
         feet: Names of the sites of the feet.
         radius: Radius of the capsules, in m.
 

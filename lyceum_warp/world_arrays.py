@@ -1,4 +1,4 @@
-"""Allocate the arrays of an environment's worlds, and convert between these arrays and state vectors."""
+"""Allocate the arrays of an environment's worlds, and convert them to and from state vectors."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -19,7 +19,7 @@ from lyceum_warp.task import MEMORIES
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
-    """Estimate the bytes per world of ``WorldArrays``, without the engine's arrays."""
+    """Estimate the bytes per world without the engine's arrays."""
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
-    """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, without the counters."""
+    """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, except for the counters."""
     form, found = task.task, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
@@ -37,18 +37,13 @@ def own_parts(task: BoundTask) -> dict[str, int]:
 
 
 def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
-    """Get the columns of ``memory`` and ``lasting_memory`` in a state, if the task has such memory."""
+    """Get the columns of ``memory`` and ``lasting_memory`` in a state."""
     ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
     return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
 
 class WorldArrays:
-    """Allocates all arrays of many worlds of one task on one engine.
-
-    Args:
-        task: The task with its model and parameters.
-        engine: The physics engine, which has arrays of the fields that the task reads.
-    """
+    """All arrays of many worlds of one task on one engine."""
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:
         self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
@@ -62,22 +57,20 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        """Allocate the fields before and after a step, and the task's memory."""
         n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        """Sums of the metrics over the current episode so far."""
+        """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of successive successful steps, up to ``success_steps``; the array has no columns if ``success_steps``
-        is 1."""
+        """Number of successes in a row, up to ``success_steps``. The array has no columns if ``success_steps`` is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        # fields after a step, and copies of the fields before the step
+        # fields after a step and before it
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
         constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
@@ -92,7 +85,7 @@ class WorldArrays:
             setattr(self.before, name, self._copies.get(name, live))
         self._allocate_shared()
         self.fields = {**self.engine.arrays, **constant}
-        """Arrays of all fields of the engine and the model, (nworld, ...), by name."""
+        """Arrays of all fields, (nworld, ...), by name."""
         drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
@@ -102,7 +95,6 @@ class WorldArrays:
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
     def _allocate_shared(self) -> None:
-        """Allocate the memory that all worlds share, and the sums over worlds that update the memory."""
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
@@ -113,7 +105,6 @@ class WorldArrays:
                 batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
-        """Allocate rewards, ends of episodes, metrics and observations."""
         n, kernels = self.nworld, self.task.kernels
         self.outcome = step_types.Outcome()
         self.buffers: dict[str, torch.Tensor] = {}
@@ -123,11 +114,11 @@ class WorldArrays:
         self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
         """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """The metrics summed over the episode up to the last step."""
+        """Sums of the metrics over the episode up to the last step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads that evaluate a world's transition
+        self._judging = parts if self.device.is_cuda else 1  # number of threads that evaluate a transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
@@ -151,7 +142,6 @@ class WorldArrays:
         self.scale: wp.array = wp.array(scale, dtype=float)
 
     def _allocate_counters(self) -> None:
-        """Allocate counters, random streams and faults."""
         n = self.nworld
         self.counters = step_types.Counters()
         self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
@@ -162,23 +152,22 @@ class WorldArrays:
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
 
     def _allocate_masks(self) -> None:
-        """Allocate masks of worlds, each (nworld,) bool."""
         n = self.nworld
         self.everyone = wp.full(n, True, dtype=bool)
         self.mask = wp.zeros(n, dtype=bool)
-        """Worlds that the next reset or restore changes; see ``set_mask``."""
+        """Worlds that the next reset or restore changes."""
         self.restarting = wp.zeros(n, dtype=bool)
-        """Worlds that ended an episode in the last step."""
+        """Worlds whose episode ended in the last step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        """Worlds with a rejected initial state, which is drawn again."""
+        """Worlds whose initial state was rejected."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that did not restart after the last step, and therefore ran the task's events."""
+        """Worlds that did not restart after the last step and thus ran events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
-        """Worlds in which an event of the last step changed the physics."""
+        """Worlds whose physics an event of the last step changed."""
         self._changed = wp.zeros(n, dtype=bool)
-        """Worlds in which an event of the last step changed the physics or the task's memory."""
+        """Worlds whose physics or memory an event of the last step changed."""
         self._outdated = wp.zeros(n, dtype=bool)
-        """Worlds that need a new observation, because they restarted or were changed by an event."""
+        """Worlds that need a new observation after a restart or an event."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
 
@@ -188,7 +177,7 @@ class WorldArrays:
         return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
-        """Choose the worlds that the next reset or restore changes; None for all worlds."""
+        """Choose the worlds that the next reset or restore changes; None means all."""
         if mask is None:
             self.mask_view.fill_(True)
         else:
@@ -196,7 +185,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write every world's state vector into ``state``; the part ``done_reason`` is copied from ``ended``."""
+        """Write the state of every world into ``state``, with the part ``done_reason`` from ``ended``."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -206,13 +195,13 @@ class WorldArrays:
             launch_rows(state.widen, self.everyone, array, columns)
 
     def unpack_state(self) -> None:
-        """Set the selected worlds' counters, memory and sums from ``state``."""
+        """Set counters, memory and sums of the selected worlds from ``state``."""
         self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
         for array, columns in self._own_parts():
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Yield a pair for each of ``own_parts``: the part's array, and its columns in the states."""
+        """Yield the array and the state's columns of each of ``own_parts``."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
@@ -220,7 +209,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the selected worlds' counters from ``columns``, the part of the states after the engine's part."""
+        """Set the selected worlds' counters from ``columns``, the columns after the engine's."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The phases of an environment as callables, for one combination of horizon, autoreset and graphs."""
+    """The phases of an environment as callables, for one choice of horizon, autoreset and graphs."""
 
     graphs: Graphs
     step: Calls
@@ -39,15 +39,9 @@ class Programs:
 
 
 class Worlds(WorldArrays):
-    """Many worlds of one task on one engine: arrays at fixed addresses, and phases that process the arrays.
+    """Many worlds of one task on one engine, with the phases that update their arrays.
 
-    Every phase must launch the same kernels on the same arrays each time, because a captured graph repeats these
-    launches.
-
-    Args:
-        task: The task with its model and parameters.
-        engine: The physics engine, which has arrays of the fields that the task reads.
-        options: Options of the environment.
+    A captured graph repeats launches, so a phase must always launch the same kernels on the same arrays.
     """
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
@@ -59,9 +53,9 @@ class Worlds(WorldArrays):
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
-        """Set the horizon, automatic restarts, and whether launches are captured as graphs.
+        """Set the horizon, automatic restarts, and whether to capture launches as graphs.
 
-        Captured graphs contain the horizon and the automatic restarts, so each combination has separate graphs.
+        A graph contains the first two, so each combination has graphs of its own.
         """
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
@@ -79,12 +73,12 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Delete the programs, whose reference cycles would keep threads and memory alive."""
+        """Delete the programs. Their reference cycles would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Make worker threads for launches before and after engine calls; None if one thread suffices."""
+        """Make threads for launches before and after engine calls, or return None if one thread suffices."""
         # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -94,7 +88,7 @@ class Worlds(WorldArrays):
     # phases
 
     def step_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases of one step, in order; by default with all substeps of the task."""
+        """List the phases of a step in order."""
         return [
             *self._transition_phases(substeps),
             *self._restart_phases(self.restarting, randomly=True),
@@ -105,7 +99,7 @@ class Worlds(WorldArrays):
         ]
 
     def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step for a single graph, whose replay skips a phase if no world needs it."""
+        """List the phases of a step for a single graph, which skips a phase if no world needs it."""
         if not self.engine.capturable:
             return self.step_phases()
         restart = self._restart_phases(self.restarting, randomly=True)
@@ -123,7 +117,7 @@ class Worlds(WorldArrays):
         ]
 
     def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
-        """Merge phases into one phase that is skipped if the mask is empty."""
+        """Merge phases into one that is skipped if the mask is empty."""
         every = [phase for part in phases for phase in part]
 
         def run() -> None:
@@ -133,7 +127,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases that advance to the next state and evaluate the transition."""
+        """List the phases from the current state to the next, including the evaluation."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -142,12 +136,12 @@ class Worlds(WorldArrays):
         ]
 
     def _tally_phases(self) -> list[Phase]:
-        """List the phase that adds up the task's sums; on a CPU, atomic additions require a single thread."""
+        """List the phase that adds up the task's sums. On a CPU, atomic additions need a single thread."""
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases of a step's substeps; by default of all substeps."""
+        """List the phases of a step's substeps."""
         skip = self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
             return self.engine.step_phases(skip)
@@ -155,7 +149,7 @@ class Worlds(WorldArrays):
         return substep * skip
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
-        """List the phases that start episodes in the worlds of ``mask``, in order."""
+        """List the phases that start episodes in the worlds of ``mask``."""
         return [
             *self._restart_phases(self.mask, randomly=randomly),
             *self._refresh_phases(self.mask),
@@ -174,12 +168,11 @@ class Worlds(WorldArrays):
         return phases
 
     def _event_phases(self) -> list[Phase]:
-        """List the phases of the task's events, which run between two steps in worlds that continue."""
+        """List the phases of the task's events, which run after a step in worlds that continue."""
         kernel = self.task.kernels.run_events
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
-        """List the phases that update model constants and derived fields after events."""
         if self.task.kernels.run_events is None:
             return []
         phases, changed = [], self._physics_changed
@@ -190,21 +183,21 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe worlds again if they changed after the transition was evaluated."""
+        """List the phases that observe worlds again that changed after the evaluation."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
-        if self.engine.reset_stage == Stage.NONE:  # no derived fields to compute
+        if self.engine.reset_stage == Stage.NONE:  # there are no derived fields
             return []
         return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
     def read_phases(self) -> list[Phase]:
-        """Write every world's state into ``state``."""
+        """List the phases that write all states into ``state``."""
         return [Phase("read state", self._read_state)]
 
     def restore_phases(self) -> list[Phase]:
-        """List the phases that restore the selected worlds from ``state``, and update everything that getters read."""
+        """List the phases that restore the selected worlds from ``state``."""
         engine_columns = self.state[:, : self.engine.state_size]
         return [
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
@@ -213,10 +206,9 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run once every phase that only launches kernels, so that ``compile_ahead`` can list the kernels."""
+        """Run every phase once that only launches kernels, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
-        # two substeps suffice, because all substeps after the first are equal; with the Warp engine, each additional
-        # substep would take milliseconds
+        # all substeps after the first are equal, and with the Warp engine each would take milliseconds
         step = self.step_phases(min(self.task.frame_skip, 2))
         phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -224,7 +216,7 @@ class Worlds(WorldArrays):
                 phase.run()
 
     def keep_before(self) -> None:
-        """Copy the current state into ``before``, as the start of a transition."""
+        """Copy the current state into ``before``."""
         if (kernel := self.task.kernels.keep_before) is not None:
             launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
 
@@ -243,14 +235,13 @@ class Worlds(WorldArrays):
         launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge_step(self) -> None:
-        """Find faults, advance the task's memory, and evaluate the transition."""
         self.engine.find_faults(self.everyone)
         self.advance_memory()
         keep_reason = not self.autoreset
         self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
 
     def advance_memory(self) -> None:
-        """Advance the task's memory by one step."""
+        """Advance the task's memory by a step."""
         if (advance := self.task.kernels.advance_memory) is not None:
             args = [self.before, self.after, self.params, self.safe_action, self.counters]
             launch_worlds(advance, self.nworld, args, self.device)
@@ -263,7 +254,7 @@ class Worlds(WorldArrays):
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
-        """Compute rewards, metrics, evaluations, ends and observations of worlds; see ``kernels.transitions``."""
+        """Compute rewards, metrics, evaluations, ends and observations; see ``kernels.transitions``."""
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
@@ -279,13 +270,12 @@ class Worlds(WorldArrays):
         self._hold_success(mask, transition=transition)
 
     def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
-        """Report success only after ``success_steps`` successful steps in a row."""
         if self.success_counts.size:
             args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        """Set the selected worlds to the task's fixed initial state, or to random initial states."""
+        """Set the selected worlds to the fixed initial state or to random ones."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
@@ -302,15 +292,14 @@ class Worlds(WorldArrays):
                 launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
-        """Set model fields of the selected worlds to nominal values."""
         for name in names:
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Draw new initial states for the selected worlds whose initial state the task rejects."""
+        """Draw new initial states for the selected worlds whose state the task rejects."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
-            # on a GPU, reading the mask would wait for the device, so all launches run, even if the mask is empty
+            # on a GPU, reading the mask would wait for the device
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return
             self.engine.refresh(self._rejected)
@@ -321,7 +310,7 @@ class Worlds(WorldArrays):
                 self.engine.apply_model(self._rejected)
 
     def _event(self, kernel: wp.Kernel) -> None:
-        """Run the events, and mark the worlds in which events changed the physics or the task's memory."""
+        """Run the events, and mark the worlds that they changed."""
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
         live = {name: getattr(self.after, name) for name in before}
         before |= self._model_copies
@@ -338,13 +327,13 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark worlds in which an event changed a field; ``physics`` is False if the field is the task's memory."""
+        """Mark worlds in which an event changed a field. ``physics`` is False for the task's memory."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the selected worlds; other worlds were already observed when the transition was evaluated."""
+        """Observe the selected worlds. All others were observed during the evaluation."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
@@ -354,26 +343,25 @@ class Worlds(WorldArrays):
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         """Compute observations, evaluations and terminations of the selected worlds, without a transition."""
-        # states that were set without a check may be invalid: find faults, so that such a world keeps its last valid
-        # observation
+        # a state that was set without a check may have faults, and its world keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets, done_reason describes only the last step, so states contain 0 instead
+        # with automatic resets, done_reason describes only the last step, so states contain 0
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # called by Env and OpenLoop
 
     def judge_transition(self, action: torch.Tensor) -> None:
-        """Evaluate the transition from ``before`` to the current state under given actions, ignoring engine faults."""
+        """Evaluate the transition from ``before`` to the current state, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # the evaluation writes the transition's faults here
+        self._judged.zero_()  # the transition's faults are written here
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:
-        """Restart the random streams of the selected worlds, and call the task's ``startup`` in these worlds."""
+        """Restart the random streams of the selected worlds, and call the task's ``startup``."""
         self._seed.fill_(seed)
         args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
@@ -392,7 +380,7 @@ class Worlds(WorldArrays):
             self._observe(self.everyone)
 
     def update_params(self) -> None:
-        """Copy the task's parameters and weights into the arrays that kernels read."""
+        """Copy the task's parameters and weights into the kernels' arrays."""
         parameters = self.task.parameters
         changed = {"params": parameters.array(self.device), "weights": parameters.weights(self.device)}
         for name, array in changed.items():

@@ -12,10 +12,9 @@ from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.pictures import WorldPictures
 
 _SEEDS = 2**31
-"""Seeds of an environment are smaller than this number."""
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that adapters do not accept, each mapped to the adapter's argument to use instead."""
+"""Options of ``lw.make`` that adapters replace, with the name of the adapter's argument."""
 
 
 def environment_of(
@@ -26,11 +25,11 @@ def environment_of(
     Args:
         task: A task, as in ``lw.make``, or an ``Env``.
         num_envs: Number of worlds; by default one, or the number in the given environment.
-        words: Options and parameters, for ``lw.make``.
+        words: Options and parameters for ``lw.make``.
         autoreset: Whether the environment resets worlds within a step.
 
     Raises:
-        ValueError: An argument is invalid; the message names it.
+        ValueError: An argument is invalid.
     """
     if not isinstance(task, Env):
         for word in _OTHER_WORDS.keys() & words.keys():
@@ -49,7 +48,7 @@ def environment_of(
 def pictures_of(
     env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
 ) -> tuple[WorldPictures, dict[str, Any]]:
-    """Make an environment's renderer, and the ``metadata`` that describes it to Gymnasium and Stable-Baselines3.
+    """Make an environment's renderer, and the ``metadata`` for Gymnasium and Stable-Baselines3.
 
     Raises:
         ValueError: There is no such render mode or camera, or the size is odd.
@@ -61,7 +60,7 @@ def pictures_of(
 
 
 class ResetSeeds:
-    """Chooses the seed of each reset. If the first reset gets no seed, it uses a random seed, as the libraries expect.
+    """Chooses the seed of each reset: a random seed for the first, unless the user gave one, as the libraries expect.
 
     Args:
         seeded: Whether the user has seeded the environment.
@@ -75,7 +74,7 @@ class ResetSeeds:
 
         Args:
             given: The seed passed to ``reset``, or None.
-            drawn: A function that returns a random seed; called if the worlds were never seeded.
+            drawn: Returns a random seed; called if the worlds were never seeded.
         """
         if given is None and self._seeded:
             return None
@@ -84,7 +83,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Split a tensor with one row per world into rows; repeat any other value for every world."""
+    """Split a tensor with one row per world into rows. Repeat any other value for every world."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

@@ -20,13 +20,13 @@ from dm_env import specs  # noqa: E402
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
     """One world as a ``dm_env.Environment``, for code that expects the interface of dm_control's suite.
 
-    An observation is a dict with the parts of the observation group ``policy``, float32; a part with a single number
-    has the shape (1,). A step after the end of an episode ignores its action and starts a new episode. The discount is
-    0 after a termination, and 1 if the time limit or a fault ends the episode.
+    An observation is a dict with the parts of the observation group ``policy``, float32. A single number has the shape
+    (1,). The first step after the end of an episode ignores its action and starts a new episode. The discount is 0
+    after a termination. It is 1 if a time limit or a fault ends the episode.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
-        flat_observation: Whether an observation is a dict with one array, "observations".
+        flat_observation: Whether an observation is a dict with a single array, "observations".
         **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
 
     Raises:
@@ -43,7 +43,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         self._ended = True
 
     def reset(self) -> dm_env.TimeStep:
-        """Start a new random episode, and return its first time step, in which reward and discount are None."""
+        """Start a new random episode. Reward and discount of its first time step are None."""
         self.env.rand_reset(self._seeds(None, lambda: np.random.SeedSequence().entropy))
         self._ended = False
         (obs,) = self._host.of(self.env.obs)
@@ -73,12 +73,12 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         return dm_env.transition(float(reward), self._split(obs))
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """The shapes of the parts of an observation."""
+        """Describe the parts of an observation by their shapes."""
         sizes = {name: len(range(*part.indices(self.env.obs_space.size))) for name, part in self._parts.items()}
         return {name: specs.Array((size,), np.float32, name) for name, size in sizes.items()}
 
     def action_spec(self) -> specs.BoundedArray:
-        """The shape and the bounds of an action."""
+        """Describe the shape and the bounds of an action."""
         space = self.env.action_space
         return specs.BoundedArray(space.shape, np.float32, space.low, space.high, "action")
 

@@ -14,15 +14,15 @@ from lyceum_warp.viz.cameras import CameraChoice
 
 
 class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
-    """One world as a ``gymnasium.Env``, for evaluation, for debugging, and for tools that need a single environment.
+    """One world as a ``gymnasium.Env``, for evaluation, debugging and tools that need a single environment.
 
-    ``info`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
-    ``episode_metrics``. For many worlds, ``GymnasiumVectorEnv`` is much faster than many single environments.
+    ``info`` has ``eval`` and ``done_reason``. It also has ``success``, ``metrics`` and ``episode_metrics`` if the task
+    defines them. For many worlds, ``GymnasiumVectorEnv`` is much faster.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
-        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
-            default, True if the task has several groups.
+        dict_obs: Whether observations are dicts of all observation groups instead of the group ``policy``. By default,
+            True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -105,10 +105,8 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         self._pictures.close()
 
     def _rows(self, *buffers: torch.Tensor) -> list[Any]:
-        """Return the single world's row of each buffer."""
         return [array[0] for array in self._host.of(*buffers)]
 
 
 def _numbers(info: dict[str, Any]) -> dict[str, Any]:
-    """Convert one world's infos to Python numbers."""
     return {name: _numbers(value) if isinstance(value, dict) else value.item() for name, value in info.items()}

@@ -1,4 +1,4 @@
-"""Convert an environment's spaces to Gymnasium's, after checking the installed Gymnasium release."""
+"""Convert an environment's spaces to Gymnasium's spaces."""
 
 import numpy as np
 
@@ -14,13 +14,13 @@ __all__ = ["box", "gymnasium", "observation_space"]
 
 
 def box(space: Space) -> gymnasium.spaces.Box:
-    """Make a Box for one world's vector, with infinite bounds if the space has none."""
+    """Make a Box for one world's vector. The bounds are infinite if the space has none."""
     low, high = (-np.inf if space.low is None else space.low), (np.inf if space.high is None else space.high)
     return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.float32)
 
 
 def observation_space(env: Env, *, dict_obs: bool) -> gymnasium.Space:
-    """Make the space of one world's observation: a Box for the group ``policy``, or a Dict of all groups."""
+    """Make the space of one world's observations: a Box for the group ``policy``, or a Dict of all groups."""
     if not dict_obs:
         return box(env.obs_space)
     return gymnasium.spaces.Dict({group: box(space) for group, space in env.obs_spaces.items()})

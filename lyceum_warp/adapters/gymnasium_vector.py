@@ -19,37 +19,36 @@ AutoresetMode = gymnasium.vector.AutoresetMode
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     """Many worlds as a ``gymnasium.vector.VectorEnv``.
 
-    ``infos`` holds ``eval``, ``done_reason`` and, if the task has them, ``success``, ``metrics`` and
-    ``episode_metrics``, as arrays with one value per world.
+    ``infos`` has ``eval`` and ``done_reason``, as arrays with one value per world. It also has ``success``, ``metrics``
+    and ``episode_metrics`` if the task defines them.
 
-    ``autoreset_mode`` determines when a world is reset after its episode ends:
+    ``autoreset_mode`` says when a world is reset after its episode ends:
 
-    - SAME_STEP resets the world within that step. The world returns the first observation of its next episode;
-      ``infos["final_obs"]`` and ``infos["final_info"]`` hold the last observations and infos of ended episodes. The
-      masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False,
-      ``final_obs`` and ``final_info`` exist only if an episode ended, and ``final_obs`` is an object array with None
-      for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, ``final_obs`` and ``final_info`` exist
-      after every step and hold tensors over all worlds, so that a step need not wait for the device.
-    - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. After the end of its episode, a world
-      keeps stepping until it is reset, and its termination or truncation stays True. A world with a fault is reset at
-      once, but returns its last valid observation.
-    - NEXT_STEP resets the world in the next step, which ignores the world's action. In NEXT_STEP mode, every step runs
-      the kernels of a reset twice. Some wrappers, such as ``NormalizeObservation``, require NEXT_STEP.
+    - SAME_STEP resets the world within that step. The world returns the first observation of its next episode.
+      ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observations and infos of ended episodes. The
+      masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False, these
+      entries exist only if an episode ended. ``final_obs`` is then an object array with None for the other worlds, as
+      Gymnasium's wrappers expect. If ``torch`` is True, the entries are tensors over all worlds and always exist,
+      because a check would wait for the device.
+    - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. Until then, a world keeps stepping, and
+      its termination or truncation stays True. A world with a fault is reset at once, but returns its last valid
+      observation.
+    - NEXT_STEP resets the world in the next step, which ignores the world's action. Every step then runs the kernels of
+      a reset twice. Some wrappers, such as ``NormalizeObservation``, require this mode.
 
-    If neither the constructor nor the first reset gets a seed, the seed is random, as in Gymnasium's own environments.
-    One seed determines the random numbers of all worlds, but every world has different random numbers.
+    Without a seed for the constructor or the first reset, the seed is random, as in Gymnasium's own environments. One
+    seed is enough for all worlds: each world has its own random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
         num_envs: Number of worlds.
-        autoreset_mode: A ``gymnasium.vector.AutoresetMode`` or its value; by default SAME_STEP, or DISABLED for an
+        autoreset_mode: A ``gymnasium.vector.AutoresetMode`` or its value. By default SAME_STEP, or DISABLED for an
             environment with ``autoreset=False``.
         torch: Whether actions and results are tensors on the environment's device instead of NumPy arrays. With
             tensors, a step never waits for the device.
-        copy: Whether to copy results. Without copies, most results (tensors, or NumPy arrays on the CPU) are live
-            buffers, and the next step overwrites them.
-        dict_obs: Whether observations are dicts of all observation groups; otherwise they are the group ``policy``. By
-            default, True if the task has several groups.
+        copy: Whether to copy results. Without copies, most results are live buffers, which the next step overwrites.
+        dict_obs: Whether observations are dicts of all observation groups instead of the group ``policy``. By default,
+            True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
@@ -153,7 +152,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         else:
             self._host.set_action(actions)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
-            env.action.masked_fill_(self._ended[:, None], 0.0)  # the action is ignored, so a NaN in it is not a fault
+            env.action.masked_fill_(self._ended[:, None], 0.0)  # a NaN in an ignored action is not a fault
         env.step()
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.rand_reset(mask=self._ended)
@@ -172,9 +171,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return None if self.render_mode is None else tuple(self._pictures())
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method or read an attribute of this adapter or its ``Env``, and return one value per world.
+        """Call a method or read an attribute of this adapter or its ``Env``. Return one value per world.
 
-        A tensor with one row per world is split into rows; any other value is repeated.
+        A tensor with one row per world is split into rows. Any other value is repeated.
         """
         value = getattr(self if hasattr(self, name) else self.env, name)
         value = value(*args, **kwargs) if callable(value) else value
@@ -192,13 +191,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             self._pictures.close()
 
     def _given(self, *buffers: torch.Tensor) -> list[Any]:
-        """Convert buffers to the arrays or tensors that the caller gets."""
         if self._host is not None:
             return list(self._host.of(*buffers))
         return [buffer.clone() for buffer in buffers] if self._copy else list(buffers)
 
     def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
-        """Add the final observations and infos of the episodes that ended in this step."""
         final_info = dict(infos)
         if self._host is None:
             final_obs = self._observations.formed(self._given(*self._observations.final))
@@ -209,7 +206,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         infos |= {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
 
     def _rows_of_ended(self, ended: np.ndarray) -> np.ndarray:
-        """Return an object array with the final observation of each ended world, and None for each other world."""
+        """Return the final observation of each ended world, and None for each other world."""
         (worlds,) = ended.nonzero()
         index = torch.from_numpy(worlds).to(self.device)
         values = self._given(*(final[index] for final in self._observations.final))
@@ -219,7 +216,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return rows
 
     def _mask(self, options: dict[str, Any] | None) -> torch.Tensor | None:
-        """Return the mask of a partial reset as a tensor, or None to reset all worlds."""
         if unknown := [name for name in options or {} if name != "reset_mask"]:
             raise ValueError(f'reset has no option {unknown[0]!r}: it takes options={{"reset_mask": mask}}')
         mask = (options or {}).get("reset_mask")

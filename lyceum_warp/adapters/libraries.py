@@ -10,7 +10,7 @@ def check_library(package: str, *, low: str, below: str, install: str) -> None:
     Args:
         package: The package's name for pip.
         low: The lowest supported version, such as "2.9".
-        below: The first unsupported newer version, such as "3".
+        below: The first newer version that is not supported, such as "3".
         install: The argument of ``pip install`` that installs a supported release.
 
     Raises:
@@ -28,5 +28,5 @@ def check_library(package: str, *, low: str, below: str, install: str) -> None:
 
 
 def _release(version: str) -> tuple[int, ...]:
-    """The release segment of a version: (2, 10) for "2.10rc1"."""
+    """Return the numbers of a version: (2, 10) for "2.10rc1"."""
     return tuple(map(int, re.findall(r"\d+", re.match(r"[\d.]*", version).group())))  # type: ignore[union-attr]

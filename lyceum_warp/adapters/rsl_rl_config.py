@@ -8,7 +8,7 @@ from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
-"""rsl_rl's names of activations, if they differ from torch's."""
+"""rsl_rl's names of activations, where they differ from torch's."""
 
 _PPO = {
     "epochs": "num_learning_epochs", "minibatches": "num_mini_batches", "clip": "clip_param", "gamma": "gamma",
@@ -16,7 +16,7 @@ _PPO = {
     "max_grad_norm": "max_grad_norm", "clip_value_loss": "use_clipped_value_loss", "schedule": "schedule",
     "desired_kl": "desired_kl", "whiten_minibatches": "normalize_advantage_per_mini_batch",
 }  # fmt: skip
-"""rsl_rl's name of each hyperparameter of PPOConfig."""
+"""rsl_rl's names of PPOConfig's hyperparameters."""
 
 
 def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
@@ -25,15 +25,14 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     Example:
         >>> runner = OnPolicyRunner(RslRlVecEnv(env), runner_config(env))
 
-    rsl_rl's PPO has no equivalent of ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the
-    mean policy.
+    rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the mean policy.
 
     Args:
-        env: The environment; its observation groups are the inputs of the networks.
+        env: The environment. Its observation groups are the inputs of the networks.
         config: Hyperparameters; by default ``PPOConfig()``.
 
     Returns:
-        A new dict; rsl_rl modifies it.
+        A new dict, because rsl_rl modifies it.
 
     Raises:
         ValueError: The task has no observation group for the value function.
@@ -47,7 +46,8 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        "check_for_nan": False,  # the check would wait for the device; the environment already reports NaN as a fault
+        # rsl_rl's check would wait for the device, and the environment already reports NaN as a fault
+        "check_for_nan": False,
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
         "critic": network | _layers(config.value_hidden, config.value_activation),

@@ -17,14 +17,14 @@ from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
 from tensordict import TensorDict  # noqa: E402
 
 RECENT = 100
-"""The approximate number of recent episodes over which logged metrics are averaged."""
+"""Logged metrics are averages over about this number of recent episodes."""
 
 
 class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
-    ``step`` never waits for the device. ``step`` returns copies of the observations, because rsl_rl stores observations
-    only after the next step. All other results are buffers, which rsl_rl copies before the next step overwrites them.
+    ``step`` never waits for the device. ``step`` copies the observations, because rsl_rl stores them only after the
+    next step. All other results are buffers that the next step overwrites. rsl_rl copies them before.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
@@ -32,8 +32,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ValueError: An argument is invalid; the message names it.
-        ImportError: rsl_rl is missing or its release is not supported; raised when this module is imported.
+        ValueError: An argument is invalid.
+        ImportError: rsl_rl is missing or not supported. Importing this module raises the error.
     """
 
     num_envs: int
@@ -41,11 +41,11 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     num_actions: int
     """The number of elements of an action."""
     max_episode_length: int
-    """Steps after which an episode is truncated; 2147483647 if the task has no horizon."""
+    """Steps after which an episode is truncated, or 2147483647 without a horizon."""
     device: torch.device
     """Device of all tensors."""
     cfg: dict[str, Any]
-    """The task, its parameters, the engine and the number of worlds, for rsl_rl's log writers."""
+    """The task, its parameters, the engine and the number of worlds, for rsl_rl's logs."""
 
     def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **words: Any) -> None:
         self.env = env = environment_of(task, num_envs, words, autoreset=True)
@@ -61,7 +61,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # number of episodes that the means cover
+        self._episodes = torch.zeros((), device=self.device)  # number of episodes in the averages
 
     @property
     def unwrapped(self) -> Env:
@@ -70,10 +70,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Steps since the reset, (nworld,) int32, a live view. Assign a tensor to change the step counters.
+        """Steps since the reset, (nworld,) int32, a live view.
 
-        An assignment also moves the time limits: a world at step ``max_episode_length - 1`` is truncated by the next
-        step.
+        Assign a tensor to change the counters, and with them the times at which episodes are truncated.
         """
         return self.env.episode_step
 
@@ -98,25 +97,25 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         env.set_state(state)
 
     def get_observations(self) -> TensorDict:
-        """Return a copy of the current observations: a dict of groups, each (nworld, group size)."""
+        """Return a copy of the current observations by group, each (nworld, group size)."""
         return self._obs.clone()
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance every world by one step, and restart worlds at the end of their episode.
+        """Advance every world by one step, and restart worlds whose episode ended.
 
         Args:
             actions: (nworld, nact), float32.
 
         Returns:
-            Observations (after a reset, the first observation of the new episode); rewards, (nworld,); dones, (nworld,)
-            bool; and a dict:
+            Observations, rewards (nworld,), dones (nworld,) bool, and a dict. After a reset, the observation is the
+            first of the new episode. The dict has these entries:
 
-            - ``time_outs``: whether the time limit or a fault truncated the episode, (nworld,) bool. A transition with
-              a fault has reward 0, and the last valid observation as its final observation.
-            - ``final_obs``: a dict of observation groups after the step, before any reset.
-            - ``log``: ``metrics/NAME``, means of the task's metrics over about the last 100 ended episodes, and
-              ``faults/worlds``, the number of worlds with a fault. The means are 0 until the first episode has ended.
-              The means include all episodes that end in this step.
+            - ``time_outs``: whether the time limit or a fault truncated the episode, (nworld,) bool. After a fault, the
+              reward is 0, and the last valid observation is the final observation.
+            - ``final_obs``: the observations after the step and before any reset, by group.
+            - ``log``: ``metrics/NAME`` are averages of the task's metrics over about the last 100 ended episodes,
+              including the episodes that end in this step. ``faults/worlds`` is the number of worlds with a fault.
+              Averages are 0 until an episode has ended.
 
         Raises:
             ValueError: The actions have the wrong shape, type or device.
@@ -131,10 +130,10 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """Average the metrics over recent episodes, on the device.
+        """Average the metrics over recent episodes.
 
-        rsl_rl averages the log over the steps of an iteration. If each log held only the last step, a step with one
-        finished episode would weigh as much as a step with a thousand.
+        rsl_rl averages the log over the steps of an iteration. With only the last step in a log, a step that ends one
+        episode would weigh as much as a step that ends a thousand.
         """
         env = self.env
         if not env.metrics:

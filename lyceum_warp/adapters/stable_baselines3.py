@@ -25,11 +25,12 @@ class StableBaselines3VecEnv(VecEnv):
     """Many worlds as a ``stable_baselines3.common.vec_env.VecEnv``.
 
     When a world's episode ends, its info dict has ``terminal_observation``, ``TimeLimit.truncated``, ``eval``,
-    ``done_reason`` and ``episode`` (return ``r``, length ``l`` and seconds since the start ``t``, as from
-    Stable-Baselines3's Monitor). The dict also has ``is_success`` if the task has a goal, and ``episode_metrics`` if
-    the task has metrics. The info dicts of all other worlds are empty, and are the same objects in every step.
+    ``done_reason`` and ``episode``. As in Stable-Baselines3's Monitor, ``episode`` has the return ``r``, the length
+    ``l`` and the seconds since the start ``t``. A task with a goal adds ``is_success``, and a task with metrics adds
+    ``episode_metrics``. The info dicts of all other worlds are empty.
 
-    By default, observations are only the group ``policy``, because Stable-Baselines3 feeds all groups to the policy.
+    Observations are by default only the group ``policy``, because Stable-Baselines3 would feed all groups to the
+    policy.
 
     Args:
         task: A task, as in ``lw.make``, or an ``Env``.
@@ -56,7 +57,7 @@ class StableBaselines3VecEnv(VecEnv):
         render_size: tuple[int, int] = (480, 480),
         **words: Any,
     ) -> None:
-        self.render_mode = render_mode  # the constructor of VecEnv reads render_mode
+        self.render_mode = render_mode  # VecEnv's constructor reads render_mode
         self.env = env = environment_of(task, num_envs, words, autoreset=True)
         self._pictures, metadata = pictures_of(env, render_mode, camera, render_size)
         self._observations = Observations(env, dict_obs=dict_obs)
@@ -70,7 +71,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._reset_once = False
 
     def reset(self) -> Any:
-        """Start new random episodes in all worlds, and return their first observations.
+        """Start new random episodes in all worlds, and return the first observations.
 
         Raises:
             ValueError: Options were set by ``set_options``; ``reset`` supports no options.
@@ -116,7 +117,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Render a picture of each world, (height, width, 3) uint8; a list of None if ``render_mode`` is None.
+        """Render a picture of each world, (height, width, 3) uint8. Return a list of None if ``render_mode`` is None.
 
         Raises:
             NoVideoError: This machine cannot render.
@@ -126,7 +127,7 @@ class StableBaselines3VecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Read a parameter of the task, or an attribute of the ``Env`` or of this adapter, for each world.
 
-        A tensor with one row per world is split into rows; any other value is repeated.
+        A tensor with one row per world is split into rows. Any other value is repeated.
         """
         parameters = self.env.task.parameters
         if attr_name in parameters.values:
@@ -145,15 +146,15 @@ class StableBaselines3VecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all worlds: call set_attr without indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # set_params raises an error for an unknown name and suggests similar ones
+        else:  # set_params suggests similar names if there is no such parameter
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the ``Env`` once, and return its result per world, as ``get_attr`` does."""
+        """Call a method of the ``Env`` once, and return its result for each world, as ``get_attr`` does."""
         return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
-        """Return True for Monitor, whose statistics this adapter provides, and False for any other wrapper."""
+        """Return True for Monitor, because this adapter provides its statistics, and False for any other wrapper."""
         return self._chosen(wrapper_class is Monitor, indices)
 
     def _chosen(self, value: Any, indices: Any) -> list[Any]:
@@ -161,7 +162,6 @@ class StableBaselines3VecEnv(VecEnv):
         return [rows[i] for i in self._get_indices(indices)]
 
     def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        """Fill the info dicts of worlds whose episodes ended, and set these worlds' returns and lengths to 0."""
         env, count = self.env, self._observations.count
         index = torch.from_numpy(worlds).to(env.obs.device)
         buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
@@ -181,7 +181,6 @@ class StableBaselines3VecEnv(VecEnv):
 
 
 def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
-    """Convert one world's infos to Stable-Baselines3's names."""
     return {
         "is_success" if name == "success" else name: _of_world(value, i) if isinstance(value, dict) else value[i].item()
         for name, value in infos.items()

@@ -13,10 +13,9 @@ from lyceum_warp.support.validate import described
 
 
 class Observations:
-    """Returns an environment's observations in an adapter's format: the group ``policy``, or a dict of all groups.
+    """Returns observations in an adapter's format: the group ``policy``, or a dict of all groups.
 
     Args:
-        env: The environment.
         dict_obs: Whether to return a dict of all groups. By default, True if the task has several groups.
     """
 
@@ -29,19 +28,18 @@ class Observations:
     def current(self) -> list[torch.Tensor]:
         """The current observations by group, (nworld, size).
 
-        Without automatic resets, ended worlds keep their last observation.
+        Without automatic resets, worlds whose episode ended keep their last observation.
         """
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]
-        # worlds with a fault are reset in any case, so their rows already hold the first observation of the next
-        # episode
+        # a fault always resets a world, so its row is already the first observation of the next episode
         done = env.done[:, None]
         return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
 
     @property
     def final(self) -> list[torch.Tensor]:
-        """The final observations by group: their values after the last step, before any reset."""
+        """The observations by group after the last step, before any reset."""
         return [self._env.final_obs_groups[group] for group in self._groups]
 
     @property
@@ -50,11 +48,11 @@ class Observations:
         return len(self._groups)
 
     def formed(self, values: list[Any]) -> Any:
-        """Combine the groups' values into one observation: a single array, or a dict of arrays."""
+        """Combine the groups' values into one observation, an array or a dict."""
         return dict(zip(self._groups, values, strict=True)) if self.dict_obs else values[0]
 
     def rows(self, values: list[np.ndarray]) -> list[Any]:
-        """Split the groups' arrays (worlds, group size) into one observation per world."""
+        """Split arrays of the groups, (worlds, group size), into one observation per world."""
         return [self.formed(list(row)) for row in zip(*values, strict=True)]
 
 
@@ -62,17 +60,14 @@ class HostArrays:
     """Transfers actions and results between NumPy arrays and an environment's buffers.
 
     Args:
-        env: The environment.
-        copy: Whether to copy results. Without copies, results on the CPU are the environment's live buffers, which the
-            next step overwrites.
-        one_world: Whether actions have the shape (nact,) instead of (nworld, nact); for an environment with a single
-            world.
+        copy: Whether to copy results. Without copies, results on the CPU are live buffers, which the next step
+            overwrites.
+        one_world: Whether actions have the shape (nact,) instead of (nworld, nact).
     """
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on the CPU, the array shares the action buffer's memory; on a GPU, pinned memory holds the actions before the
-        # copy
+        # on a GPU, stage the actions in pinned memory
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
         actions = (env.action if pinned is None else pinned).numpy()
@@ -93,7 +88,7 @@ class HostArrays:
             self._env.action.copy_(self._pinned, non_blocking=True)
 
     def of(self, *tensors: torch.Tensor) -> list[np.ndarray]:
-        """Convert tensors to NumPy arrays, waiting for the device at most once."""
+        """Convert tensors to NumPy arrays. This waits for the device at most once."""
         if self._pinned is None:
             return [tensor.numpy().copy() if self._copy else tensor.numpy() for tensor in tensors]
         copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
@@ -105,11 +100,7 @@ class Infos:
     """Collects the infos of a step in a dict.
 
     ``eval`` is the evaluation metric after the step, and ``done_reason`` has the bits of ``lw.Done``. A task with a
-    goal adds ``success``; a task with metrics adds ``metrics`` and ``episode_metrics``, the sums of the metrics over
-    the episode.
-
-    Args:
-        env: The environment.
+    goal adds ``success``. A task with metrics adds ``metrics``, and their sums over the episode as ``episode_metrics``.
     """
 
     def __init__(self, env: Env) -> None:
@@ -138,9 +129,7 @@ class StepResults:
     """Returns the results of a step in Gymnasium's format.
 
     Args:
-        env: The environment.
-        observations: The format of the observations.
-        given: A function that converts all buffers, in one call, to the arrays or tensors that the caller gets.
+        given: Converts all buffers at once to arrays or tensors for the caller.
     """
 
     def __init__(self, env: Env, observations: Observations, given: Callable[..., list[Any]]) -> None:

@@ -16,14 +16,9 @@ from lyceum_warp.support.validate import described, positive_number
 class CheckedController:
     """Calls a controller, checks its actions, and selects a plan's action for each step of the plant.
 
-    Args:
-        controller: The controller.
-        env: The plant.
-
     Raises:
-        ValueError: The controller cannot be called with a state and an observation, simulates its plans in the plant
-            itself, or plans for several plants; or neither the controller's nor the plant's time step is a multiple of
-            the other.
+        ValueError: The controller has the wrong arguments, plans in the plant itself, or plans for several plants. Or
+            neither time step, the controller's or the plant's, is a multiple of the other.
     """
 
     def __init__(self, controller: Controller, env: Env) -> None:
@@ -53,18 +48,18 @@ class CheckedController:
         Args:
             state: State of the plant, (state_size,) float64.
             obs: The plant's observation, (nobs,).
-            shift: Number of controller steps between the initial state of the last plan and this state.
+            shift: Number of controller steps since the initial state of the last plan.
             step: Step of the plant, for error messages.
 
         Returns:
-            The plan, (horizon, nact) float32, copied to the CPU. A single action counts as a plan of horizon 1.
+            The plan, (horizon, nact) float32, on the CPU. A single action counts as a plan of horizon 1.
 
         Raises:
             ValueError: The plan has the wrong shape, or is not finite.
         """
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
-        # do not copy the returned action to the CPU: the plan contains it, and a second copy would synchronise again
+        # do not copy the returned action, because a second copy would wait for the device again
         return self._checked(action, 1, step)[None] if plan is None else self._checked(plan, 2, step)
 
     def reset(self, seed: int | None) -> None:
@@ -73,32 +68,31 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """Get the number of failed samples and the effective sample size of the last plan; NaN if unknown."""
+        """Get the last plan's number of failed samples and its effective sample size. Unknown values are NaN."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
         failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
-        # report an effective sample size of 0 if all samples failed, because the weights are undefined
+        # the weights are undefined if all samples failed
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
-        """Convert a number of plant steps to the number of complete controller steps."""
+        """Convert plant steps to complete controller steps."""
         return plant_steps * self._plan_steps // self._plant_steps
 
     def passed(self, before: int, now: int) -> int:
-        """Count the controller steps that are completed between two plant steps of an episode."""
+        """Count the controller steps that end between two plant steps."""
         return self.steps(now) - self.steps(before)
 
     def action(self, plan: torch.Tensor, plant_steps: int) -> torch.Tensor:
-        """Select the action to apply ``plant_steps`` steps of the plant after the plan's initial state.
+        """Select the action for the time ``plant_steps`` after the plan's initial state.
 
-        If a step of the plan covers several steps of the plant, the action is held for all of them; if the controller
-        has ``between="linear"``, the action is interpolated towards the next action. After the end of the plan, the
-        plan's last action is held.
+        An action is held until the controller's next step, or interpolated towards the next action if the controller
+        has ``between="linear"``. The last action of the plan is held for ever.
 
         Args:
             plan: The plan, (horizon, nact).
-            plant_steps: Number of steps of the plant.
+            plant_steps: Number of plant steps since the plan's initial state.
 
         Returns:
             The action, (nact,).
@@ -109,7 +103,7 @@ class CheckedController:
         return plan[min(index, len(plan) - 1)]
 
     def check_horizon(self, horizon: int, steps: int) -> None:
-        """Check that a plan of length ``horizon`` covers a number of plant steps.
+        """Check that a plan of ``horizon`` actions lasts for a number of plant steps.
 
         Raises:
             ValueError: The plan is too short.
@@ -124,7 +118,7 @@ class CheckedController:
             )
 
     def description(self) -> dict[str, Any]:
-        """Describe the controller by name, settings, engine and device; see ``Trajectory.controller``."""
+        """Describe the controller's name, settings, engine and device; see ``Trajectory.controller``."""
         controller = self._controller
         found: dict[str, Any] = {"name": getattr(controller, "__name__", type(controller).__name__)}
         if (samples := getattr(controller, "samples", None)) is not None:
@@ -133,7 +127,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # convert to JSON and back, so that a loaded file gives the same result; other types become strings
+        # a loaded file must give the same result, so convert all values to JSON types
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -150,7 +144,7 @@ class CheckedController:
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:
-    """Compute how many plan steps and how many plant steps fit into the longer time step.
+    """Return how many plan steps and how many plant steps the longer time step lasts.
 
     Raises:
         ValueError: The larger time step is not a multiple of the smaller one.
@@ -165,7 +159,6 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
 
 
 def _check_call(controller: Any) -> None:
-    """Raise an error if a controller cannot be called with a state and an observation."""
     if not callable(controller):
         raise ValueError(
             f"a controller must be callable with (state, obs), not {described(controller)}: pass a function, or "
@@ -181,7 +174,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature; None if Python does not know it, as for some C functions."""
+    """Get a function's signature, or None if Python does not know it, as for some C functions."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):
@@ -189,7 +182,6 @@ def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
 
 
 def _fits(signature: inspect.Signature, count: int) -> bool:
-    """Check whether a function with this signature accepts ``count`` positional arguments."""
     try:
         signature.bind(*[None] * count)
     except TypeError:

@@ -21,9 +21,9 @@ from lyceum_warp.support.validate import positive_number
 class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
 
-    A value is None if there are too few plans, if the value does not apply, or if the controller does not report the
-    value. The first plan of each trajectory takes longer than later plans, because it loads kernels and captures
-    graphs. Statistics of planning times therefore exclude the first plan, whose planning time is ``first_plan_ms``.
+    A value is None if there are too few plans, if the controller does not report it, or if it does not apply. The first
+    plan of each trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times
+    therefore exclude it; see ``first_plan_ms``.
     """
 
     task: str
@@ -39,11 +39,11 @@ class ControlReport:
     plans: int
     """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time among the trajectories' first plans, in milliseconds."""
+    """Longest planning time of a first plan, in milliseconds."""
     plan_mean_ms: float | None
     """Mean planning time, in milliseconds."""
     plan_p50_ms: float | None
-    """Median planning time, in milliseconds; None with fewer than 2 plans. All quantiles are interpolated."""
+    """Median planning time, in milliseconds; None with fewer than 2 plans. Quantiles are interpolated."""
     plan_p90_ms: float | None
     """90 % quantile of the planning time, in milliseconds; None with fewer than 10 plans."""
     plan_p99_ms: float | None
@@ -55,28 +55,28 @@ class ControlReport:
     plan_jitter_ms: float | None
     """Standard deviation of the planning time, in milliseconds."""
     plans_per_second: float | None
-    """Number of finished plans per second of wall time."""
+    """Finished plans per second of wall time."""
     deadline_ms: float
-    """Longest planning time that meets the deadline, in milliseconds: 1 / ``rate``, or the plant's period."""
+    """Deadline for the planning time, in milliseconds: 1 / ``rate``, or the plant's period."""
     misses: int
     """Number of plans with a planning time above the deadline."""
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, including first plans. For such a plan, the planner only shifts the
-    previous plan in time."""
+    """Number of plans whose samples all failed, including first plans. The planner then only shifts the previous plan
+    in time."""
     known_plans: int
-    """Number of plans, including first plans, for which the controller reports the number of failed samples."""
+    """Number of plans, including first plans, for which the controller reports failed samples."""
     failed_share: float | None
-    """Fraction of samples that failed, in the plans that ``known_plans`` counts."""
+    """Fraction of failed samples in these plans."""
     effective_samples_mean: float | None
-    """Mean effective sample size of a plan: 1 if a single sample has all the weight, 0 if all samples failed."""
+    """Mean effective sample size of a plan: 1 if one sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None
-    """Standard deviation of the delays of the plant's steps, in milliseconds; None in a synchronous run."""
+    """Standard deviation of the delays of plant steps, in milliseconds; None in a synchronous run."""
     tick_delay_max_ms: float | None
     """Longest delay of a step, in milliseconds."""
     late_ticks: int | None
-    """Number of steps that started late because the previous step was not finished in time."""
+    """Number of steps that started late because the previous step took too long."""
     age_mean_ms: float
     """Mean age of the applied actions, in milliseconds; see ``Trajectory.ages``."""
     age_max_ms: float
@@ -84,9 +84,9 @@ class ControlReport:
     age_steps_mean: float
     """Mean age of the applied actions, in steps of the plant."""
     age_steps_max: int
-    """Maximum age of the applied actions, in steps of the plant; 1 if every plan was finished in time."""
+    """Maximum age of the applied actions, in plant steps; 1 if every plan was finished in time."""
     real_time_factor: float
-    """Simulated seconds per second of wall time, over all episodes."""
+    """Simulated seconds per second of wall time."""
     episode_seconds_mean: float
     """Mean wall time of an episode, in seconds."""
     return_mean: float
@@ -94,7 +94,7 @@ class ControlReport:
     return_std: float | None
     """Sample standard deviation (n - 1) of the returns."""
     eval_mean: float
-    """Mean evaluation metric in the last states of the episodes."""
+    """Mean evaluation metric in the last state of an episode."""
     success: float
     """Fraction of episodes that end in success."""
     success_low: float
@@ -109,11 +109,11 @@ class ControlReport:
     """Versions of Python and packages, and the machine, from the first trajectory."""
 
     def to_json(self) -> str:
-        """Convert the report to JSON; missing and non-finite numbers become null."""
+        """Convert the report to JSON. Missing and non-finite numbers become null."""
         return json.dumps(_finite(dataclasses.asdict(self)), indent=2, allow_nan=False)
 
     def write(self, path: str | Path) -> Path:
-        """Write the report as JSON to a file, atomically, and return the file's path."""
+        """Write the report as JSON, atomically, and return the file's path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(path) as temporary:
@@ -121,7 +121,7 @@ class ControlReport:
         return path
 
     def rows(self) -> list[tuple[str, str]]:
-        """Format the report as rows of two strings: a label, and a number with its unit ("-" if missing)."""
+        """Format the report as pairs of a label and a number with its unit ("-" if missing)."""
         rows = [
             ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
             ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),
@@ -160,9 +160,9 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
     """Make a report on one or many episodes of a controller.
 
     Args:
-        trajectories: Episodes of the same task, engine, mode and controller.
-        rate: Required number of plans per second; the deadline of a plan is 1 / ``rate``. By default, one plan is
-            required per period of the plant.
+        trajectories: Episodes with the same task, engine, mode and controller.
+        rate: Required plans per second. A plan's deadline is 1 / ``rate``. By default, the deadline is the plant's
+            period.
 
     Raises:
         ValueError: There is no trajectory, the trajectories differ in task, engine, mode or controller, or the rate is
@@ -204,7 +204,7 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# each quantile, and the number of plans that it needs
+# quantile, and number of plans that it needs
 _QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
 
 
@@ -223,18 +223,17 @@ def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:
 
 
 def _std(values: np.ndarray) -> float | None:
-    """Compute the sample standard deviation (n - 1); None if there are fewer than two values or any is not finite."""
+    """Compute the sample standard deviation (n - 1), or None if it is undefined."""
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
 def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
     names = dict.fromkeys(name for mapping in mappings for name in mapping)
-    # compare values as text, because NaN != NaN
+    # compare texts, because NaN != NaN
     return [name for name in names if len({json.dumps(mapping.get(name)) for mapping in mappings}) > 1]
 
 
 def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
-    """Summarise planning times and missed deadlines, excluding the first plan of each episode."""
     times = _joined(episode.plan_times[1:] for episode in episodes)
     misses = int((times > deadline).sum())
     return {
@@ -255,7 +254,7 @@ def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[st
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
-    """Compute the number of plans per second; the first plan of each episode and its planning time do not count."""
+    """Compute the rate of plans without each episode's first plan."""
     plans, seconds = 0, 0.0
     for episode in episodes:
         ends = episode.plan_starts + episode.plan_times
@@ -265,7 +264,6 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
 
 
 def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Summarise failed samples and effective sample sizes, as far as the controller reports them."""
     failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
     failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
     samples = episodes[0].controller.get("samples")
@@ -279,7 +277,6 @@ def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
 
 
 def _tick_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    """Summarise the delays of the plant's steps in asynchronous runs."""
     if episodes[0].mode == "sync":
         return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
     delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)

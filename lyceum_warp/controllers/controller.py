@@ -9,10 +9,10 @@ from lyceum_warp.env import Env
 
 
 class Controller(Protocol):
-    """A function that returns an action for the state and the observation of one world, the plant.
+    """A function from the state and the observation of one world, the plant, to an action.
 
     Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
-    Further attributes and methods are optional; ``PlanningController`` lists them.
+    ``PlanningController`` lists optional attributes and methods.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -32,7 +32,7 @@ class Controller(Protocol):
 class PlanningController(Controller, Protocol):
     """A controller that plans a sequence of actions and returns the first action, such as ``lw.MPPI``.
 
-    A controller implements only those attributes and methods that it needs. It need not derive from
+    Attributes and methods are optional: implement only those that you need. There is no need to derive from
     ``PlanningController``.
     """
 
@@ -42,14 +42,13 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Number of steps of length ``timestep`` since the initial state of the last plan; 0 for the first plan
-                after a reset. With ``reset=False``, the loops assume that the last plan was made in the previous step
-                or, with ``replan_every``, in the last step for which a plan was due. The loops pass ``shift`` only if
-                the controller has an argument of this name.
+            shift: Number of controller steps (see ``timestep``) since the initial state of the last plan. It is 0 for
+                the first plan after a reset. With ``reset=False``, the loops assume that the previous run made a plan
+                whenever one was due. Loops pass ``shift`` only to a controller with an argument of this name.
 
         Returns:
-            The first action of the plan, (nu,). If the controller has an attribute ``actions``, the loops instead read
-            the whole plan from this attribute.
+            The first action of the plan, (nu,). If the controller has an attribute ``actions``, the loops read the
+            whole plan from it instead.
         """
         ...
 
@@ -59,20 +58,20 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact): finite numbers. The first action is for the given state."""
+        """The last plan, (horizon, nact), all finite. The first action is for the given state."""
         ...
 
     @property
     def timestep(self) -> float:
-        """Simulated seconds between two actions of the plan; by default the plant's time step.
+        """Simulated seconds between two actions of the plan. By default this is the plant's time step.
 
-        The controller's time step must be a whole multiple or a whole fraction of the plant's time step.
+        It must be a whole multiple or a whole fraction of the plant's time step.
         """
         ...
 
     @property
     def between(self) -> Literal["hold", "linear"]:
-        """Which action the plant applies between two actions of the plan; see ``MPPIConfig.between``."""
+        """How the plant moves from one action of the plan to the next; see ``MPPIConfig.between``."""
         ...
 
     @property
@@ -87,7 +86,7 @@ class PlanningController(Controller, Protocol):
 
     @property
     def summary(self) -> Mapping[str, float]:
-        """Quality of the last plan: ``failed_samples`` and ``effective_samples`` (the effective sample size)."""
+        """Quality of the last plan: ``failed_samples``, and the effective sample size as ``effective_samples``."""
         ...
 
     @property
@@ -97,5 +96,5 @@ class PlanningController(Controller, Protocol):
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. It must not be the plant itself, because planning changes the state."""
+        """Environment that simulates the plans. It must not be the plant, because planning changes the state."""
         ...

@@ -21,7 +21,7 @@ class ControlProgress:
     step: int
     """Number of steps so far."""
     time: float
-    """Wall time so far, including the last step, in seconds."""
+    """Wall time so far, in seconds."""
     reward: float
     """Reward of the step."""
     eval: float
@@ -29,11 +29,11 @@ class ControlProgress:
     success: bool
     """Whether the state after the step is a success."""
     plan_time: float
-    """Planning time of the plan to which the step's action belongs, in seconds."""
+    """Planning time of the plan that contains the step's action, in seconds."""
     age: float
     """Age of the step's action when it was applied, in seconds; see ``Trajectory.ages``."""
     plans: int
-    """Number of plans so far, up to the plan to which the step's action belongs."""
+    """Number of plans so far."""
 
 
 OnStep = Callable[[ControlProgress], object]
@@ -49,16 +49,16 @@ class TimedPlan:
     begun: float  # start time, in seconds on the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
-    ahead: int = 0  # number of steps by which the initial state was predicted
+    ahead: int = 0  # the initial state was predicted by this number of steps
 
     @property
     def seen(self) -> int:
-        """Index of the measured state from which the plan's initial state was predicted."""
+        """Index of the measured state that the plan is based on."""
         return self.step - self.ahead
 
 
 def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the arguments that both control loops have in common."""
+    """Check the arguments that both control loops share."""
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_kind("on_step", on_step, Callable | None, "a function")
@@ -71,11 +71,11 @@ def begin_episode(
     """Reset the plant and the controller, unless ``reset`` is False.
 
     Returns:
-        The maximum number of steps, and the number of steps since the reset (not 0 in a continued run).
+        The maximum number of steps, and the number of steps since the reset. The latter is 0 unless a run is continued.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the current
-            episode is over, or a seed is given without a reset.
+        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the episode is
+            over, or a seed is given without a reset.
     """
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
@@ -100,15 +100,7 @@ def begin_episode(
 class EpisodeCollector:
     """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory``.
 
-    For each step, a loop calls ``before_step``, steps the plant and calls ``after_step``.
-
-    Args:
-        env: The plant, in its initial state.
-        controller: The checked controller.
-        mode: "sync" or "async"; see ``Trajectory.mode``.
-        period: Wall time between two steps, in seconds.
-        seed: Seed of the run.
-        now: Function that reads the clock, in seconds.
+    A loop calls ``before_step``, steps the plant, and calls ``after_step``.
     """
 
     def __init__(
@@ -119,7 +111,7 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        # the action, its plan, its age, and whether the step was late
+        # action, plan, age, and whether the step was late
         self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
         self._outcomes: list[tuple[float, float, bool]] = []
         self._plans: list[tuple[int, float, float, float, float]] = []
@@ -127,31 +119,24 @@ class EpisodeCollector:
         self.start = now()
 
     def restart_clock(self) -> None:
-        """Restart the clock, which first starts when the collector is constructed."""
+        """Restart the clock."""
         self.start = self._now()
 
     def elapsed(self) -> float:
-        """Return the seconds since the clock started."""
+        """Return the seconds on the clock."""
         return self._now() - self.start
 
     def add_plan(self, plan: TimedPlan, quality: tuple[float, float]) -> None:
-        """Add a finished plan; ``quality`` is its number of failed samples and its effective sample size."""
+        """Add a finished plan with its number of failed samples and its effective sample size."""
         self._plans.append((plan.seen, plan.begun - self.start, plan.seconds, *quality))
 
     def before_step(self, plan: TimedPlan, now: float, age: float, *, late: bool) -> None:
-        """Record ``env.action`` just before the plant applies it.
-
-        Args:
-            plan: The plan that contains the action.
-            now: Seconds since the clock started.
-            age: Age of the action, in seconds.
-            late: Whether the step starts late.
-        """
+        """Record ``env.action``, which the plant is about to apply, and its ``age`` in seconds."""
         self._applied.append((self.env.action[0].clone(), plan, age, late))
         self.times.append(now)
 
     def after_step(self, on_step: OnStep | None) -> None:
-        """Record the state, the observation and the outcome of a step, and report progress."""
+        """Record the result of a step, and report progress."""
         env = self.env
         self.states.append(env.get_state()[0])
         self.obs.append(env.final_obs[0].clone())
@@ -162,13 +147,13 @@ class EpisodeCollector:
             on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
-        """If there are complete steps, call ``on_abort`` with their trajectory."""
+        """Call ``on_abort`` with the trajectory so far, if there are complete steps."""
         if on_abort is not None and self._outcomes and self._plans:
             on_abort(self.trajectory(wall_seconds, done_reason=0))
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
         """Make the trajectory of all complete steps."""
-        steps = len(self._outcomes)  # omit an interrupted step: it has no outcome, because outcomes are recorded last
+        steps = len(self._outcomes)  # an interrupted step has no outcome, so omit it
         rewards, evals, success = zip(*self._outcomes, strict=True)
         actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
         plan_steps, *plans = zip(*self._plans, strict=True)

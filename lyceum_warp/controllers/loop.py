@@ -31,34 +31,31 @@ def control(
     on_step: OnStep | None = None,
     on_abort: OnAbort | None = None,
 ) -> Trajectory:
-    """Control one world, the plant, until its episode ends; the plant waits while the controller plans.
+    """Control one world, the plant, until its episode ends. The plant waits while the controller plans.
 
     Args:
         env: The plant, an environment of one world made with ``autoreset=False``.
-        controller: The controller; see ``lw.Controller``. Each call makes a plan. The controller must not step
-            ``env``.
+        controller: The controller; see ``lw.Controller``. It makes a plan in each call. It must not step ``env``.
         steps: Maximum number of steps; the episode may end earlier.
-        replan_every: Number of steps from one plan to the next plan. Steps in between apply further actions of the last
-            plan, so values above 1 require a controller with an attribute ``actions``.
+        replan_every: Number of steps between two plans. The other steps apply further actions of the last plan, so the
+            controller needs an attribute ``actions``.
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
-            and the controller's last plan, and ``replan_every`` must be the same as in the previous run.
-        on_step: Called with a ``ControlProgress`` after each step. Planning times do not include ``on_step``.
-        on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
-            the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
-            ``on_abort``.
+            and the controller's last plan. ``replan_every`` must be the same as before.
+        on_step: Called with a ``ControlProgress`` after each step. Planning times exclude it.
+        on_abort: Called with the trajectory so far if an exception, such as Ctrl-C, ends the run after the first step.
+            Its ``done_reason`` is 0. The exception is then raised again.
 
     Returns:
-        The trajectory of the episode; the plant's time step is stored as ``period``.
+        The trajectory of the episode. Its ``period`` is the plant's time step.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an
-            action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
+        ValueError: The environment has several worlds or automatic resets, or the episode is over or may never end. Or
+            an action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
     """
     check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
     checked = CheckedController(controller, env)
-    # count steps from the reset, so that plans shift as in an uninterrupted run
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every

@@ -23,20 +23,19 @@ def policy_episodes(
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
-    The episodes equal the episodes of ``lw.evaluate`` with the same seed and number of worlds. The policy computes the
-    actions of all worlds at once, so the times in a trajectory are those of the whole batch.
+    The episodes equal those of ``lw.evaluate`` with the same seed and number of worlds. All worlds share a call of the
+    policy, so the times in a trajectory are those of the whole batch.
 
     Args:
         env: An environment made with ``autoreset=False``; its worlds are reset.
         policy: Function from observations (nworld, nobs) to actions (nworld, nact).
         episodes: Number of episodes.
-        seed: Seed of the initial states. Without a seed, the initial states depend on the random numbers that the
-            worlds have used before.
+        seed: Seed of the initial states. By default, the worlds continue their random streams.
         controller: Description of the policy; see ``Trajectory.controller``.
-        progress: Called every ten steps with the number of steps so far and the maximum number.
+        progress: Called every ten steps with the steps so far and the maximum number of steps.
 
     Yields:
-        The first episode of each world, then the second episode of each world, and so on.
+        The first episodes of all worlds, then their second episodes, and so on.
 
     Raises:
         ValueError: The environment has automatic resets, or its episodes may never end.
@@ -64,14 +63,12 @@ def policy_episodes(
 
 
 class _Batch:
-    """One episode in every world of an environment, starting from the worlds' current states."""
-
     def __init__(self, env: Env) -> None:
         self.env = env
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        # for each step: time of the action, duration of the policy's call, and time of the step's end
+        # time of the action, duration of the policy's call, and time of the step's end
         self._times: list[tuple[float, float, float]] = []
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
@@ -79,16 +76,13 @@ class _Batch:
 
     @property
     def steps(self) -> int:
-        """Number of steps so far."""
         return len(self._actions)
 
     @property
     def ended(self) -> bool:
-        """Whether the episodes of all worlds have ended."""
         return bool((self._lengths > 0).all())
 
     def step(self, policy: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        """Step all worlds, including worlds with finished episodes."""
         env, begun = self.env, time.perf_counter()
         env.action.copy_(policy(env.obs))
         self._actions.append(env.action.cpu().clone())
@@ -103,7 +97,7 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """Make the trajectory of a world; ``origin`` holds more attributes, such as the results of ``provenance``."""
+        """Make a world's trajectory; ``origin`` has the attributes from ``provenance``."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

@@ -1,4 +1,4 @@
-"""Measure planning times, and choose the largest setting of a planner that meets a real-time deadline."""
+"""Choose the largest setting of a planner that meets a real-time deadline, by measuring planning times."""
 
 import bisect
 import dataclasses
@@ -12,22 +12,22 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 
 SHARE = 0.8
-"""A setting meets the deadline if the 99 % quantile of its planning time is at most this fraction of the deadline."""
+"""A setting meets the deadline if the 99 % quantile of its planning time is at most this fraction of it."""
 
-_SECONDS = 0.4  # duration of a measurement; _STEPS is its minimum number of steps
+_SECONDS = 0.4  # a measurement lasts this long, but at least _STEPS steps
 _STEPS = 12
 
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeSetting:
-    """The settings of a planner on which its planning time depends."""
+    """The settings that determine a planner's planning time."""
 
     samples: int
     """Number of samples."""
     horizon: int
     """Number of steps in a plan."""
     physics: str | None = None
-    """Name of the physics options of the planner's worlds; None if the options have no name."""
+    """Name of the planner's physics options; None if they have no name."""
 
     def __str__(self) -> str:
         physics = "" if self.physics is None else f", physics {self.physics}"
@@ -36,24 +36,23 @@ class RealTimeSetting:
 
 @dataclasses.dataclass(frozen=True)
 class RealTimeChoice:
-    """The chosen setting of a planner, and the planning times on which the choice is based.
+    """The chosen setting of a planner, with its planning time.
 
     Planning times are 99 % quantiles in seconds.
     """
 
     setting: RealTimeSetting
-    """The largest setting that meets the deadline, or else the fastest measured setting."""
+    """The largest setting that meets the deadline, or else the fastest one."""
     planning_time: float
     """Planning time of the setting."""
     deadline: float
     """Longest permitted planning time, in seconds."""
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and its planning time; None if no number misses
-    the deadline."""
+    """The smallest measured number of samples that misses the deadline, and its planning time, or None."""
 
     @property
     def replan_every(self) -> int:
-        """Number of plant steps per plan if a step lasts as long as the deadline; 1 if plans meet the deadline."""
+        """Number of plant steps per plan, if a step lasts as long as the deadline."""
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
@@ -74,18 +73,17 @@ def choose_setting(
 ) -> RealTimeChoice:
     """Choose the largest number of samples for which planning meets a deadline.
 
-    If the smallest number of samples misses the deadline, the function tries shorter horizons, and then other physics
-    options.
+    If even the smallest number of samples is too slow, try shorter horizons, and then other physics options.
 
     Args:
         samples: Numbers of samples, in ascending order.
         horizons: Horizons, the preferred one first.
         physics: Names of physics options, the preferred one first.
-        measure: Function from a setting to the 99 % quantile of its planning times, in seconds.
+        measure: Returns the 99 % quantile of a setting's planning times, in seconds.
         deadline: Longest permitted planning time, in seconds.
 
     Returns:
-        The choice. If no setting meets the deadline, the choice is the fastest measured setting.
+        The largest setting that meets the deadline, or else the fastest one.
     """
     budget, missed = SHARE * deadline, []
     for name in physics:
@@ -100,7 +98,7 @@ def choose_setting(
                     missed.append(RealTimeChoice(setting, found, deadline, None))
                 else:
                     low = tried
-                # planning times grow at most in proportion to the number of samples
+                # the planning time grows at most in proportion to the number of samples
                 reachable = bisect.bisect(samples, samples[tried] * budget / found) - 1
                 tried = min(max(reachable, low + 1), high - 1)
             if low >= 0:
@@ -111,11 +109,7 @@ def choose_setting(
 
 
 def planning_time(plant: Env, planner: Controller) -> float:
-    """Measure a planner in real time, for about half a second, and restore the plant's state.
-
-    Args:
-        plant: The plant.
-        planner: The planner.
+    """Measure a planner in real time for about half a second. Restore the plant's state.
 
     Returns:
         The 99 % quantile of the planning times, in seconds.

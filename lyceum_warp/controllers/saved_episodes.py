@@ -1,4 +1,4 @@
-"""Load saved episodes for playback, and make an environment that accepts their states."""
+"""Load saved episodes, and make an environment that accepts their states."""
 
 import os
 import stat
@@ -13,19 +13,18 @@ from lyceum_warp.task import Task
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
-    """Load episodes of one task with states of the same layout.
+    """Load episodes of the same task and the same layout of states.
 
     Args:
-        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. The
-            ``.npz`` files of a folder are loaded in alphabetical order.
+        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. A
+            folder stands for its ``.npz`` files in alphabetical order.
 
     Returns:
         The episodes by file, in the order of ``paths``.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
-        ValueError: A file is broken, was written by a newer release, or has a different task or model than the first
-            file.
+        ValueError: A file is broken, comes from a newer release, or has a different task or model than the first file.
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
@@ -42,23 +41,23 @@ def episode_env(
 ) -> Env:
     """Make an environment for the states of saved episodes, with one world and no automatic resets.
 
-    The environment has the parameters, the model and the physics options of the first episode. ``env.set_state``
-    accepts the states of all given episodes.
+    The environment has the first episode's parameters, model and physics options. ``env.set_state`` accepts the states
+    of all episodes.
 
-    The file of an episode names the file of its task, and making the environment runs this task file as Python code. An
-    episode from another person could thus run foreign code. Without ``task``, this function therefore runs a task file
-    only if the file and its folder belong to this user or to root, and no other user can write to the file or folder.
+    An episode's file names the file of its task, and making the environment runs that file as Python code. An episode
+    from another person could thus run foreign code. Without ``task``, this function runs a task file only if no other
+    user can write to the file or its folder. Both must belong to this user or to root.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, with the same name as the episodes' task; required if the task was defined in a notebook, if the
-            task's file has moved, or if other users can write to the file.
+        task: The task, which must have the name of the episodes' task. It is required if the task was defined in a
+            notebook, if its file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task cannot be found or has a different name, other users can write to the task's file, or the
-            states do not fit the task.
+        ValueError: The task is not found or has a different name, other users can write to its file, or the states do
+            not fit it.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -80,13 +79,8 @@ def episode_env(
 def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode") -> None:
     """Check that an environment accepts the states of an episode.
 
-    Args:
-        env: The environment.
-        episode: The episode.
-        name: Name of the episode in error messages.
-
     Raises:
-        ValueError: The episode has a different task, or its states have a different layout.
+        ValueError: The episode has a different task or a different layout of states.
     """
     if episode.task != env.task.name:
         raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of the task {env.task.name!r}")
@@ -124,9 +118,9 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """Describe the first difference between two state layouts, such as "qpos of 7 numbers, not 9".
+    """Describe how two state layouts differ, such as "qpos of 7 numbers, not 9".
 
-    The returned text is empty if the layouts are equal.
+    Return "" if they are equal.
     """
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
@@ -164,7 +158,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 def _foreign(file: Path) -> str:
     """Explain why a file may contain another user's code, such as "it can be written by other users".
 
-    The explanation is empty if the file cannot contain another user's code.
+    Return "" if it cannot.
     """
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
@@ -178,7 +172,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Check whether a group belongs to root or contains only this user (many systems make such a group per user)."""
+    """Return whether only root or this user is in a group. Many systems make a group for each user."""
     import grp
     import pwd
 

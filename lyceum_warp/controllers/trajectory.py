@@ -1,4 +1,4 @@
-"""Store one episode of a controlled world, in memory and in files: ``lw.Trajectory``."""
+"""Store one episode of a controlled world in memory and in files: ``lw.Trajectory``."""
 
 import dataclasses
 import json
@@ -17,9 +17,9 @@ from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
-"""Version of the file format. A release increases the version if older releases cannot read its files."""
+"""Version of the file format. It increases if older releases cannot read the new files."""
 
-# dtype and axes of each array; axes with the same name must have the same length
+# dtype and axes of each array
 _ARRAYS = {
     "states": (torch.float64, ("steps + 1", "state_size")), "obs": (torch.float32, ("steps + 1", "nobs")),
     "actions": (torch.float32, ("steps", "nu")), "rewards": (torch.float32, ("steps",)),
@@ -42,15 +42,15 @@ class Trajectory:
     """One episode of a controlled world, the plant. All tensors are on the CPU.
 
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
-    engine, set the first state with ``set_state`` and step with each action.
+    engine, call ``set_state`` with the first state and step with each action.
 
-    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after the first
-    plan in an asynchronous run.
+    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
+    asynchronous run.
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. If a fault ended the episode, the last state is instead the first state
-    of the next episode."""
+    """States, (steps + 1, state_size) float64. If a fault ended the episode, the last state is the first state of the
+    next episode."""
     obs: torch.Tensor
     """Observations of the states, (steps + 1, nobs) float32. If a fault ended the episode, the last valid observation
     is repeated."""
@@ -66,18 +66,17 @@ class Trajectory:
     """Time at which each action was applied, (steps,) float64, in seconds."""
     ages: torch.Tensor
     """Age of each action when it was applied, (steps,) float64, in seconds. The age is the wall time since the plant
-    was in the plan's initial state. In a synchronous run, the age of a plan's first action is thus the planning
-    time."""
+    was in the plan's initial state. In a synchronous run, a plan's first action is as old as the planning time."""
     late: torch.Tensor
-    """Whether each step started late because the previous step was not finished in time, (steps,) bool. In a
-    synchronous run, no step is late."""
+    """Whether each step started late because the previous step took too long, (steps,) bool. In a synchronous run, no
+    step is late."""
     plan_of: torch.Tensor
     """Index of the plan that contains each action, (steps,) int64."""
     plan_steps: torch.Tensor
     """Index of each plan's initial state, (plans,) int64."""
     plan_starts: torch.Tensor
-    """Time at which planning started, (plans,) float64, in seconds; negative for the first plan of an asynchronous
-    run."""
+    """Time at which planning started, (plans,) float64, in seconds. The first plan of an asynchronous run has a
+    negative time."""
     plan_times: torch.Tensor
     """Planning time, including the copy of the actions to the CPU, (plans,) float64, in seconds."""
     plan_failed: torch.Tensor
@@ -103,19 +102,19 @@ class Trajectory:
     versions: Mapping[str, Any]
     """Versions of packages and Python, the machine, and the commit."""
     seed: int | None
-    """Seed of the initial state and of the controller, or None."""
+    """Seed of the initial state and of the controller."""
     controller: Mapping[str, Any]
-    """The controller's ``name``, and its settings, ``engine`` and ``device`` if it has them."""
+    """The controller's ``name``, and its settings, ``engine`` and ``device`` if known."""
     state_parts: Mapping[str, Sequence[int]]
-    """Columns [start, stop] of each part of a state, by the part's name."""
+    """Columns [start, stop] of each part of a state."""
     obs_parts: Mapping[str, Sequence[int]]
-    """Columns [start, stop] of each part of an observation, by the part's name."""
+    """Columns [start, stop] of each part of an observation."""
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The arguments of ``lw.make`` with which ``episode_env`` makes the plant again. ``task`` is a name or "file:class"
-    (None for a task from a notebook or script), ``params`` lists the names of the task parameters that were given, and
-    ``options`` holds the options. Files of earlier releases lack these arguments."""
+    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again. ``task`` is a name or
+    "file:class", or None for a task from a notebook or script. ``params`` lists the names of the given parameters, and
+    ``options`` has the options. Files of earlier releases lack these entries."""
 
     @property
     def steps(self) -> int:
@@ -129,7 +128,7 @@ class Trajectory:
 
     @property
     def terminated(self) -> bool:
-        """Whether the episode ended by termination (the task's ``terminated``)."""
+        """Whether the task's ``terminated`` ended the episode."""
         return bool(self.done_reason & Done.TERMINATED)
 
     @property
@@ -144,7 +143,7 @@ class Trajectory:
 
     @property
     def age_steps(self) -> torch.Tensor:
-        """Age of each action in steps of the plant, (steps,) int64."""
+        """Age of each action in plant steps, (steps,) int64."""
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def part(self, name: str) -> torch.Tensor:
@@ -161,9 +160,9 @@ class Trajectory:
     def save(self, path: str | Path) -> Path:
         """Write the trajectory to a file atomically, and return the file's path.
 
-        The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor attribute is stored as an array
-        of the same name. The zero-dimensional string array ``info`` is a JSON object with the other attributes and
-        ``format``, which is 1. For example, with ``start, stop = info["state_parts"]["qpos"]``, the positions are
+        The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor is an array with the attribute's
+        name. The string ``info``, an array without dimensions, is a JSON object with the other attributes and
+        ``format``, which is 1. After ``start, stop = info["state_parts"]["qpos"]``, for example, the positions are
         ``states[:, start:stop]``.
         """
         path = Path(path)
@@ -171,7 +170,7 @@ class Trajectory:
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
-        # pass an open file, because numpy would append .npz to a path
+        # numpy appends .npz to a path, but not to an open file
         with replaced(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, **arrays)
         return path
@@ -182,12 +181,12 @@ class Trajectory:
 
         Raises:
             FileNotFoundError: The file does not exist.
-            ValueError: The file is broken, is not a trajectory, or was written by a newer release.
+            ValueError: The file is broken, is not a trajectory, or comes from a newer release.
         """
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                # files of earlier releases lack the entry "source"
+                # files of earlier releases have no "source"
                 info = {"source": {}, **json.loads(str(file["info"]))}
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
@@ -204,7 +203,6 @@ class Trajectory:
 
 
 def _check(arrays: Mapping[str, torch.Tensor]) -> None:
-    """Raise an error if an array has a wrong type, or if the arrays' shapes are inconsistent."""
     steps = len(arrays["actions"])
     lengths = {"steps": steps, "steps + 1": steps + 1, "plans": len(arrays["plan_times"])}
     for name, (dtype, axes) in _ARRAYS.items():
@@ -217,7 +215,6 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 
 
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
-    """Raise an error if a part lies outside an array's columns, or if ``source`` has wrong types."""
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
             whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
@@ -232,7 +229,7 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 
 def provenance(env: Env) -> dict[str, Any]:
-    """Collect the trajectory's attributes that depend only on the environment: task, engine, versions, column names."""
+    """Collect the attributes of a trajectory that depend only on the environment."""
     params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
@@ -243,11 +240,11 @@ def provenance(env: Env) -> dict[str, Any]:
 
 
 _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "fields")
-"""Options that affect neither the physics nor the states; they are not stored."""
+"""Options that change neither the physics nor the states. Trajectories do not store them."""
 
 
 def source(env: Env) -> dict[str, Any]:
-    """Collect the arguments from which an environment can be made again; see ``Trajectory.source``."""
+    """Collect the arguments that make an environment again; see ``Trajectory.source``."""
     task = env.task.task
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)

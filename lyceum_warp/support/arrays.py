@@ -10,36 +10,36 @@ import torch
 import warp as wp
 
 WORLDS_A_BLOCK = 32
-"""The number of threads in a CUDA block if each thread processes a world. Larger blocks would leave most
-multiprocessors idle."""
+"""Threads in a CUDA block, for kernels with one thread per world. Larger blocks would leave most multiprocessors
+idle."""
 
 _SPARE = 256
-"""The number of elements that ``with_memory`` allocates for an empty array."""
+"""Number of elements that stand in for an empty array."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """Make an alias of an array's memory with a different type, shape or strides; the alias keeps the memory alive."""
+    """View an array's memory with a different type, shape or strides. The view keeps the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view
 
 
 def flat(array: wp.array) -> wp.array:
-    """View an array's memory as a (nworld, n) float32 array, for copies that do not depend on the type."""
+    """View an array's memory as (nworld, n) float32, to copy it without regard to its type."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
     return alias(array, wp.float32, (array.shape[0], n))
 
 
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
-    """Make a read-only array of equal rows, (count, ...), which share the memory of one row (stride 0)."""
+    """Make a read-only array (count, ...) of equal rows, which share the memory of one row (stride 0)."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
     return alias(single, dtype, (count, *single.shape[1:]), (0, *single.strides[1:]))
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array; if it is empty, return an array of the same shape that has allocated memory.
+    """Return the array, or an array of the same shape with allocated memory if it is empty.
 
-    A task that reads an element of an empty array by mistake would otherwise crash the process.
+    Otherwise a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array
@@ -47,22 +47,17 @@ def with_memory(array: wp.array) -> wp.array:
 
 
 def torch_view(array: wp.array) -> torch.Tensor:
-    """Return the torch tensor that shares an array's memory."""
+    """Return a torch tensor that shares an array's memory."""
     return wp.to_torch(array, requires_grad=False)
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The part of the worlds to which launches are currently restricted: its index, and the number of parts."""
+"""The part of the worlds that launches are restricted to: index and number of parts."""
 
 
 @contextlib.contextmanager
 def part_of_worlds(part: int, parts: int) -> Iterator[None]:
-    """Return a context in which this module's functions launch kernels only for one part of the worlds.
-
-    Args:
-        part: The index of the part.
-        parts: The number of parts, which have about equal sizes.
-    """
+    """Restrict the launches of this module to one of several equal parts of the worlds."""
     token = _PART.set((part, parts))
     try:
         yield
@@ -71,9 +66,9 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
-    """Launch a kernel for the current part of the worlds; ``axis`` is the axis of the worlds in ``dim``.
+    """Launch a kernel over the current part of the worlds.
 
-    The kernel's last argument is the index of the first world of the part.
+    The kernel's last argument becomes the index of the first world.
     """
     part, parts = _PART.get()
     first, end = (dim[axis] * k // parts for k in (part, part + 1))
@@ -87,29 +82,29 @@ def _block(device: wp.Device | None) -> int:
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with one thread per world or row; the kernel's last argument is the index of the first row."""
+    """Launch a kernel with one thread per world. Its last argument becomes the index of the first world."""
     _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 
 def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel over (parts, nworld): several threads share the work on each world."""
+    """Launch a kernel with several threads per world, over (parts, nworld)."""
     _launch(kernel, (parts, nworld), 1, args, device, block_dim=_block(device))
 
 
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
-    """Launch a kernel over (nworld, lanes); the last arguments are the number of lanes and the first world's index.
+    """Launch a kernel over (nworld, lanes).
 
-    The lanes of a world are threads that share the work on the world's rows: one thread on the CPU, and a warp on a
-    GPU, for coalesced memory access.
+    Its last arguments become the number of lanes and the index of the first world. The lanes of a world are threads
+    that share the work: one thread on the CPU, and a warp on a GPU for coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch one of the copying kernels of ``kernels.state`` over the selected rows of the target, (nworld, n).
+    """Launch a copying kernel of ``kernels.state`` over the selected rows of the target, (nworld, n).
 
-    The kernel's last arguments are the number of threads per row and the first row.
+    Its last arguments become the number of threads per row and the first row.
     """
     if target.size == 0:
         return
@@ -118,22 +113,17 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
 
 
 PAIRS_A_LAUNCH = 4
-"""The number of pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
+"""Number of pairs of arrays per launch of ``narrow_four`` or ``widen_four``."""
 
 
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
-    """Launch ``narrow_four`` or ``widen_four`` of ``kernels.state`` over the selected rows of sources and targets.
+    """Copy the selected rows of several arrays with ``narrow_four`` or ``widen_four`` of ``kernels.state``.
 
-    On the CPU, a launch takes longer than copying a few short rows, so one launch copies up to four arrays.
-
-    Args:
-        kernel: The kernel.
-        mask: The mask of the rows to copy, (n,) bool.
-        pairs: Pairs of a source and a target, both (n, columns).
+    On the CPU, a launch takes longer than a copy of a few short rows, so one launch copies four arrays.
     """
     pairs = [pair for pair in pairs if pair[1].size]
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):
         some = list(pairs[i : i + PAIRS_A_LAUNCH])
         source, target = some[0]
-        some += [(source[:, :0], target[:, :0])] * (PAIRS_A_LAUNCH - len(some))  # nothing to copy
+        some += [(source[:, :0], target[:, :0])] * (PAIRS_A_LAUNCH - len(some))  # fill up with empty copies
         launch_worlds(kernel, len(mask), [mask, *(array for pair in some for array in pair)], mask.device)

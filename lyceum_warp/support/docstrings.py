@@ -1,8 +1,7 @@
 """Make ``help()`` show the docstrings of attributes and of overloaded Warp functions.
 
-Python discards a string after an attribute, so ``help`` does not show it. ``document_attributes`` reads the strings
-after attributes from the source and appends them to the docstring of the class. ``document_overloads`` sets the
-docstring of an overloaded Warp function, which has none.
+Python discards a string after an attribute, so ``document_attributes`` reads these strings from the source and adds
+them to the class's docstring. An overloaded Warp function has no docstring, so ``document_overloads`` sets it.
 """
 
 import ast
@@ -17,11 +16,11 @@ from typing import Any, TypeVar
 Class = TypeVar("Class", bound=type)
 
 
-_parse = functools.lru_cache(maxsize=1)(ast.parse)  # parse each module only once
+_parse = functools.lru_cache(maxsize=1)(ast.parse)
 
 
 def attribute_docs(cls: type) -> dict[str, str]:
-    """Return the docstrings of a class's attributes by name, in source order; empty if there is no source."""
+    """Return the docstrings of a class's attributes by name, or nothing if there is no source."""
     try:
         lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
         body: list[ast.stmt] = _parse("".join(lines)).body
@@ -42,13 +41,13 @@ def attribute_docs(cls: type) -> dict[str, str]:
 
 
 def listed(docs: dict[str, str]) -> str:
-    """Format names and their docstrings as the body of an ``Attributes:`` or ``Args:`` section."""
+    """Format names and docstrings as an ``Attributes:`` or ``Args:`` section."""
     entries = (f"{name}: {text}".splitlines() for name, text in docs.items())
     return "\n".join("\n".join(["    " + lines[0], *("        " + line for line in lines[1:])]) for lines in entries)
 
 
 def document_attributes(cls: Class) -> Class:
-    """Class decorator: append the docstrings of attributes, including inherited fields, to the class's docstring."""
+    """Append the docstrings of attributes, including inherited ones, to a class's docstring."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])):
         docs |= attribute_docs(base)
@@ -61,19 +60,14 @@ def document_attributes(cls: Class) -> Class:
 
 
 def document_overloads(function: Any) -> None:
-    """Give an overloaded Warp function a docstring: the arguments of each overload, and the docstring of the first."""
+    """Give an overloaded Warp function the docstring of its first overload, with the arguments of all overloads."""
     found = [overload.func for overload in (*function.user_overloads.values(), *function.user_templates.values())]
     signatures = dict.fromkeys(f"{function.key}({', '.join(inspect.signature(each).parameters)})" for each in found)
     function.__doc__ = "\n".join([*signatures, "", inspect.cleandoc(found[0].__doc__)])
 
 
 def document_arguments(function: Any, meanings: Mapping[str, str]) -> None:
-    """Append descriptions of the arguments of all overloads to a Warp function's docstring.
-
-    Args:
-        function: The function.
-        meanings: The descriptions by argument name; names that are not arguments of the function are ignored.
-    """
+    """Append descriptions of arguments to a Warp function's docstring."""
     overloads = (*function.user_overloads.values(), *function.user_templates.values())
     names = dict.fromkeys(name for overload in overloads for name in overload.input_types)
     if names:

@@ -11,16 +11,15 @@ from typing import Any
 
 @contextlib.contextmanager
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
-    """Replace a file atomically, so that a reader finds either the old file or the complete new file.
+    """Replace a file atomically: a reader finds either the old file or the complete new file.
 
-    The body of the ``with`` statement writes to the yielded path, a temporary file beside the target. If the body
-    raises an error, the target stays unchanged and the temporary file is deleted.
+    Write to the yielded path, a temporary file beside the target. If the body of the ``with`` statement raises an
+    error, the target stays unchanged.
 
     Args:
         path: The file.
-        durable: Whether to flush the new content to disk before it replaces the old file, so that it survives a power
-            loss.
-        previous: The path to which the old file is saved; by default, the old file is lost.
+        durable: Whether to flush the new content to disk first, so that it survives a power loss.
+        previous: Path to which the old file is saved; by default it is lost.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:
@@ -36,7 +35,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
                 shutil.copyfile(path, previous)
         try:
             os.replace(temporary, path)
-        except OSError:  # the file may be on a network drive, or open in another program
+        except OSError:  # the file may be open in another program
             time.sleep(0.1)
             os.replace(temporary, path)
     except OSError as error:
@@ -49,13 +48,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
 
 
 def unknown_format(path: Path, number: Any, known: int) -> ValueError:
-    """Return the error for a file whose format this release does not know.
-
-    Args:
-        path: The file.
-        number: The format number in the file.
-        known: The newest format that this release can read.
-    """
+    """Return the error for a file of an unknown format."""
     return ValueError(
         f"{path} has format {number!r}, and this lyceum_warp reads formats up to {known}: "
         "pip install --upgrade lyceum-warp"

@@ -1,4 +1,4 @@
-"""Make environments raise an error in forked children instead of waiting forever for the parent's threads."""
+"""Make environments raise an error in forked children, where they would wait for the parent's threads for ever."""
 
 import os
 import weakref
@@ -20,12 +20,12 @@ class LeftInParent:
 
 
 def leave_in_parent(thing: Any, *attributes: str) -> None:
-    """Make attributes of an object raise RuntimeError in all children that are forked later."""
+    """Make attributes of an object raise RuntimeError in children that are forked later."""
     _watched[thing] = attributes
 
 
 def call_once_gone(thing: Any, function: Callable[[], object]) -> None:
-    """Call a function when an object is deleted, except in forked children and at the end of the process."""
+    """Call a function when an object is deleted, but neither in forked children nor at the end of the process."""
     weakref.finalize(thing, _call_in, os.getpid(), function).atexit = False
 
 
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # never deleted: its destructor would wait forever
+            _kept.append(getattr(thing, name))  # its destructor would wait for ever
             setattr(thing, name, LeftInParent())
 
 

@@ -1,4 +1,4 @@
-"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception, raised immediately or when the caller can handle it."""
+"""Turn Ctrl-C, SIGTERM and SIGHUP into an exception, at once or when the caller is ready."""
 
 import contextlib
 import signal
@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 _NUMBERS = [int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""The numbers of SIGINT, SIGTERM and, except on Windows, SIGHUP."""
+"""SIGINT, SIGTERM and, except on Windows, SIGHUP."""
 
 
 class Interrupted(BaseException):
-    """Raised when a signal requests the end of the program."""
+    """Raised when a signal asks the program to end."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -18,11 +18,10 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal. ``obeyed`` replaces this handler, but not SIG_IGN."""
+    """Ignore a signal, until ``obeyed`` replaces this handler."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
-    """Raise Interrupted, and ignore all later signals."""
     for other in _NUMBERS:
         if signal.getsignal(other) is _interrupt:
             signal.signal(other, _ignore)
@@ -31,17 +30,17 @@ def _interrupt(number: int, frame: Any) -> None:
 
 @contextlib.contextmanager
 def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any = None) -> Iterator[dict[int, Any]]:
-    """Within the context, the first Ctrl-C, SIGTERM or SIGHUP raises Interrupted.
+    """Raise Interrupted at the first Ctrl-C, SIGTERM or SIGHUP within the context.
 
-    Later signals raise Interrupted only within ``obeyed``.
+    Later signals raise it only within ``obeyed``.
 
     Args:
         handler: The handler of the signals; by default it raises Interrupted.
-        replaces: Replace only this handler; by default, replace every handler that does not ignore the signal. Shells
-            make background programs ignore SIGINT, and nohup makes programs ignore SIGHUP.
+        replaces: Replace only this handler. By default, replace all handlers except those that ignore a signal. Shells
+            let background programs ignore SIGINT, and nohup lets programs ignore SIGHUP.
 
     Yields:
-        Replaced handlers, by signal; the context restores them at its end.
+        The replaced handlers, by signal. They are restored afterwards.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set signal handlers
@@ -57,7 +56,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """After the first Ctrl-C, SIGTERM or SIGHUP (see ``signals``), let the next signal raise Interrupted, too.
+    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted although ``signals`` has already raised it.
 
     The user can then cancel long work at the end of a program.
     """
@@ -65,9 +64,9 @@ def obeyed() -> contextlib.AbstractContextManager[object]:
 
 
 def _raise(number: int) -> None:
-    """Send a signal to this process, so that the signal's current handler runs.
+    """Send a signal to this process.
 
-    The default handlers of SIGTERM and SIGHUP would end the program without running its ``finally`` blocks.
+    The default handlers of SIGTERM and SIGHUP would end the program without its ``finally`` blocks.
 
     Raises:
         SystemExit: The signal has its default handler.
@@ -79,17 +78,16 @@ def _raise(number: int) -> None:
 
 @contextlib.contextmanager
 def postponed(*, insist: bool = False) -> Iterator[list[int]]:
-    """Return a context that collects Ctrl-C, SIGTERM and SIGHUP in a list; at its end, the first signal is handled.
+    """Collect Ctrl-C, SIGTERM and SIGHUP in a list until the context ends, and then handle the first one.
 
-    If the program has no handler for this signal, the context raises SystemExit. After Interrupted is raised, further
-    signals are ignored.
+    Once Interrupted is raised, further signals are ignored.
 
     Args:
-        insist: Whether a second signal is handled immediately instead of being collected.
+        insist: Whether a second signal is handled at once.
 
     Raises:
-        Interrupted: A signal arrived within the context, and ``signals`` handles it.
-        SystemExit: A signal arrived within the context, and the program has no handler for it.
+        Interrupted: A signal arrived, and ``signals`` handles it.
+        SystemExit: A signal arrived, and the program has no handler for it.
     """
     noted: list[int] = []
 

@@ -9,10 +9,10 @@ import numpy as np
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-# cached, because a figure shows hundreds of intervals, mostly with the same degrees of freedom
+# a figure shows hundreds of intervals, mostly with the same degrees of freedom
 @functools.lru_cache(maxsize=256)
 def student_quantile(probability: float, freedom: float) -> float:
-    """Compute a quantile of Student's t distribution, by bisection on the integral of its density.
+    """Compute a quantile of Student's t distribution by bisection on the integral of its density.
 
     Args:
         probability: At least 0.5.
@@ -20,7 +20,7 @@ def student_quantile(probability: float, freedom: float) -> float:
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)
 
-    # the substitution x = sqrt(freedom) tan(angle) gives a smooth integrand on a finite interval
+    # substitute x = sqrt(freedom) tan(angle), which gives a smooth integrand on a finite interval
     def beyond_half(angle: float) -> float:
         at = 0.5 * angle * (_NODES + 1.0)
         density = math.sqrt(freedom) * np.exp(log_factor) * np.cos(at) ** (freedom - 1)
@@ -34,7 +34,7 @@ def student_quantile(probability: float, freedom: float) -> float:
 
 
 def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the mean and the half-width of its confidence interval (Student's t); NaN for a single value."""
+    """Compute the mean and the half-width of its confidence interval (Student's t), which is NaN for a single value."""
     array = np.asarray(values, float)
     if len(array) < 2:
         return float(array.mean()), math.nan
@@ -43,18 +43,17 @@ def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95
 
 
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """Compute the difference of two paired proportions, and the half-width of its 95 % confidence interval.
+    """Compute the difference of two paired proportions, with its 95 % confidence interval.
 
-    The method is that of Agresti and Min (2005, "Simple improved confidence intervals for comparing matched
-    proportions"). Half an observation is added to each of a pair's four outcomes, so the width of the interval is
-    positive even if all pairs agree.
+    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". Each of a
+    pair's four outcomes gets half an observation more, so the interval is never empty.
 
     Args:
-        first: The first outcome of each pair, (pairs,) bool.
-        second: The second outcome of each pair, (pairs,) bool.
+        first: First outcome of each pair, (pairs,) bool.
+        second: Second outcome of each pair, (pairs,) bool.
 
     Returns:
-        The centre of the interval, which estimates second minus first, and the half-width of the interval.
+        The centre of the interval, an estimate of second minus first, and its half-width.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0

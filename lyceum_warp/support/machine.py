@@ -12,7 +12,7 @@ def cpu_cores() -> int:
 
 
 def free_memory(device: wp.Device) -> int | None:
-    """Return the free bytes on a device, or None if the system does not report them."""
+    """Return the free bytes on a device, or None if the system does not say."""
     if device.is_cuda:
         return int(device.free_memory)
     try:

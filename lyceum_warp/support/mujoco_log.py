@@ -11,7 +11,7 @@ def quiet() -> None:
     """Send MuJoCo's warnings to the log, for the whole process.
 
     By default, MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory. The engines report
-    a world's warnings in the world's ``done_reason``.
+    warnings of a world in its ``done_reason``.
     """
     mujoco.set_mju_user_warning(_log)
 

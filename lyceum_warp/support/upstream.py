@@ -1,6 +1,6 @@
 """Access and patch internals of Warp and MuJoCo Warp.
 
-Only this module uses such internals, so a new version of these packages cannot break any other module.
+No other module uses such internals.
 """
 
 import contextlib
@@ -15,17 +15,16 @@ import warp as wp
 
 
 def builtin_functions() -> Mapping[str, Any]:
-    """Return Warp's built-in functions by name; some, such as ``wp.tid``, are not attributes of ``warp``."""
+    """Return Warp's built-in functions by name. Some of them, such as ``wp.tid``, are not attributes of ``warp``."""
     functions: Mapping[str, Any] = wp._src.context.builtin_functions
     return functions
 
 
 def extend_structs() -> None:
-    """Let a Python class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
+    """Let a class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
 
-    Warp refuses a class that extends a struct, because a struct is not a type. If the class extended the struct's
-    Python class instead, Warp would lose the inherited fields, because it reads only the annotations of the class
-    itself.
+    In Warp, a struct is not a type, so a class cannot extend it. A class that extends the struct's Python class would
+    lose the inherited fields, because Warp reads only the annotations of the class itself.
     """
     codegen: Any = wp._src.codegen
 
@@ -44,9 +43,9 @@ def extend_structs() -> None:
 
 
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
-    """Whether a module of kernels, compiled for a block size, is loaded or in Warp's cache.
+    """Return whether a module of kernels is loaded or in Warp's cache, for a block size.
 
-    If Warp's internals have changed, the result is always False, which costs time but changes no results.
+    If Warp's internals have changed, the result is False, which only costs time.
     """
     if (device.context, block) in module.execs:
         return True
@@ -58,22 +57,22 @@ def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
         return False
 
 
-# MuJoCo Warp is imported on demand, because the C engine does not need it
+# the C engine does not need MuJoCo Warp, so import it on demand
 
 
 def forward_functions() -> Mapping[str, Any]:
-    """Return the namespace of MuJoCo Warp's forward pass and step: functions and imported modules by name."""
+    """Return the functions and imported modules of MuJoCo Warp's forward pass, by name."""
     return vars(importlib.import_module("mujoco_warp._src.forward"))
 
 
 def has_sdf_functions() -> bool:
-    """Whether MuJoCo Warp has a registered distance function for SDF plugins; its default function raises an error."""
+    """Return whether MuJoCo Warp has a distance function for SDF plugins. The default function raises an error."""
     collision_sdf = importlib.import_module("mujoco_warp._src.collision_sdf")
     return bool(collision_sdf.user_sdf.func.__module__ != collision_sdf.__name__)
 
 
 class _PerThread(threading.local):
-    """A thread-local attribute of Warp's runtime, initially None."""
+    """A thread-local attribute of Warp's runtime."""
 
     value: Any = None
 
@@ -87,28 +86,28 @@ class _PerThread(threading.local):
 def separate_captures() -> None:
     """Make captures of CPU launches thread-local.
 
-    Warp's native library captures only launches of the thread that started the capture, but Warp's Python code applies
-    the capture to all threads. Captured loops of other threads would become part of the graph, and launches of other
-    threads would overwrite the graph's arguments.
+    Warp's native library captures only the thread that started a capture, but Warp's Python code applies the capture to
+    all threads. Loops of other threads would then become part of the graph, and launches of other threads would
+    overwrite the graph's arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
 
 
 class _Tiles(threading.local):
-    """Thread-local flag that is set when a kernel with tiles was launched."""
+    """Whether this thread launched a kernel with tiles."""
 
     launched = False
 
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""The lock that is held while kernels with tiles run on the CPU. Kernels that are compiled for x86 store the address of
-their tiles in a static variable, so two threads would overwrite each other's tiles."""
+"""Lock for kernels with tiles on the CPU. On x86, kernels store the address of their tiles in a static variable, so two
+threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
-    """Serialise CPU launches of kernels that use tiles, and set ``tiles.launched`` at each such launch."""
+    """Serialise CPU launches of kernels with tiles, and set ``tiles.launched`` at each."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:
@@ -122,11 +121,7 @@ def separate_tiles() -> None:
 
 @contextlib.contextmanager
 def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
-    """Replace functions of Warp for calls from this thread.
-
-    Args:
-        functions: The new functions, by their names in ``warp`` or ``warp.utils``.
-    """
+    """Replace functions of Warp for calls from this thread."""
     thread = threading.get_ident()
     with contextlib.ExitStack() as restored:
         for name, instead in functions.items():
@@ -142,15 +137,15 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
 
 
 _REMADE = ("reset_data", "get_state", "set_state")
-"""The functions of MuJoCo Warp that define their kernels again in every call. Each kernel is a closure over one
-variable, the mask, and depends only on whether the mask is None."""
+"""Functions of MuJoCo Warp that define their kernels again in every call. Each kernel is a closure over the mask, and
+depends only on whether the mask is None."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Cache results in MuJoCo Warp's host code; without graphs, this code takes most of the time of a step or a reset.
+    """Cache results in MuJoCo Warp's host code, which takes most of the time of a step or reset without graphs.
 
-    For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and each call resolves overloads. The
-    functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses packages' metadata.
+    For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and Warp then resolves overloads. The
+    functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses metadata of packages.
     """
     convex: Any = importlib.import_module("mujoco_warp._src.collision_convex")
     primitive: Any = importlib.import_module("mujoco_warp._src.collision_primitive")

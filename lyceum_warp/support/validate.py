@@ -25,10 +25,10 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
 
 
 def positive_number(name: str, value: Any, unit: str) -> float:
-    """Check that a value is a positive, finite number, and convert it to a float.
+    """Convert a positive, finite number to a float.
 
     Raises:
-        ValueError: The value is not a positive, finite number.
+        ValueError: The value is not positive or not finite.
     """
     if not isinstance(value, (int, float)) or not 0 < value < math.inf:
         raise ValueError(f"{name} must be a positive number of {unit}, not {value!r}")
@@ -57,7 +57,7 @@ def check_flag(name: str, value: Any) -> None:
 
 
 def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    """Check that a value is one of the given words; ``others`` adds other valid values to the message.
+    """Check that a value is one of the given words.
 
     Raises:
         ValueError: The value is not one of the words.

@@ -1,4 +1,4 @@
-"""Collect the versions of packages and data about the machine, because both affect a run's numbers."""
+"""Collect the versions of packages and data about the machine, which both affect a run's numbers."""
 
 import functools
 import importlib.metadata
@@ -18,7 +18,7 @@ def versions(device: str = "cpu") -> dict[str, Any]:
     """Return the versions of packages and Python, a description of the machine, and the commit of a git checkout.
 
     Args:
-        device: The device of the run; a CUDA device adds the GPU's name and the CUDA version.
+        device: The run's device. For a CUDA device, the result has the GPU's name and the CUDA version.
     """
     found: dict[str, Any] = {}
     for package in _PACKAGES:
@@ -26,7 +26,7 @@ def versions(device: str = "cpu") -> dict[str, Any]:
             found[package.replace("-", "_")] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             found[package.replace("-", "_")] = None
-    found["torch"] = torch.__version__  # torch's version includes the build, such as +cpu
+    found["torch"] = torch.__version__  # includes the build, such as +cpu
     found["python"] = platform.python_version()
     found["platform"] = platform.platform()
     found["cpu"] = _cpu_name()
@@ -53,7 +53,7 @@ def _cpu_name() -> str:
 def _commit() -> str | None:
     root = Path(__file__).resolve().parent.parent.parent
     git = shutil.which("git")
-    # an installed package may be inside another project's checkout, which has an unrelated commit
+    # an installed package may lie inside another project's checkout
     if git is None or not (root / ".git").exists():
         return None
     command = [git, "describe", "--always", "--dirty", "--abbrev=40"]

@@ -1,4 +1,4 @@
-"""Initialise Warp without a banner, and send Warp's messages about the CUDA driver to Python's log."""
+"""Initialise Warp without a banner, and log its messages about the CUDA driver."""
 
 import contextlib
 import logging
@@ -17,14 +17,14 @@ _remarks: list[str] | None = None
 
 
 def start_warp() -> list[str]:
-    """Initialise Warp without a banner, and log Warp's messages about the CUDA driver.
+    """Initialise Warp without a banner, and log its messages about the CUDA driver.
 
-    At its default log level, Warp prints a banner and a line for every loaded module. The level is therefore raised to
-    warnings, unless the user has set a level. Without a GPU, Warp's native library prints messages about the driver to
-    stderr. Such messages are logged instead, and all other output is printed.
+    By default, Warp prints a banner and a line for every loaded module. The log level is therefore raised to warnings,
+    unless the user has set it. Without a GPU, Warp's native library prints messages about the driver to stderr. These
+    messages are logged instead.
 
     Returns:
-        The messages about the CUDA driver; callers append them to errors about a missing device.
+        The messages about the CUDA driver, which callers add to errors about a missing device.
     """
     global _remarks
     with _lock:
@@ -44,7 +44,7 @@ def start_warp() -> list[str]:
 
 
 def _stderr_of_start() -> list[str]:
-    """Capture the lines that Warp writes to stderr while it is initialised."""
+    """Capture what Warp writes to stderr while it is initialised, as lines."""
     with contextlib.ExitStack() as restored:
         try:
             stderr = os.dup(2)

@@ -1,8 +1,8 @@
 """AlohaLift: lift a pot by its two handles with two arms (robot and pot from mujoco_warp's test data).
 
-Meshes are visual only. Collision geoms are the simple shapes in the task's MJCF file, and capsules fitted to the arms.
-The arms do not collide with each other. Actions are velocities of the position servos' targets.
-Success: the pot has been above the goal height for ten consecutive steps.
+Meshes are visual only. Collisions use simple shapes in the task's MJCF file, and capsules fitted to the arms. The arms
+do not collide with each other. Actions are velocities of the position servos' targets. Success: the pot has been above
+the goal height for ten consecutive steps.
 """
 
 import mujoco
@@ -101,7 +101,7 @@ class AlohaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Replace colliding meshes by simple shapes, and make the servos follow velocities."""
+        """Replace colliding meshes by simple shapes, and let the servos follow velocities."""
         spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for servo in spec.actuators:
             lw.follow_velocity(servo, 0.1 if servo.name.endswith("gripper") else 1.0)  # m/s or rad/s
@@ -111,7 +111,7 @@ class AlohaLift(lw.Task):
                 geom.type, geom.conaffinity = mujoco.mjtGeom.mjGEOM_CAPSULE, 1
             elif geom.name.startswith("partnet"):
                 geom.rgba = (0.75, 0.77, 0.8, 1.0)
-        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK  # camera for videos
+        spec.camera("collaborator_pov").mode = mujoco.mjtCamLight.mjCAMLIGHT_TRACK
         for light in spec.lights:
             light.castshadow = False  # without a GPU, shadows make rendering 17 times slower
         child = lw.package_model("lyceum_warp", "tasks/aloha_lift.xml").spec()

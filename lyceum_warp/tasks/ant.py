@@ -1,9 +1,9 @@
 """Ant: walk forward on four legs (Gymnasium's Ant-v5).
 
-Contact forces are computed in MuJoCo's sensor stage. The model's integrator is RK4, under which the sensor stage runs
-only in the first of a substep's four passes. Gymnasium computes ``cfrc_ext`` again after the last pass. By default, the
-model has pyramidal friction cones. With these cones, MuJoCo Warp uses a different contact frame than MuJoCo for a steep
-leg on the floor. Both frames are valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
+MuJoCo's sensor stage computes the contact forces. With the model's integrator RK4, that stage runs only in the first of
+four passes of a substep. Gymnasium computes ``cfrc_ext`` again after the last pass. The model has pyramidal friction
+cones. With these, MuJoCo Warp's contact frame differs from MuJoCo's for a steep leg on the floor. Both frames are
+valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
 The arm and the hand are the Kinova Jaco, whose model the extra "dm-control" installs. Goal, reward and initial states
-are Lyceum's, with one correction: the reward uses the distance from the ball to the goal. Lyceum's code uses the
-distance from the ball to (ball - goal), which is constant. Actions are joint velocities. Success: the ball has been
-within 5 cm of the goal for ten consecutive steps, 0.2 s.
+are Lyceum's, except for the distance from the ball to the goal. Lyceum's code uses the distance from the ball to (ball
+- goal), which is constant. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten
+consecutive steps, 0.2 s.
 """
 
 import mujoco
@@ -95,7 +95,7 @@ class ArmHandPickup(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
-    # planners get larger values of ``far`` and ``finger_weight`` than the task
+    # planners get larger values of ``far`` and ``finger_weight``
     planning = lw.Planning(
         settings=dict(horizon=32, samples=64, temperature=0.1, noise=0.8, fill="repeat", include_plan=False),
         params={"far": 1.0, "finger_weight": 2.0},
@@ -106,8 +106,8 @@ class ArmHandPickup(lw.Task):
         """Add the hand, a table, and motors that control joint velocities."""
         spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = 0, 1  # the arm and the hand do not collide with each other
-        # the gain, the maximum rad/s and the maximum N m of large joints, small joints and fingers
+            geom.contype, geom.conaffinity = 0, 1  # arm and hand do not collide with each other
+        # for large joints, small joints and fingers: gain, maximum rad/s and maximum N m
         for i, joint in enumerate(spec.joints):
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]
             motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)

@@ -1,7 +1,7 @@
 """CartpoleSwingup: swing a pole up and balance it (dm_control's cartpole swingup, with Lyceum's reward).
 
-All sigmoids of Lyceum's reward are quadratic; in dm_control's reward, all sigmoids except the control's are Gaussian.
-Episodes do not terminate.
+All sigmoids of Lyceum's reward are quadratic. In dm_control's reward, only the control's sigmoid is quadratic. Episodes
+do not terminate.
 """
 
 import warp as wp
@@ -65,6 +65,6 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class CartpoleSwingup(lw.Task):
     model = "cartpole.xml"
     obs = {"cart_position": 1, "pole_direction": 2, "cart_velocity": 1, "pole_velocity": 1}
-    # Euler's method is 3 times faster than RK4; returns differ by up to 1.1 %
+    # Euler's method is 3 times faster than RK4, and returns differ by up to 1.1 %
     physics = {"fast": lw.PhysicsOptions(integrator="euler")}
     planning = lw.Planning(settings={"horizon": 100})

@@ -1,11 +1,10 @@
 """HerbReach: move the hands of two 7-joint Barrett arms to targets in space (HERB in the Lyceum paper).
 
-The paper's model is not published, so the task's model was built from published data of the robot (see herb.xml). An
-action is a fraction of the peak torque of each motor, fingers included. The motors add the action's torque to gravity
-compensation. The targets are mocap bodies, so that they are part of the state. The targets are drawn from two boxes
-within reach, in front of the shoulders. Episodes start near HERB's home position. Success: both palms have been within
-5 cm of their targets for ten consecutive steps, 0.2 s. If two box geoms of the arms touch, MuJoCo Warp finds fewer
-contact points than MuJoCo.
+The paper's model is not published, so this model uses published data of the robot (see herb.xml). An action is a
+fraction of each motor's peak torque, fingers included. The motors add it to gravity compensation. The targets are mocap
+bodies, because they are part of the state. They are drawn from two boxes within reach, in front of the shoulders.
+Episodes start near HERB's home position. Success: both palms have been within 5 cm of their targets for ten consecutive
+steps, 0.2 s. If two boxes of the arms touch, MuJoCo Warp finds fewer contact points than MuJoCo.
 """
 
 import warp as wp
@@ -98,7 +97,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     s.mocap_pos[p.right_target][1] = -s.mocap_pos[p.right_target][1]
 
 
-# the wrist gets less noise, because its links are light, and large torques would only shake the hand
+# the wrist's links are light, and more noise would only shake the hand
 ARM_NOISE, FINGER_NOISE = (0.14, 0.07, 0.035, 0.1, 0.02, 0.02, 0.02), (0.0, 0.0, 0.0, 0.0)
 
 

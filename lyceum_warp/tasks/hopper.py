@@ -68,9 +68,9 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class Hopper(lw.Task):
     model, frame_skip, gymnasium = "hopper.xml", 4, "Hopper-v5"
     obs = staticmethod(lambda p: {"position": 6 - p.exclude_current_positions_from_observation, "velocity": 6})
-    # Euler's method is 3 to 4 times faster than RK4; returns differ by up to 2 %
+    # Euler's method is 3 to 4 times faster than RK4, and returns differ by up to 2 %
     physics = {"fast": lw.PhysicsOptions(integrator="euler")}
-    # a higher healthy_reward keeps the robot from falling over when the planner's horizon is short
+    # with a short horizon, planners need a higher healthy_reward to keep the robot from falling
     planning = lw.Planning(
         settings={"horizon": 128, "samples": 128, "noise": 0.1},
         options={"integrator": "euler"},

@@ -1,9 +1,8 @@
 """Humanoid: walk forward on two legs without falling over (Gymnasium's Humanoid-v5).
 
-Contact forces are computed in MuJoCo's sensor stage. The model's integrator is RK4, under which the sensor stage runs
-only in the first of a substep's four passes. Gymnasium computes ``cfrc_ext`` again after the last pass. While feet
-touch the ground, the task's contact forces therefore differ from Gymnasium's; everything else is equal. The solver is
-Newton instead of the model's PGS.
+MuJoCo's sensor stage computes the contact forces. With the model's integrator RK4, that stage runs only in the first of
+four passes of a substep. Gymnasium computes ``cfrc_ext`` again after the last pass. The task's contact forces therefore
+differ from Gymnasium's while feet touch the ground. The solver is Newton instead of the model's PGS.
 """
 
 import warp as wp
@@ -95,7 +94,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 @lw.register
 class Humanoid(lw.Task):
     model, frame_skip, gymnasium = "humanoid.xml", 5, "Humanoid-v5"
-    # one substep of implicitfast is 13 times faster than five of RK4; plans reach 92 to 103 % of the returns with RK4
+    # one substep of implicitfast is 13 times faster than five of RK4, and plans reach 92 to 103 % of the returns
     physics = {"fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1)}
     planning = lw.Planning(options={"physics": "fast"})
     lagged = ("subtree_com", "cinert", "cvel")

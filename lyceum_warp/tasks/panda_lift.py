@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
-The arm's model, which the extra "robots" installs, has no gripper. Hand, table and cube are in MJCF files of the
-package. Actions are velocities of the position servos' targets. The arm compensates gravity, as the real robot does.
-Meshes are visual only, and capsules fitted to the arm collide with table and cube. Success: the cube has been above the
-goal height for ten consecutive steps.
+The arm's model, which the extra "robots" installs, has no gripper. The hand, the table and the cube are in MJCF files
+of the package. Actions are velocities of the position servos' targets. The arm compensates gravity, as the real robot
+does. Collisions use capsules fitted to the arm, and meshes are visual only. Success: the cube has been above the goal
+height for ten consecutive steps.
 """
 
 import mujoco
@@ -12,7 +12,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers, with the gripper pointing down
+HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers, gripper pointing down
 
 
 @wp.struct
@@ -97,7 +97,7 @@ class PandaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add the hand, a table and the cube, and replace the motors by servos that follow velocities."""
+        """Add the hand, a table and the cube. Replace the motors by servos that follow velocities."""
         spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
         for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
             kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the robot's published torque limits, N m

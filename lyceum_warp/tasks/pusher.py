@@ -1,7 +1,7 @@
 """Pusher: push a cylinder to a goal with a 7-joint arm (Gymnasium's Pusher-v5).
 
-As in Gymnasium, body positions are one substep old after ``mj_step``. An episode succeeds if the
-cylinder's centre is over the goal's disc; Gymnasium defines no success.
+As in Gymnasium, body positions are one substep old after ``mj_step``. Success: the cylinder's centre is over the goal's
+disc. Gymnasium defines no success.
 """
 
 import warp as wp

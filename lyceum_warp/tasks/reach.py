@@ -1,8 +1,8 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-The model has no gravity. The target is a mocap body, so that it is part of the state. Success: the hand's mean distance
-from the target over the last ten steps is below 5 cm. If ``random_start`` is set, one episode in five begins with the
-palm inside the table, and contact forces push the palm out.
+The model has no gravity. The target is a mocap body, because it is part of the state. Success: the hand's mean distance
+from the target over the last ten steps is below 5 cm. With ``random_start``, one episode in five begins with the palm
+inside the table, and contact forces push it out.
 """
 
 import warp as wp
@@ -11,9 +11,9 @@ import lyceum_warp as lw
 from lyceum_warp import Row
 
 REMEMBERED = 10
-"""The number of steps over which the distance is averaged."""
+"""The distance is averaged over this number of steps."""
 FAR = 10.0
-"""The initial value of the distances in memory (m), so large that success is impossible before the tenth step."""
+"""Initial value of the remembered distances, m. It makes success impossible before the tenth step."""
 
 
 @wp.struct
@@ -95,7 +95,7 @@ class Reach(lw.Task):
     frame_skip = 2
     obs = {"position": 7, "velocity": 7, "hand": 3, "error": 3}
     horizon = 75
-    # one long substep is 1.7 times faster than two short ones; returns differ by up to 0.2 %
+    # one long substep is 1.7 times faster than two short ones, and returns differ by up to 0.2 %
     physics = {"fast": lw.PhysicsOptions(frame_skip=1, timestep=0.02)}
     # the paper's settings, including an inverse temperature of 5
     planning = lw.Planning(settings={"horizon": 16, "samples": 30, "temperature": 0.2, "noise": 1.0})

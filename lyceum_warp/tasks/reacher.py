@@ -1,7 +1,7 @@
 """Reacher: move the tip of a planar arm of two links to a target (Gymnasium's Reacher-v5).
 
-As in Gymnasium, body positions are one substep old after ``mj_step``. An episode succeeds if the tip
-touches the target; Gymnasium defines no success.
+As in Gymnasium, body positions are one substep old after ``mj_step``. Success: the tip touches the target. Gymnasium
+defines no success.
 """
 
 import warp as wp

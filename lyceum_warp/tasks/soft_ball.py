@@ -2,7 +2,7 @@
 
 Squeezing the ball costs reward, and crushing it to two thirds of its width ends the episode. The policy observes the
 mean and the extents of the ball's vertices. Success: the ball has been within 3 cm of the target for half a second.
-MuJoCo Warp merges flex contacts that are less than 1 mm apart, so the engines differ when the ball is squeezed hard.
+MuJoCo Warp merges flex contacts that are less than 1 mm apart, so the engines differ if the ball is squeezed hard.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # the ball's first index in qpos and qvel, after the gripper's joints; the ball has 8 corners with 3 numbers
+NODE = 4  # the ball's first index in qpos and qvel; the ball has 8 corners with 3 numbers
 
 
 @wp.struct

@@ -1,7 +1,7 @@
-"""Offer reward terms, commands, contact clocks, noise, random draws and motors as functions of numbers and arrays.
+"""Offer reward terms, commands, contact clocks, noise, random draws and motors for any task.
 
-Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``, so it works in any
-task. An argument's name has the same meaning in all functions; ``ARGUMENTS`` explains the names.
+Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``. An argument's name has
+the same meaning in all functions; see ``ARGUMENTS``.
 """
 
 from lyceum_warp.support.docstrings import document_arguments
@@ -176,8 +176,7 @@ ARGUMENTS = {
     "wanted_air_time": "least duration of a rewarded swing (s)",
     "width": "number of elements of one value in a history",
 }
-"""The meanings of the functions' arguments by name. Memory is the task's memory, and Params is the task's struct of
-parameters."""
+"""The meanings of arguments by name. Memory is the task's memory, and Params is the task's struct of parameters."""
 
 for _name in __all__:
     document_arguments(globals()[_name], ARGUMENTS)

@@ -1,7 +1,7 @@
 """Compute reward terms for the motion of a floating base: its velocity, orientation and height.
 
-The free joint of the base is the first joint of the model. A task with a different base defines its own functions
-``gravity``, ``linear_velocity``, ``angular_velocity``, ``base_height`` and ``heading``.
+The free joint of the base is the first joint of the model. For a different base, define your own ``gravity``,
+``linear_velocity``, ``angular_velocity``, ``base_height`` and ``heading``.
 """
 
 import warp as wp

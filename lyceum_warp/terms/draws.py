@@ -1,7 +1,7 @@
 """Draw random numbers, and randomize model fields in each world.
 
-Functions that scale or shift a model field start from its current value. In ``startup`` and in ``randomize``, the
-current value is the nominal value, because a reset restores the field first.
+Functions that scale or shift a model field start from its current value. In ``startup`` and ``randomize``, this is the
+nominal value, because a reset restores the field first.
 """
 
 import warp as wp

@@ -1,9 +1,9 @@
 """Draw mass, centre of mass and inertia of a body together, so that they stay physically consistent.
 
-Mass, centre of mass and inertia are physically consistent if and only if the pseudo-inertia matrix J (4 x 4) is
-positive definite. For an upper triangular matrix U with a positive diagonal, J' = U J U^T is also positive definite.
-Rucker and Wensing 2022, "Smooth parameterization of rigid-body inertia", parameterise U by log-Cholesky parameters. U
-maps the body's mass affinely, x -> D x + t, and scales its density.
+They are consistent if and only if the pseudo-inertia matrix J (4 x 4) is positive definite. For an upper triangular
+matrix U with a positive diagonal, J' = U J U^T is also positive definite. U has the log-Cholesky parameters of Rucker
+and Wensing 2022, "Smooth parameterization of rigid-body inertia". It maps the body's mass affinely, x -> D x + t, and
+scales its density.
 """
 
 import warp as wp

@@ -1,6 +1,6 @@
 """Compute torques of servos and of DC motors.
 
-A task's ``control`` runs once per step, so its torques are constant over the step's substeps.
+``control`` runs once per step, so torques are constant over a step's substeps.
 """
 
 import warp as wp

@@ -1,7 +1,7 @@
-"""Check the rules of an environment for any task on any engine.
+"""Check that a task's environment follows the package's rules, on any engine.
 
-Each check tests one rule. A check takes the environments under test, and leaves them usable for the next check. The
-AssertionError of a check names the task, the engine, the rule, the values, the seed and a world's state.
+Each check tests one rule, and leaves the environments usable for the next check. The AssertionError of a check names
+the task, the engine, the rule, the values, the seed and a world's state.
 """
 
 import dataclasses
@@ -34,13 +34,13 @@ CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     for name, value in vars(module).items()
     if name.startswith("check_")
 )
-"""All checks in the order in which they run: the functions ``check_*`` of the rule modules."""
+"""All checks in order: the functions ``check_*`` of the rule modules."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Report:
-    """Reports the result of ``check_task`` for a task that follows every rule."""
+    """The result of ``check_task`` for a task that follows every rule."""
 
     task: str
     """The task's name."""
@@ -51,9 +51,9 @@ class Report:
     nworld: int
     """Number of worlds."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
-    """The duration of each check in seconds, by the rule's name."""
+    """Duration of each check in seconds, by the rule's name."""
     unused: list[str] = dataclasses.field(default_factory=list)
-    """The unused parts of the task: functions that are never called, and memory that is never read."""
+    """Functions that are never called, and memory that is never read."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
@@ -75,21 +75,21 @@ def check_task(
     """Check that a task follows every rule of an environment on an engine.
 
     Args:
-        task: The name, the file or the class of a task.
-        engine: The engine's name, as for ``make``, or an engine class (see ``engines.base``).
+        task: A task's name, file or class.
+        engine: The engine's name, as in ``make``, or an engine class (see ``engines.base``).
         device: See ``make``.
         nworld: Number of worlds, at least 2.
-        steps: Number of steps in long checks (determinism, memory).
+        steps: Number of steps in long checks.
         seed: Seed of the worlds and of the random actions.
         checks: The rules to check, a selection of ``CHECKS``.
-        options: Additional options of ``make`` and parameters of the task. On a CUDA device, ``deterministic`` is True
-            by default, because the rules compare numbers bit for bit.
+        options: More options of ``make`` and parameters of the task. On a CUDA device, ``deterministic`` is True by
+            default, because numbers are compared bit for bit.
 
     Returns:
-        A printable report of the checks.
+        A report that can be printed.
 
     Raises:
-        AssertionError: Rules are broken; the message lists them.
+        AssertionError: The task breaks rules, which the message lists.
         ValueError: ``nworld`` is less than 2, ``steps`` is less than 1, or an option is not valid.
 
     Example:
@@ -111,7 +111,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
-        ctx.restart()  # reset, so that results do not depend on earlier checks
+        ctx.restart()  # do not depend on earlier checks
         try:
             check(ctx)
         except AssertionError as error:

@@ -7,7 +7,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def check_spaces(ctx: Context) -> None:
-    """A space has its buffer's shape and type; its parts cover all columns, and lower bounds are below upper bounds."""
+    """A space has its buffer's shape and type, its parts cover all columns, and its bounds are in order."""
     env = ctx.a
     pairs = {
         "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),
@@ -38,7 +38,7 @@ def check_spaces(ctx: Context) -> None:
 
 
 def check_addresses(ctx: Context) -> None:
-    """Every buffer stays the same object at the same address through steps, resets and ``set_state``."""
+    """Buffers keep their addresses through steps, resets and ``set_state``."""
     env = ctx.a
     ctx.restart()
     names = (*OUTCOMES, "action", "time")

@@ -1,8 +1,8 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-In a copy, each index into a row, a vector or a matrix is passed to a function that checks it against the size, and each
-``while`` loop counts its iterations. A copy is otherwise unchanged, so it computes the same numbers. Native functions
-(``wp.func_native``) are C++ and cannot be checked.
+In a copy, a function checks each index into a row, vector or matrix, and each ``while`` loop counts its iterations.
+Otherwise a copy computes the same numbers as the original. Native functions (``wp.func_native``) are C++ and cannot be
+checked.
 """
 
 import ast
@@ -19,7 +19,7 @@ from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
-"""The attributes of an array that are tuples."""
+"""Attributes of an array that are tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,14 +28,14 @@ class Place:
 
     function: str
     text: str
-    """The source of the expression with the index."""
+    """The expression with the index."""
     where: str
-    """The file and the line of the index."""
+    """The file and the line."""
     verb: str
     """The kind of access: reads, writes or loops."""
 
     def problem(self, index: int, size: int) -> str:
-        """Return the message about an index out of range, or about an endless loop."""
+        """Describe an index out of range or an endless loop."""
         if self.verb == "loops":
             rounds = int(index_checks.MOST_ROUNDS)
             return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
@@ -47,20 +47,19 @@ _HELPERS = {
     "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
     "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
-"""The functions that the copies call, under names that a task is unlikely to use."""
+"""Functions that the copies call, with names that a task hardly uses."""
 
 
 class Unchecked(Exception):  # noqa: N818
-    """Raised if a function can't be checked; the message gives the reason."""
+    """Raised if a function can't be checked."""
 
 
 class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel takes the report and, for each argument of the function, the values of all worlds. The values of a World
-    are a ``Batch``, the values of Params are an array (nworld,) or (1,), and the values of a row are an array (nworld,
-    size). The report, (places, 3) int32, has a row per indexing expression. A row holds how often the index was out of
-    range, the first such index, and the size of the array.
+    A kernel takes the report, and the values of each argument in all worlds. These are a ``Batch`` for a World, an
+    array (nworld,) or (1,) for Params, and an array (nworld, size) for a row. The report, (places, 3) int32, has a row
+    for each index in the source. A row has the number of errors, the first wrong index, and the size of the array.
 
     Raises:
         Unchecked: A function can't be copied.
@@ -73,7 +72,7 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # make kernels after all copies, because functions may call each other
+        for scope, numbers in self._scopes:  # functions may call each other, so make kernels after all copies
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
@@ -84,21 +83,21 @@ class CheckedFunctions:
             raise Unchecked(f"Warp can't compile the functions with checks: {' '.join(str(error).split())}") from error
 
     def report(self, device: wp.Device) -> wp.array:
-        """An empty report."""
+        """Make an empty report."""
         return wp.zeros((max(len(self.places), 1), 3), dtype=int, device=device)
 
     def problems(self, report: wp.array) -> list[str]:
-        """Return the messages for a report, one line each."""
+        """Describe the problems in a report, one per line."""
         found: np.ndarray = report.numpy()
         return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
 
     def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
-        """Add a row for an index or a loop to the report, and return the row's index."""
+        """Add a row to the report, and return its index."""
         self.places.append(Place(source.name, text, source.place(node), verb))
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """Return the index of a function's copy; the first call makes the copy."""
+        """Return the index of a function's copy, and make the copy in the first call."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):
@@ -127,7 +126,7 @@ class CheckedFunctions:
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
         scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
-        if number in self._copies:  # if the key exists, Warp adds the copy as an overload
+        if number in self._copies:  # with an existing key, Warp adds an overload
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
         self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
@@ -139,7 +138,6 @@ class CheckedFunctions:
         sources.run_source(text, f"<{self._module} {part}>", scope)
 
     def _kernel(self, name: str, function: wp.Function) -> wp.Kernel:
-        """Make the kernel that runs a function's copy in every world."""
         number = self.number(function)
         scope: dict[str, Any] = {"wp": wp, "copy": self._copies[number]}
         arguments, lines, values = ["report: wp.array2d[int]"], ["w = wp.tid()"], ["report"]
@@ -159,17 +157,14 @@ class CheckedFunctions:
 
 
 class _Rewriter(ast.NodeTransformer):
-    """Inserts checks into the syntax tree of one function."""
-
     def __init__(self, checked: CheckedFunctions, source: FunctionSource) -> None:
         self.checked, self.source = checked, source
         self.callees: list[int] = []
         self.loops = 0
         self.writes = False
-        """Whether the current expression is part of an assignment target."""
+        """Whether the expression is part of an assignment target."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
-        """Visit the assigned value, but not the annotation."""
         node.target = self.visit(node.target)
         node.value = node.value and self.visit(node.value)
         return node
@@ -189,7 +184,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function that is used as a value, because its copy has an additional argument."""
+        """Refuse a function as a value, because its copy has one more argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(
@@ -252,13 +247,12 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def _is_constant(self, node: ast.Subscript) -> bool:
-        """Whether a subscript belongs to a type, a tuple or a shape, for which Warp requires a constant index."""
+        """Return whether Warp requires a constant index, as in a type, a tuple or a shape."""
         value = self.source.value(node.value)
         type_or_tuple = value is not None and not hasattr(value, "_wp_scalar_type_")
         return type_or_tuple or (isinstance(node.value, ast.Attribute) and node.value.attr in _SHAPES)
 
     def _checked(self, node: ast.AST, text: str, verb: str, base: ast.expr, axis: int, index: ast.expr) -> ast.expr:
-        """Return the checked index along one axis."""
         place = ast.Constant(self.checked.place(self.source, node, text, verb))
         for _ in range(axis):
             base = ast.Subscript(_loaded(base), ast.Constant(0), ast.Load())
@@ -268,7 +262,6 @@ class _Rewriter(ast.NodeTransformer):
         return _call("bounds_from_end" if constant else "bounds_at", _name("bounds_report"), place, index, size)
 
     def visit_While(self, node: ast.While) -> list[ast.stmt]:
-        """Insert a counter that breaks an endless loop."""
         place = self.checked.place(self.source, node, f"while {ast.unparse(node.test)}", "loops")
         self.loops += 1
         rounds = f"bounds_rounds_{self.loops}"
@@ -289,7 +282,6 @@ def _call(name: str, *arguments: ast.expr) -> ast.Call:
 
 
 def _loaded(node: ast.expr) -> ast.expr:
-    """Copy an expression, with the context ``ast.Load``."""
     loaded = copy.deepcopy(node)
     if isinstance(loaded, ast.Attribute | ast.Subscript | ast.Name):
         loaded.ctx = ast.Load()
@@ -302,10 +294,10 @@ _made: dict[Any, CheckedFunctions] = {}
 def checked_functions(
     name: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function], device: wp.Device
 ) -> CheckedFunctions:
-    """Get the checked copies of a task's functions, compiled for a device; equal functions share cached copies.
+    """Get checked copies of a task's functions, compiled for a device. Equal functions share copies.
 
-    ``name`` is the name of the copies' Warp module, and ``views`` maps types of arguments to functions that read one
-    world's value.
+    ``name`` is the Warp module of the copies. ``views`` maps types of arguments to functions that read one world's
+    value.
 
     Raises:
         Unchecked: A function can't be checked.

@@ -1,4 +1,4 @@
-"""Hold the environments under test, and compare their values for the checks."""
+"""Hold the environments under test, and compare their values."""
 
 import contextlib
 import dataclasses
@@ -15,25 +15,25 @@ from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 
 OUTCOMES = (*step_types.OUTCOMES, "obs", "final_obs")
-"""The buffers that a step fills."""
+"""Buffers that a step fills."""
 
 SHORT = 8
-"""The number of steps in short checks."""
+"""Number of steps in short checks."""
 
 
 @document_attributes
 @dataclasses.dataclass
 class Context:
-    """Holds two environments with the same options, and compares values; errors name the rule and the values."""
+    """Two environments with the same options, and functions that compare values and name the rule in errors."""
 
     a: Env
-    """The environment for most checks."""
+    """The environment of most checks."""
     b: Env
     """A second environment, for comparisons."""
     make: Callable[..., Env]
-    """A function that makes another environment with the same options, except for the given changes."""
+    """Makes another environment with the same options, except for given changes."""
     steps: int
-    """The number of steps in long checks."""
+    """Number of steps in long checks."""
     seed: int
     """Seed of the worlds and of the random actions."""
     task: str
@@ -41,10 +41,10 @@ class Context:
     engine: str
     """The engine's name."""
     rule: str = ""
-    """The name of the rule that is being checked."""
+    """The rule that is being checked."""
 
     def fail(self, problem: str, world: int = 0) -> NoReturn:
-        """Raise an AssertionError that states a problem, the seed, and the step and state of one world of ``a``."""
+        """Raise an AssertionError with the seed, and with the step and the state of a world of ``a``."""
         state, parts = self.a.get_state()[world], self.a.state_space.parts
         values = ", ".join(f"{name} {state[part].tolist()}" for name, part in parts.items())
         where = f"with seed {self.seed}, world {world} in step {int(state[parts['step']])} of its episode: {values}"
@@ -57,7 +57,7 @@ class Context:
             self.fail(problem)
 
     def equal(self, found: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
-        """Fail unless two tensors have the same shape and type and bitwise equal values (NaN equals NaN)."""
+        """Fail unless two tensors have the same shape and type, and are equal bit for bit (NaN equals NaN)."""
         if found.shape != wanted.shape or found.dtype != wanted.dtype:
             self.fail(f"{what}: {found.dtype} {tuple(found.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
         differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
@@ -76,7 +76,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Draw random actions, (steps, nworld, nact); a missing bound is replaced by -1 or 1."""
+        """Draw random actions, (steps, nworld, nact). A missing bound is -1 or 1."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
@@ -86,23 +86,23 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def mask(self, *worlds: int) -> torch.Tensor:
-        """Return a mask of the given worlds, by default of every second world, (nworld,) bool."""
+        """Return a mask of the given worlds, (nworld,) bool. By default, it has every second world."""
         numbers = torch.arange(self.a.nworld)
         mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
         return mask.to(self.a.action.device)
 
     def faulty(self, env: Env) -> torch.Tensor:
-        """Return a mask of the worlds that had a fault in the last step, (nworld,) bool."""
+        """Mark the worlds with a fault in the last step, (nworld,) bool."""
         return (env.done_reason & int(FAULTS)) != 0
 
     def calm(self, env: Env) -> torch.Tensor:
-        """Return a mask of the worlds that no event changed after the last step, (nworld,) bool."""
+        """Mark the worlds that no event changed after the last step, (nworld,) bool."""
         if env.task.functions["event"] is None:
             return torch.ones_like(env.done)
         return ~env.worlds.changed_view
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Apply a sequence of actions, and return the states and outcomes of all steps, (steps, nworld, ...)."""
+        """Apply actions, and return the states and results of all steps, (steps, nworld, ...)."""
         kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
@@ -113,13 +113,13 @@ class Context:
         return {name: torch.stack(values) for name, values in kept.items()}
 
     def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
-        """Fail unless two results of ``run`` are bitwise equal."""
+        """Fail unless two results of ``run`` are equal bit for bit."""
         for name in wanted:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """Return a context in which environments have a different ``horizon``, ``autoreset`` or ``graphs``."""
+        """Change ``horizon``, ``autoreset`` or ``graphs`` of environments within a context."""
         kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs
@@ -139,6 +139,6 @@ class Context:
         return shown | fields | {"state": env.get_state()}
 
     def finite(self, env: Env, when: str) -> None:
-        """Fail unless the state and every outcome are finite."""
+        """Fail unless the state and all results are finite."""
         for name, values in {"state": env.get_state(), **{k: getattr(env, k) for k in OUTCOMES}}.items():
             self.that(torch.isfinite(values).all(), f"{name} is not finite {when}: {values}")

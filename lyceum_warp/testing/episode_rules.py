@@ -10,7 +10,7 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-# tolerated bytes of the interpreter's caches; one leaked float per step takes 3,200 bytes after 100 steps
+# tolerated growth of the interpreter's caches; one leaked float per step is 3,200 bytes after 100 steps
 _PYTHON_BYTES = 2_048
 
 
@@ -22,12 +22,12 @@ def _check_flags(ctx: Context, env: Env) -> None:
 
 
 def check_truncation(ctx: Context) -> None:
-    """At the horizon, an episode is truncated.
+    """An episode is truncated at the horizon.
 
-    ``final_obs`` is the last observation of the episode, and ``obs`` the first observation of the next one.
+    ``final_obs`` is then its last observation, and ``obs`` the first observation of the next episode.
 
-    Truncation does not set ``terminated``. In worlds that continue, ``final_obs`` and ``obs`` are equal. The rules on
-    observations hold for every group of observations.
+    Truncation does not set ``terminated``. In worlds that continue, both are equal. This holds for every group of
+    observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
@@ -41,7 +41,7 @@ def check_truncation(ctx: Context) -> None:
             _check_flags(ctx, a)
             ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
             going, state = ~a.done & ctx.calm(a), a.get_state()
-            # automatic resets change no value before the end of a world's first episode
+            # automatic resets change no value before a world's first episode ends
             for name, obs in a.obs_groups.items():
                 final = a.final_obs_groups[name]
                 ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")
@@ -77,7 +77,7 @@ def check_no_autoreset(ctx: Context) -> None:
 
 
 def check_graphs(ctx: Context) -> None:
-    """Steps and resets are bitwise equal with and without graphs."""
+    """Results are equal bit for bit with and without graphs."""
     a, b, n = ctx.a, ctx.b, 20
     with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
         ctx.restart()
@@ -92,7 +92,7 @@ def check_graphs(ctx: Context) -> None:
 def _memory(device: wp.Device) -> dict[str, int]:
     gc.collect()
     found = {"Python bytes": tracemalloc.get_traced_memory()[0]}
-    # type(), because isinstance would load modules that are loaded lazily
+    # isinstance would load modules that are loaded lazily
     found["arrays"] = sum(issubclass(type(thing), (wp.array, torch.Tensor)) for thing in gc.get_objects())
     if device.is_cuda:
         found["Warp bytes"] = wp.get_mempool_used_mem_current(device)

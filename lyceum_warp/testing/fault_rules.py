@@ -11,7 +11,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
-    """Cause a fault in one world of environment a, and compare a with environment b, which has no fault."""
+    """Cause a fault in one world of environment a, and compare a with environment b."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
     others = ~ctx.mask(bad)
@@ -96,7 +96,7 @@ def check_bad_warmstart(ctx: Context) -> None:
 def check_not_finite(ctx: Context) -> None:
     """A reward or an observation that is not finite is a fault of its world, and changes no other world.
 
-    The check makes the task's parameters infinite in one world, one parameter after the other.
+    The check makes each of the task's parameters infinite in one world.
     """
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)

@@ -9,7 +9,7 @@ from lyceum_warp.world_arrays import memory_columns
 
 
 def check_groups(ctx: Context) -> None:
-    """The group ``policy`` equals ``env.obs``, and after a fault, every group keeps its last valid observation."""
+    """The group ``policy`` equals ``env.obs``. After a fault, every group keeps its last valid observation."""
     a = ctx.a
     ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
@@ -28,7 +28,7 @@ def check_groups(ctx: Context) -> None:
 
 
 def check_noise(ctx: Context) -> None:
-    """An observation's noise depends only on the state, and differs between worlds, episodes and steps."""
+    """Noise depends only on the state, and differs between worlds, episodes and steps."""
     env = ctx.a
     if not env.task.noisy_groups:
         return
@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # these copies of a state differ only in the positions of their random streams
+    # copies of a state that differ only in their random streams
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):
@@ -54,7 +54,7 @@ def check_noise(ctx: Context) -> None:
 
 
 def check_metrics(ctx: Context) -> None:
-    """``episode_metrics`` are the sums of ``metrics`` over an episode without faults, and belong to the state."""
+    """``episode_metrics`` are sums of ``metrics`` over an episode without faults, and part of the state."""
     a, b, horizon = ctx.a, ctx.b, 4
     if not a.metrics:
         return
@@ -86,12 +86,11 @@ def check_metrics(ctx: Context) -> None:
 
 
 def check_success_steps(ctx: Context) -> None:
-    """``success`` requires ``success_steps`` consecutive steps that meet the goal.
+    """``success`` requires ``success_steps`` successes in a row.
 
-    The number of steps in a row that met the goal belongs to the state, and a reset clears it.
+    The current number is part of the state, and a reset clears it.
 
-    To find out whether a state meets the goal, the check sets the count to its maximum, sets the state, and reads
-    ``success``.
+    The check sets this number to its maximum and reads ``success``, to find out whether a state meets the goal.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:
@@ -125,9 +124,9 @@ def check_success_steps(ctx: Context) -> None:
 
 
 def check_events(ctx: Context) -> None:
-    """An event runs after a step's reward and termination are computed, and changes the state and the next observation.
+    """An event runs after a step's reward and termination, and changes the state and the next observation.
 
-    An event does not run in worlds that restart, and leaves worlds without an event bitwise unchanged.
+    It does not run in worlds that restart. Worlds without an event do not change.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:
@@ -195,7 +194,7 @@ def check_substep(ctx: Context) -> None:
 
 
 def check_lasting_memory(ctx: Context) -> None:
-    """Resets preserve lasting memory, except ``rand_reset(seed)``, which clears it."""
+    """Resets preserve lasting memory, except for ``rand_reset(seed)``, which clears it."""
     a, b = ctx.a, ctx.b
     if (columns := memory_columns(a.task, a.state_space).get("lasting_memory")) is None:
         return

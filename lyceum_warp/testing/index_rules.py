@@ -15,19 +15,19 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
-"""The functions of a reset, in order."""
+"""Functions of a reset, in order."""
 
 _FEW = 20
-"""The number of steps on a slow engine: MuJoCo Warp on a CPU."""
+"""Number of steps on a slow engine: MuJoCo Warp on a CPU."""
 
 _MOST_LISTED = 8
-"""The maximum number of problems that a failure message lists."""
+"""Maximum number of problems in a message."""
 
 
 def check_bounds(ctx: Context) -> None:
-    """No function of the task reads or writes a row, a vector or a matrix out of range.
+    """No function of the task reads or writes out of range in a row, a vector or a matrix.
 
-    Warp counts negative indices from the end; the check allows only constants such as ``-1``. The check runs
+    Warp counts negative indices from the end, but only constants such as ``-1`` are allowed. The check runs
     instrumented copies of the functions on the states of random steps.
     """
     run = _Run(ctx)
@@ -39,8 +39,6 @@ def check_bounds(ctx: Context) -> None:
 
 
 class _Run:
-    """Runs the checked functions of a task on the states of random steps."""
-
     def __init__(self, ctx: Context) -> None:
         self.ctx, self.env, self.worlds = ctx, ctx.a, ctx.a.worlds
         task = self.env.task
@@ -70,7 +68,7 @@ class _Run:
         self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
 
     def steps(self) -> None:
-        """Run the functions on the states of random steps, and of resets between the steps."""
+        """Run the functions on the states of random steps and of resets between them."""
         env = self.env
         self._keep_start()
         self.ctx.restart()
@@ -92,9 +90,9 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run a step's functions on the state in which a fault ended the episode, before the world restarts.
+        """Run a step's functions on the state in which a fault ended the episode.
 
-        A read out of range may have caused the fault by returning NaN.
+        The fault may come from a read out of range that returned NaN.
         """
         env = self.ctx.b
         env.set_state(state)
@@ -105,14 +103,13 @@ class _Run:
         self._run_step(env.worlds)
 
     def _run_step(self, worlds: Worlds) -> None:
-        """Run the functions of a step, on the states before and after it."""
         dirty = True
         for name, function in self.functions.items():
             if name in (*_RESET, "control"):
                 continue
             if dirty:
                 self._copy(worlds.after, self.after)
-            if name == "advance":  # the function advance gets the memory of the previous step
+            if name == "advance":  # advance gets the memory of the previous step
                 for memory in MEMORIES:
                     if memory in self.env.task.types:
                         wp.copy(getattr(self.after, memory), getattr(self.before, memory))
@@ -120,7 +117,7 @@ class _Run:
             dirty = name == "advance" or bool(written_fields(function))
 
     def _run_reset(self) -> None:
-        """Run the functions of a reset on the engine's initial state."""
+        """Run a reset's functions on the engine's initial state."""
         self._copy(self.start, self.after)
         if "lasting_memory" in self.env.task.types:
             wp.copy(self.after.lasting_memory, self.worlds.after.lasting_memory)
@@ -128,7 +125,7 @@ class _Run:
             self._run(name, self.after)
 
     def _keep_start(self) -> None:
-        """Copy the initial state before the task's functions change it."""
+        """Copy the initial state, which the task's functions change."""
         env = self.ctx.b
         env.engine.reset(env.worlds.everyone)
         self._copy(env.worlds.after, self.start)
@@ -138,7 +135,7 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function, if the task defines it; ``state`` is the function's argument ``s`` or ``s1``."""
+        """Run the copy of a function with ``state`` as its argument ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
@@ -155,7 +152,6 @@ class _Run:
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
 
     def _batch(self) -> Any:
-        """Allocate arrays for copies of the task's fields."""
         batch = self.env.task.kernels.Batch()
         for name in self.env.task.types:
             live = getattr(self.worlds.after, name)
@@ -165,7 +161,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Allocate an array of zeros.
+        """Allocate zeros.
 
         An empty array gets memory for one element, because a checked function may access it.
         """

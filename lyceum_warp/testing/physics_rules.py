@@ -1,7 +1,6 @@
-"""Check that a world's inputs (such as applied forces) and its own model fields affect its physics.
+"""Check that a world's inputs, such as applied forces, and its own model fields affect its physics.
 
-The reference is ``mj_step``. An engine's result must be nearer to the reference than to the result of ``mj_step``
-without these inputs and fields.
+The reference is ``mj_step``. The engine must come closer to it than ``mj_step`` without these inputs and fields.
 """
 
 import copy
@@ -17,21 +16,21 @@ from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
-"""If inputs and model fields move every coordinate by less than this distance, their effect is not checked."""
+"""Inputs and model fields are not checked if they move all coordinates by less than this distance."""
 
 
 def predicted(
     env: Env, before: torch.Tensor, after: torch.Tensor | None = None, *, nstep: int, dynamics: bool = True,
     inputs: bool = True,
 ) -> np.ndarray:  # fmt: skip
-    """Step every world by ``mj_step``, and return its coordinates, (nworld, nq).
+    """Step every world with ``mj_step``, and return its coordinates, (nworld, nq).
 
     Args:
-        env: The environment to which the states belong.
+        env: The environment of the states.
         before: Initial states, (nworld, state_space.size).
-        after: States that hold the controls and inputs of the step; by default ``before``.
+        after: States with the controls and inputs of the step; by default ``before``.
         nstep: Number of substeps.
-        dynamics: Whether to take model fields from ``before`` instead of the nominal values.
+        dynamics: Whether to take model fields from ``before`` instead of their nominal values.
         inputs: Whether to take inputs from ``after`` instead of ``before``.
     """
     parts, size = env.state_space.parts, env.engine.integration_size
@@ -74,7 +73,7 @@ def closer(
 
 
 def check_inputs(ctx: Context) -> None:
-    """Inputs from ``control`` act in the same step, belong to the state, and are cleared by a reset."""
+    """Inputs from ``control`` act in the same step and are part of the state. A reset clears them."""
     env, b = ctx.a, ctx.b
     written = [name for name in INPUTS if name in env.task.writes.get("control", ())]
     if not written:
@@ -86,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # call the task's control without a step
+            b.worlds.act()  # call only the task's control
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)
@@ -109,9 +108,10 @@ def check_inputs(ctx: Context) -> None:
 
 
 def check_dynamics(ctx: Context) -> None:
-    """A world's model fields belong to its state and affect its physics; randomization does not accumulate over resets.
+    """A world's model fields are part of its state and affect its physics.
 
-    ``reset`` restores nominal values, except in fields that are randomized only once per world.
+    Random changes do not accumulate over resets. ``reset`` restores nominal values, except for fields that are
+    randomized once per world.
     """
     a, b = ctx.a, ctx.b
     varied = [field.name for field in a.task.dynamics]
@@ -144,7 +144,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # the next random values are the same after many resets as after one reset
+    # the random values are the same after many resets as after one
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

@@ -1,4 +1,4 @@
-"""Check how episodes start: from a keyframe, after rejected initial states, after the substeps of ``settle``."""
+"""Check how episodes start: from a keyframe, after rejected states, after the substeps of ``settle``."""
 
 import numpy as np
 import torch
@@ -9,7 +9,6 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.testing.physics_rules import closer, predicted
 
 _RESETS = 6
-"""The number of resets in ``check_rejection``."""
 
 
 def check_keyframe(ctx: Context) -> None:
@@ -18,7 +17,7 @@ def check_keyframe(ctx: Context) -> None:
     if (name := env.task.task.keyframe) is None:
         return
     key = env.task.model.key(name)
-    env.engine.reset(env.worlds.everyone)  # the initial state, before the task's functions change it
+    env.engine.reset(env.worlds.everyone)  # the initial state before the task's functions change it
     state = env.get_state()
     env.rand_reset(ctx.seed)
     given = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act, "ctrl": key.ctrl, "mocap_pos": key.mpos}
@@ -30,7 +29,7 @@ def check_keyframe(ctx: Context) -> None:
 
 
 def check_rejection(ctx: Context) -> None:
-    """Each world draws initial states until one is accepted or the maximum number of draws is reached."""
+    """Each world draws initial states until one is accepted, up to the maximum number of draws."""
     a, b = ctx.a, ctx.b
     reject = a.task.kernels.reject_worlds
     if reject is None:

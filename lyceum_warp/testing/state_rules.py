@@ -10,7 +10,7 @@ from lyceum_warp.testing.context import SHORT, Context
 
 
 def check_round_trip(ctx: Context) -> None:
-    """After ``set_state(state)``, ``get_state()`` returns the same state.
+    """``get_state()`` returns the state given to ``set_state``.
 
     With a mask, ``get_state`` writes only the rows of selected worlds.
     """
@@ -45,7 +45,7 @@ def check_restoring(ctx: Context) -> None:
 
 
 def check_masked_restoring(ctx: Context) -> None:
-    """With a mask, ``set_state`` changes no bit of the worlds outside the mask."""
+    """With a mask, ``set_state`` does not change other worlds."""
     a, b = ctx.a, ctx.b
     ctx.restart()
     mask = ctx.mask()
@@ -92,7 +92,7 @@ def check_set_state_shows(ctx: Context) -> None:
 
 
 def check_purity(ctx: Context) -> None:
-    """Given old states and actions, getters return the original step's numbers at any time, without side effects."""
+    """For old states and actions, getters return the numbers of the original step at any time, without side effects."""
     env = ctx.a
     has_evaluate = env.task.functions["evaluate"] is not None
     with ctx.changed(env, autoreset=False, horizon=0):
@@ -122,7 +122,7 @@ def check_purity(ctx: Context) -> None:
 
 
 def check_determinism(ctx: Context) -> None:
-    """Two environments with the same options and actions stay bitwise equal through all resets."""
+    """Two environments with the same options and actions stay equal bit for bit through all resets."""
     ctx.restart()
     for i, action in enumerate(ctx.actions(ctx.steps)):
         ctx.a.step(action)
@@ -135,13 +135,13 @@ def check_determinism(ctx: Context) -> None:
 
 
 def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
-    """Select the parts of an episode's initial state that do not depend on earlier episodes."""
+    """Select the parts of an initial state that do not depend on earlier episodes."""
     names = [n for n in env.state_space.parts if n not in (*COUNTERS, *env.task.memory["lasting_memory"])]
     return torch.cat([state[:, env.state_space.parts[name]] for name in names], dim=1)
 
 
 def _lasting_columns(env: Env) -> list[slice]:
-    """Return the state's columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
+    """Return the columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
     return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]
@@ -150,8 +150,8 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    Resets preserve some columns of a state, and the other columns may depend on them. The check therefore first sets
-    these columns to equal values in all worlds.
+    Some columns survive a reset, and other columns may depend on them. The check therefore makes these columns equal in
+    all worlds first.
     """
     env = ctx.a
     lasting = _lasting_columns(env)
@@ -184,7 +184,7 @@ def check_reset(ctx: Context) -> None:
 
 
 def check_masked_reset(ctx: Context) -> None:
-    """Resets with a mask change no bit of the worlds outside the mask."""
+    """With a mask, resets do not change other worlds."""
     env = ctx.a
     mask = ~ctx.mask()
     for reset in (env.reset, env.rand_reset):
@@ -199,7 +199,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` is reproducible and clears actions; other resets, worlds and seeds give other states."""
+    """``rand_reset(seed)`` is reproducible and clears actions. Other resets, worlds and seeds give other states."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

@@ -12,12 +12,12 @@ from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task
 
 
 def unused(task: BoundTask) -> list[str]:
-    """List a task's unused parts, one per line: functions that are never called, and memory that is never read."""
+    """List functions that are never called and memory that is never read, one per line."""
     return [*_functions(task), *_memory(task)]
 
 
 def _functions(task: BoundTask) -> list[str]:
-    """List the functions of the task's file that no function calls, no task uses, and no term takes as an argument."""
+    """List functions that no function calls, no task uses, and no term takes as an argument."""
     module = vars(sys.modules[task.task.__module__])
     own = {name: value for name, value in module.items() if isinstance(value, wp.Function) and has_source(value)}
     used = {*FUNCTIONS, *task.source.terms.functions}
@@ -40,7 +40,6 @@ def _functions(task: BoundTask) -> list[str]:
 
 
 def _memory(task: BoundTask) -> list[str]:
-    """List the memory in World that the task's functions never read."""
     roots = (*task.functions.values(), *task.observers.values(), *task.kernels.terms.values())
     waiting: list[Any] = [overload for root in roots if root is not None for overload in overloads(root)]
     seen, read = set[wp.Function](), set[str]()

@@ -1,4 +1,4 @@
-"""List the physics settings to try for a task, and format a setting as flags or as Python."""
+"""List the physics settings to try for a task, and write a setting as flags or as Python."""
 
 import dataclasses
 from collections.abc import Iterable, Mapping
@@ -9,12 +9,12 @@ from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
-"""Iteration limits to try, if lower than the model's limit."""
+"""Iteration limits to try, if they are lower than the model's limit."""
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
-"""Minimum number of degrees of freedom for which each engine uses a sparse Jacobian."""
+"""Number of degrees of freedom from which each engine uses a sparse Jacobian."""
 _DENSE_LIMIT = 60
-"""Maximum number of degrees of freedom for which MuJoCo Warp supports a dense Jacobian."""
+"""Number of degrees of freedom up to which MuJoCo Warp supports a dense Jacobian."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,21 +22,17 @@ class Setting:
     """Physics options to try together."""
 
     name: str
-    """Short description; empty for the unchanged task."""
+    """Short description, or "" for the unchanged task."""
     group: str
-    """Kind of change. A combination has at most one setting of each group."""
+    """Kind of change. A combination has at most one setting per group."""
     physics: Mapping[str, Any]
-    """Options that differ from the task's options, by their names in ``lw.PhysicsOptions``."""
+    """Options that differ from the task's, by their names in ``lw.PhysicsOptions``."""
     parts: tuple["Setting", ...] = ()
-    """Settings of a combination, in order."""
+    """Settings of a combination."""
 
 
 def candidates(env: Env) -> list[Setting]:
-    """List the settings to try one by one, in order.
-
-    Args:
-        env: Environment of the unchanged task.
-    """
+    """List the settings to try one by one."""
     option, limits = env.task.model.opt, env.options.physics.solver or {}
     cone, integrator = _name(CONES, option.cone), _name(INTEGRATORS, option.integrator)
     found = [
@@ -67,7 +63,7 @@ def candidates(env: Env) -> list[Setting]:
 
 
 def not_tried(env: Env) -> list[str]:
-    """List the settings that are not tried on the environment's engine, each with the reason."""
+    """List the settings that are not tried on the environment's engine, with reasons."""
     found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
     if env.engine.name == "warp":
         if env.task.model.nv > _DENSE_LIMIT:
@@ -78,9 +74,9 @@ def not_tried(env: Env) -> list[str]:
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """Combine settings; earlier settings have priority. None if the result equals one of the settings.
+    """Combine settings. Earlier settings have priority. None if the result is one of the settings.
 
-    A setting is omitted if an earlier setting has the same group or sets the same option.
+    A setting is left out if an earlier one has the same group or sets the same option.
     """
     parts: list[Setting] = []
     physics: dict[str, Any] = {}
@@ -95,14 +91,14 @@ def combined(settings: Iterable[Setting]) -> Setting | None:
 
 
 def flags(physics: Mapping[str, Any]) -> str:
-    """Format a setting as flags of lyceum-warp train and plan."""
+    """Write a setting as flags of lyceum-warp train and plan."""
     words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
     words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
     return " ".join(words)
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
-    """Format a setting as a line of Python that defines a task's physics options "fast"."""
+    """Write a setting as the line of Python that defines a task's physics options "fast"."""
     words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
     return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
 
@@ -112,7 +108,7 @@ def _name(names: Mapping[str, Any], value: int) -> str | None:
 
 
 def _fewer(substeps: int) -> list[int]:
-    """List smaller numbers of substeps: a half of a given number, a quarter, and so on."""
+    """List smaller numbers of substeps: a half, a quarter, and so on."""
     found = []
     while substeps > 1:
         substeps = (substeps + 1) // 2
@@ -121,7 +117,7 @@ def _fewer(substeps: int) -> list[int]:
 
 
 def _other_jacobian(env: Env) -> list[str]:
-    """Return the other form of the Jacobian, dense or sparse, if the engine supports this form."""
+    """Return the other form of the Jacobian, dense or sparse, if the engine supports it."""
     nv, engine = env.task.model.nv, env.engine.name
     now = _name(JACOBIANS, env.task.model.opt.jacobian)
     if now == "auto":

@@ -1,4 +1,4 @@
-"""Judge a setting by a tolerance and the confidence interval of its difference in returns."""
+"""Judge a setting by the confidence interval of its difference in returns."""
 
 import dataclasses
 import math
@@ -10,20 +10,20 @@ import numpy as np
 from lyceum_warp.support.intervals import mean_interval
 
 TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
-"""Largest accepted difference of returns, relative to the mean absolute return of the unchanged task."""
+"""Largest accepted difference of returns, relative to the unchanged task's mean absolute return."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation between returns under a planner's physics and under the plant's physics, by name
-of the tolerance. The program bench/rank_loss.py compares rank correlations with losses of planned return."""
+"""Smallest accepted rank correlation between returns under a planner's physics and under the plant's physics.
+bench/rank_loss.py compares rank correlations with losses of planned return."""
 
 LEAST_GAIN = 1.03
-"""Minimum speed-up at which a setting's returns are compared; settings that take less memory are always compared."""
+"""Returns are compared only from this speed-up on, or if a setting takes less memory."""
 _LEAST_SAVING = 0.95
 
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Difference of returns between a setting and the unchanged task, relative to the mean absolute return."""
+    """Difference of returns from the unchanged task, relative to its mean absolute return."""
 
     mean: float
     low: float
@@ -32,11 +32,11 @@ class Difference:
     episodes: int
 
     def within(self, tolerance: float) -> bool:
-        """Check whether the interval lies within the tolerance."""
+        """Return whether the interval lies within the tolerance."""
         return -tolerance <= self.low and self.high <= tolerance
 
     def beyond(self, tolerance: float) -> bool:
-        """Check whether the interval lies outside the tolerance."""
+        """Return whether the interval lies outside the tolerance."""
         return self.low > tolerance or self.high < -tolerance
 
     def __str__(self) -> str:
@@ -45,9 +45,9 @@ class Difference:
 
 
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
-    """Compare two arrays of returns of the same episodes, each (episodes,).
+    """Compare returns of the same episodes, each (episodes,).
 
-    If all returns of the unchanged task are 0, every difference is infinite.
+    The difference is infinite if all returns of the unchanged task are 0.
     """
     change, scale = returns - reference, float(np.abs(reference).mean())
     if not change.any():
@@ -60,7 +60,7 @@ def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
 
 @dataclasses.dataclass(frozen=True)
 class Correlation:
-    """Mean rank correlation over some states, with the bounds of its 95 % confidence interval."""
+    """Mean rank correlation over some states, with its 95 % confidence interval."""
 
     mean: float
     low: float
@@ -68,28 +68,27 @@ class Correlation:
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Correlation":
-        """Average the correlations of the states, (states,)."""
+        """Average correlations, (states,)."""
         mean, half = mean_interval(values)
         return cls(mean, max(mean - half, -1.0), min(mean + half, 1.0))
 
 
 def episodes_needed(found: Difference, half_width: float) -> int:
-    """Estimate from some episodes how many episodes give an interval of a given half-width.
+    """Estimate how many episodes give an interval of a given half-width.
 
-    The estimate uses only the spread of the returns, not their mean, so it does not depend on the result (Stein's
-    two-stage procedure).
+    The estimate uses only the spread of the returns, so it does not depend on their mean (Stein's two-stage procedure).
     """
     now = (found.high - found.low) / 2
     return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
 
 
 def buys(speedup: float, memory: float) -> bool:
-    """Check whether a setting saves time or memory, given the speed-up's lower bound and the ratio of memory."""
+    """Return whether a setting saves time or memory, from the speed-up's lower bound and the ratio of memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 
 def verdict(row: Mapping[str, Any], tolerance: str) -> str:
-    """Derive the verdict on a row of results; see ``Tuning.rows``."""
+    """Return the verdict on a row of results; see ``Tuning.rows``."""
     if row["refused"]:
         return "refused"
     if "ranks" in row:

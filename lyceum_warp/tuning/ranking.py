@@ -1,4 +1,4 @@
-"""Compare planners with different physics options by planning time, and by how they rank the same samples."""
+"""Compare planners with different physics options by planning time and by how they rank the same samples."""
 
 import dataclasses
 import statistics
@@ -19,34 +19,33 @@ _SAMPLES = 64
 _MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""How many times a plan is improved before the compared samples are drawn around it."""
+"""A plan is improved this often before the compared samples are drawn around it."""
 
 
 class Rankings:
     """Compares a planner's physics options with the plant's options.
 
-    From each state, planners with both physics options draw the same samples around the same plan. A planner only uses
-    the order and the differences of returns, so the rank correlation of the returns shows whether a planner can use
-    coarser physics. The states are of three kinds:
+    From each state, both planners draw the same samples around the same plan. A planner uses only the order and the
+    differences of returns. The rank correlation of the returns thus says whether coarser physics is good enough. There
+    are three kinds of states:
 
-    - standing: states after a random reset;
-    - moving: states after 30 steps under a planner that has the plant's physics and replans every 6 steps;
-    - fallen: states after random actions until the end of the episode (at most 200 steps), and for 10 more steps.
+    - standing: after a random reset;
+    - moving: after 30 steps under a planner with the plant's physics that replans every 6 steps;
+    - fallen: after random actions until the end of the episode (at most 200 steps), and 10 more steps.
 
     Args:
-        task: The task.
         states: Number of states of each kind.
         repeats: Number of timed plans.
         samples: Number of samples of a plan.
         seed: Seed of states and noise.
-        words: Options and parameters as for ``lw.MPPI``.
+        words: Options and parameters for ``lw.MPPI``.
     """
 
     def __init__(
         self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
     ) -> None:
         self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
-        # with several improvements, each planner's samples would adapt to its own physics
+        # after several improvements, each planner's samples would fit its own physics
         self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
@@ -57,7 +56,6 @@ class Rankings:
         return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
 
     def _find_states(self) -> dict[str, torch.Tensor]:
-        """Compute the states of each kind, (states, state_space.size)."""
         plant = self.reference.replicate(nworld=self.states, autoreset=False)
         plant.rand_reset(self.seed)
         found = {"standing": plant.get_state()}
@@ -81,7 +79,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states; return the plans, and the returns (states, samples) of samples drawn around them."""
+        """Plan from some states. Return the plans, and the returns (states, samples) of samples around them."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)
@@ -89,14 +87,14 @@ class Rankings:
         return plan, self._returns(self.exact, start, plan)
 
     def _returns(self, planner: MPPI, start: torch.Tensor, plan: torch.Tensor) -> torch.Tensor:
-        """Compute the returns of the samples that a planner draws around a plan, (states, samples)."""
+        """Compute returns of samples around a plan, (states, samples)."""
         planner.reset(self.seed + 1)
         planner.knot_actions.copy_(plan)
         planner(start, shift=0)
         return planner.returns.reshape(self.states, -1).clone()
 
     def measure(self, setting: Setting) -> dict[str, Any]:
-        """Measure a setting, and return the row of its results."""
+        """Measure a setting, and return its row of results."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
         try:
             planner, one = self._planner(setting.physics, self.states), self._planner(setting.physics, 1)
@@ -106,7 +104,7 @@ class Rankings:
         start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
             exact, own = self._seconds(self.one, start), self._seconds(one, start)
-            if repeat:  # do not time the first plans, which load kernels
+            if repeat:  # the first plans load kernels, so do not time them
                 times.append(own)
                 ratios.append(exact / own)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
@@ -117,7 +115,6 @@ class Rankings:
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:
-        """Measure the seconds of planning from a state."""
         begin = time.perf_counter()
         planner(start)
         if planner.actions.is_cuda:
@@ -126,7 +123,7 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, omitting rows of equal numbers.
+    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, without rows of equal numbers.
 
     Equal numbers get the mean of their ranks.
     """

@@ -16,12 +16,7 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
-    """Collect everything that affects results, except the setting: task, machine, worlds and versions.
-
-    Args:
-        env: Environment of the unchanged task.
-        more: Additional entries, which are JSON values.
-    """
+    """Collect everything that affects results, except the setting: task, machine, worlds and versions."""
     kept, _ = task_copy(env)
     params = {name: json_value(name, value) for name, value in env.given_params.items()}
     task = {"task": kept, "params": params, "physics": env.options.physics.given(), "horizon": env.horizon}
@@ -34,18 +29,18 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
 
 
 class RowFile:
-    """Stores rows of results in a file, one row per setting.
+    """Stores one row of results per setting in a file.
 
     Args:
-        path: The file; it need not exist.
-        identity: Only rows with this identity are used; see the function ``identity``.
+        path: The file, which need not exist.
+        identity: Only rows with this identity are used; see ``identity``.
 
     Raises:
         ValueError: The file is not a file of results.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self.identity = path, json.loads(json.dumps(identity))  # convert tuples to lists, as in JSON
+        self.path, self.identity = path, json.loads(json.dumps(identity))  # tuples become lists, as in JSON
         self._rows: dict[str, dict[str, Any]] = {}
         self._whole = 0
         lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
@@ -54,7 +49,7 @@ class RowFile:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                # a killed process may leave an incomplete last line: the next row replaces it
+                # a killed process may leave an incomplete last line, which the next row replaces
                 if number == len(lines) and line.startswith(_BEGIN):
                     break
                 raise ValueError(f"line {number} of {path} is not a result of tune: use another file") from None
@@ -63,11 +58,11 @@ class RowFile:
                 self._rows[key] = row
 
     def get(self, physics: Mapping[str, Any]) -> dict[str, Any] | None:
-        """Get the row of a setting, or None if the file has no such row."""
+        """Get the row of a setting, or None."""
         return self._rows.get(_key(physics))
 
     def add(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Append a row to the file, and return the row as read from JSON."""
+        """Append a row to the file, and return it as read from JSON."""
         line = json.dumps({**row, "identity": self.identity})
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("ab") as file:

@@ -34,14 +34,13 @@ class Tuning:
     """Results of ``tune``."""
 
     rows: list[Row]
-    """Results of each setting, the fastest first; docs/physics.md describes the entries. The entry ``verdict`` is
+    """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
     "same", "different" or "not shown" if the interval of the returns lies within, outside or across the tolerance. It
-    is "faults" if the setting has more than twice as many faults as the unchanged task. It is "no gain", without a
-    comparison of returns, if the setting is less than 3 % faster and does not save memory. It is "refused" if MuJoCo or
-    the engine refuses the setting; the entry ``refused`` has the reason. A setting of a planner may also have the
-    verdict "ranks badly"."""
+    is "faults" if there are more than twice as many faults as in the unchanged task. It is "no gain" if the setting is
+    less than 3 % faster and saves no memory; returns are then not compared. It is "refused" if MuJoCo or the engine
+    refuses the setting, for the reason in the entry ``refused``. A setting of a planner may also get "ranks badly"."""
     reference: Row
-    """Results of comparing the unchanged task with itself."""
+    """Results of a comparison of the unchanged task with itself."""
     not_tried: list[str]
     """Settings that were not tried, with reasons."""
     path: Path
@@ -49,17 +48,17 @@ class Tuning:
 
     @property
     def best(self) -> Row | None:
-        """Return the fastest setting with the same returns; None if there is no such setting."""
+        """Return the fastest setting with the same returns, or None."""
         return next((row for row in self.rows if row["verdict"] == "same"), None)
 
     @property
     def flags(self) -> str:
-        """Format the best setting as flags of lyceum-warp train and plan; empty if ``best`` is None."""
+        """Write the best setting as flags of lyceum-warp train and plan, or "" without one."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
     def task_line(self) -> str:
-        """Format the best setting as a task's line for ``physics="fast"``; empty if ``best`` is None."""
+        """Write the best setting as a task's line for ``physics="fast"``, or "" without one."""
         return task_line(self.best["physics"]) if self.best else ""
 
 
@@ -77,34 +76,32 @@ def tune(
     progress: Callable[[Row], object] | None = None,
     **words: Any,
 ) -> Tuning:
-    """Measure how physics options change a task's speed and returns, and find the fastest that keep the returns.
+    """Find the fastest physics options that do not change a task's returns.
 
-    Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence,
-    and the returns of the same episodes under random actions and under a policy. Settings are first tried alone.
-    Afterwards, the best settings of all groups are combined, and as long as the combination changes the returns, the
-    least useful setting of the combination is removed.
+    Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults,
+    divergence, and returns. Returns are those of the same episodes under random actions and under a policy. Settings
+    are first tried alone. Then the best settings of all groups are combined. While the combination changes the returns,
+    its least useful setting is removed.
 
     Args:
-        task: Name of a task, path of a task file, or a task class.
-        run: Folder of a run of the same task. Returns are then also compared under the run's policy, and the run's
-            parameters replace the task's defaults.
+        task: A task's name, file or class.
+        run: Folder of a run of the same task. Its policy plays further episodes to compare, and its parameters replace
+            the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
-        tolerance: Tolerance for the 95 % interval of the difference of returns, relative to the mean absolute return:
-            "strict" (2 %), "loose" (5 %) or "any" (only faults count).
-        short: Whether to compare only the first 100 steps of episodes, which takes a few seconds, instead of whole
-            episodes.
-        episodes: Number of episodes of each setting, rounded up to a multiple of the number of worlds. By default, the
-            width of the interval determines the number, within the time limit of a minute, or of 5 s if ``short``.
-        planning: Whether to find physics options for the worlds of the task's planner. In this case, the search
-            compares planning times and the rankings of the same samples, from standing, moving and fallen states. A
-            setting is suggested if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8
-            ("loose"). With ``planning``, ``nworld`` is the number of samples, by default 64, and ``episodes`` is the
-            number of states of each kind.
-        out: File of the results, to which rows are appended; existing rows are not measured again. The default is
+        tolerance: Largest 95 % interval of the difference of returns, relative to the mean absolute return: "strict" (2
+            %), "loose" (5 %) or "any" (only faults count).
+        short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
+        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, as many
+            as the width of the interval needs, for at most a minute (5 s with ``short``).
+        planning: Whether to find physics options for the worlds of the task's planner. The search then compares
+            planning times, and the rankings of the same samples from standing, moving and fallen states. It suggests a
+            setting if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). ``nworld``
+            is then the number of samples, by default 64, and ``episodes`` is the number of states of each kind.
+        out: File of the results. Rows are appended, and settings with a row are not measured again. By default
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
-        progress: Function that is called with each row of results.
-        words: Options and parameters as for ``lw.make``; by default 256 worlds on the CPU, and 4096 worlds on a GPU.
+        progress: Called with each row of results.
+        words: Options and parameters for ``lw.make``; by default 256 worlds on the CPU, and 4096 worlds on a GPU.
 
     Raises:
         ValueError: An argument is unknown or not valid, or the run belongs to a different task.
@@ -139,7 +136,6 @@ def _trials(
     task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
     episodes: int | None,
 ) -> Trials:  # fmt: skip
-    """Make the trials of the unchanged task, with the policy of a given run."""
     options, params = EnvOptions.split(words)
     if "nworld" not in words:
         options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
@@ -157,11 +153,7 @@ def _digest(run: str | Path, which: str) -> str:
 
 
 def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
-    """Get the task parameters of a run.
-
-    Raises:
-        ValueError: The run belongs to a different task.
-    """
+    """Get a run's task parameters, after checking that it belongs to the same task."""
     opened = Run.open(run)
     if opened.task_name != task_name(task):
         raise ValueError(f"{run} is a run of the task {opened.task_name!r}, not of the task {task_name(task)!r}")
@@ -169,15 +161,12 @@ def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
 
 
 class _Search:
-    """Runs a search over physics settings."""
-
     def __init__(
         self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
     ) -> None:
         self.trials, self.file, self.tolerance, self.progress = trials, file, tolerance, progress
 
     def run(self) -> Tuning:
-        """Try all settings."""
         env = self.trials.reference
         reference = self._row(Setting("", "", {}))
         tried = [(setting, self._row(setting)) for setting in candidates(env)]
@@ -187,7 +176,7 @@ class _Search:
         settings = [setting for setting, _ in good]
         while (both := combined(settings)) is not None:
             row = self._row(both)
-            if row["name"] == both.name:  # skip a single setting, which was already tried alone
+            if row["name"] == both.name:  # a single setting was already tried alone
                 rows.append(row)
             if row["verdict"] == "same":
                 break

@@ -1,4 +1,4 @@
-"""Compare a physics setting with the unchanged task by speed, memory, faults, divergence and returns."""
+"""Compare a physics setting with the unchanged task: speed, memory, faults, divergence and returns."""
 
 import dataclasses
 import gc
@@ -21,9 +21,9 @@ from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, differenc
 
 DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
-"""Standard deviation of a perturbation of positions and velocities. The perturbation shows how chaotic the task is."""
+"""Standard deviation of a perturbation of positions and velocities, which shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the difference's confidence interval. This width determines the number of episodes."""
+"""Target half-width of the confidence interval of the difference. It determines the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -34,15 +34,15 @@ class Effort:
     """Limits on the duration of measurements."""
 
     repeats: int
-    """Number of timed blocks of steps, each run with the unchanged task and with the setting."""
+    """Number of timed blocks of steps, each with the unchanged task and with the setting."""
     block_seconds: float
     """Duration of a block with the unchanged task."""
     judging_seconds: float
-    """Time limit for all episodes of the unchanged task, separately for random actions and for the policy."""
+    """Time limit for the unchanged task's episodes, once for random actions and once for the policy."""
     steps: int
-    """Maximum number of steps in an episode; 0 means the task's horizon."""
+    """Maximum number of steps in an episode, or 0 for the task's horizon."""
     recorded_at: tuple[int, ...]
-    """Numbers of steps after which states are recorded; speed and divergence are measured from these states."""
+    """Steps after which states are recorded. Speed and divergence are measured from these states."""
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
@@ -50,15 +50,11 @@ SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, rec
 
 
 class Trials:
-    """Compares settings with the unchanged task; a setting and the unchanged task alternate in one process.
+    """Compares settings with the unchanged task, by turns in one process.
 
     Args:
-        reference: Environment of the unchanged task, made with ``autoreset=False``.
-        policy: The policy of a run, or None.
-        effort: Limits on the duration of measurements.
-        seed: Seed of initial states and actions.
-        episodes: Number of episodes of each setting; by default, the interval's width and the time limit determine the
-            number.
+        reference: The unchanged task, made with ``autoreset=False``.
+        episodes: Number of episodes of each setting; by default, the interval's width and the time limit determine it.
     """
 
     def __init__(
@@ -77,9 +73,9 @@ class Trials:
     # recorded states and actions
 
     def _record(self) -> None:
-        """Record states, and the next 50 actions after each state.
+        """Record states, and 50 actions after each.
 
-        Half of the worlds follow the policy, and the other half acts at random.
+        Half of the worlds follow the policy, and the others act at random.
         """
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
@@ -119,7 +115,7 @@ class Trials:
         return torch.where(policy_worlds, self.policy(self.reference.obs), random)
 
     def _share_in_contact(self) -> float:
-        """Compute the fraction of recorded states with contacts, from a sample of the states on the CPU."""
+        """Estimate the fraction of recorded states with contacts, on the CPU."""
         model, size = self.reference.task.model, self.reference.engine.integration_size
         data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
         states = torch.cat(self._starts)[:, :size].cpu().numpy()
@@ -133,7 +129,7 @@ class Trials:
     # one setting
 
     def measure(self, setting: Setting) -> dict[str, Any]:
-        """Measure a setting, and return a row of results, with returns only if the setting saves time or memory."""
+        """Return a row of results. Returns are compared only if the setting saves time or memory."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
         before = self._free()
         try:
@@ -160,7 +156,6 @@ class Trials:
         return row
 
     def _free(self) -> int:
-        """Get the free memory of the device; 0 on the CPU."""
         if not self.reference.device.is_cuda:
             return 0
         gc.collect()
@@ -169,10 +164,10 @@ class Trials:
         return free_memory(self.reference.device) or 0
 
     def _speed(self, env: Env) -> tuple[float, float, float]:
-        """Measure steps per second of all worlds, and the median and the lower bound of the speed-up.
+        """Measure steps per second of all worlds, and the speed-up's median and lower bound.
 
-        The lower bound is the smaller of two numbers, because other processes may slow down some blocks: the lower
-        quartile of the blocks' speed-ups, and the speed-up between the fastest blocks.
+        Other processes may slow down some blocks. The lower bound is therefore the lower quartile of the blocks'
+        speed-ups, or the speed-up between the fastest blocks if that is smaller.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
@@ -182,7 +177,7 @@ class Trials:
         return count / float(np.median(own)), float(np.median(exact / own)), float(low)
 
     def _seconds(self, env: Env, k: int) -> float:
-        """Measure the seconds of a block of steps from the k-th recorded states, after one untimed step."""
+        """Time a block of steps from the k-th recorded states, after one untimed step."""
         actions = self._actions[k]
         env.set_state(self._starts[k])
         env.step(actions[0])
@@ -205,13 +200,13 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps, in RMS units."""
+        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps (RMS)."""
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
-        """Compare returns, and count faults and steps with the setting and with the unchanged task.
+        """Compare returns, and count faults and steps on both sides.
 
         The spread in the first batch of episodes determines the number of batches, within the time limit.
         """
@@ -236,9 +231,9 @@ class Trials:
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
-        """Compute the returns of one episode per world (nworld,) and the numbers of faults and of steps.
+        """Compute the returns of one episode per world (nworld,), and the numbers of faults and steps.
 
-        Episodes of the same batch have equal initial states, random streams and, without a policy, random actions.
+        Episodes of the same batch have the same initial states, random streams and random actions.
         """
         seed = self.seed + 1 + batch
         self.reference.rand_reset(seed)
@@ -260,7 +255,7 @@ class Trials:
 
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
-    """Yield batches of uniform random actions, (nworld, nact); actions without bounds are drawn from -1 to 1."""
+    """Yield batches of uniform random actions, (nworld, nact). Actions without bounds lie between -1 and 1."""
     device, low, high = env.obs.device, env.action_space.low, env.action_space.high
     assert low is not None and high is not None
     generator = torch.Generator(device).manual_seed(seed)

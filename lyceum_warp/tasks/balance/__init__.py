@@ -7,4 +7,4 @@ TASKS = {
     "humanoid_walk": "humanoid_balance",
     "humanoid_get_up": "humanoid_balance",
 }
-"""The modules of the tasks, by task name; the registry reads this dict without running the file."""
+"""The modules of the tasks by name. The registry reads this dict without running the file."""

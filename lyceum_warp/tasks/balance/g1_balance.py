@@ -1,9 +1,9 @@
 """G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
-Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock, so that, with zero
-actions, the robot steps in place until it falls after about a second. A planner thus only needs to find corrections of
-a step, not the step itself. The gains of the servos are those of unitree_rl_gym, which also keeps waist and arms rigid.
-The 17 joints of the upper body and the dry friction of the legs' joints would double the time of a substep.
+Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock. With zero actions,
+the robot steps in place and falls after about a second. A planner thus only corrects the steps. The servos have the
+gains of unitree_rl_gym, which also keeps waist and arms rigid. The 17 joints of the upper body and the dry friction of
+the legs would double the time of a substep.
 """
 
 import mujoco
@@ -71,17 +71,17 @@ class G1Stand(balancing.Balance):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the upper body rigid in the pose of the keyframe knees_bent, and set the gains of the legs."""
+        """Make the upper body rigid in the pose of the keyframe knees_bent, and set the legs' gains."""
         walkers.prepare_walker(spec, ("left_foot", "right_foot"), timestep=0.005, iterations=(10, 10))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
         pose = model.key("knees_bent").qpos
-        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]  # without the floating base
+        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]  # all except the floating base
         servos = [servo for servo in spec.actuators if servo.target not in LEGS]
         hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
         for element in (*spec.sensors, *spec.keys, *servos, *hands):
             spec.delete(element)
-        for body in spec.bodies:  # most meshes are drawn twice, and every geom costs time in each substep
+        for body in spec.bodies:  # most meshes are drawn twice, and every geom costs time
             meshes = [geom.meshname for geom in body.geoms]
             for i, geom in enumerate(body.geoms):
                 if geom.meshname and geom.meshname in meshes[:i]:

@@ -1,8 +1,7 @@
 """HumanoidStand: Gymnasium's humanoid stands, and steps to keep its balance when it is pushed.
 
-Actions are offsets of the joints' targets from a default pose with bent knees. The motors act as servos at the control
-rate, within Gymnasium's torque limits. The feet are spheres, so the robot can only balance by stepping and by swinging
-its body.
+Actions are offsets of the joints' targets from a pose with bent knees. The motors act as servos at the control rate,
+within Gymnasium's torque limits. The feet are spheres, so the robot must step and swing its body to keep its balance.
 """
 
 import warp as wp

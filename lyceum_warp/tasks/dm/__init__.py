@@ -1,4 +1,4 @@
-"""Reimplement dm_control's suite: a family of tasks with one domain in each module."""
+"""Reimplement dm_control's suite, with one domain in each module."""
 
 TASKS = {
     "dm/acrobot_swingup": "dm_acrobot",
@@ -32,4 +32,4 @@ TASKS = {
     "dm/walker_stand": "dm_walker",
     "dm/walker_walk": "dm_walker",
 }
-"""The modules of the tasks, by task name; the registry reads this dict without running the file."""
+"""The modules of the tasks by name. The registry reads this dict without running the file."""

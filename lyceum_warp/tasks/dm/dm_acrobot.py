@@ -18,7 +18,7 @@ class World:
 
 
 def lengths(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the lengths of the upper and the lower arm, m."""
+    """Return the lengths of upper and lower arm, m."""
     return np.array([model.body("lower_arm").pos[2], model.site_pos[p.tip, 2]])
 
 
@@ -36,11 +36,11 @@ def lift(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the matrix P of the effort x^T P x that balancing takes from a state x = (qpos, qvel) near upright, s.
+    """Return the matrix P of the effort x^T P x for balancing from a state x = (qpos, qvel) near upright, s.
 
-    The effort is the smallest integral of the squared action that brings the arms to rest in the upright pose. With
-    the linearized dynamics dx/dt = A x + B u and the unstable modes z_i = w_i^T x, where A^T w_i = r_i w_i and b_i =
-    w_i^T B, the effort is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
+    The effort is the smallest integral of the squared action that brings the arms to rest upright. The linearized
+    dynamics are dx/dt = A x + B u, with unstable modes z_i = w_i^T x, A^T w_i = r_i w_i and b_i = w_i^T B. The effort
+    is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
     """
     (a, b, c), (e1, e2) = p.inertia, p.lift
     mobility = np.linalg.inv([[a + 2.0 * c, b + c], [b + c, b]])
@@ -116,7 +116,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AcrobotSwingup(lw.Task):
     model, frame_skip = suite.model("acrobot"), 1
     obs = {"orientations": 4, "velocity": 2}
-    # the motor is too weak to lift the arms at once, so the planner is rewarded for the energy that it pumps in
+    # the motor is too weak to lift the arms at once, so reward the planner for the energy of the arms
     planning = lw.Planning(
         settings={"horizon": 25, "samples": 24, "noise": 2.0, "temperature": 0.2},
         options={"timestep": 0.04, "integrator": "rk4"},
@@ -131,6 +131,6 @@ class SparseParams(Params):
 
 @lw.register
 class AcrobotSwingupSparse(AcrobotSwingup):
-    """Swing up a double pendulum; the reward is 1 near the target and 0 elsewhere."""
+    """Swing up a double pendulum. The reward is 1 near the target and 0 elsewhere."""
 
     Params = SparseParams

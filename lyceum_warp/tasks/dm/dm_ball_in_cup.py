@@ -55,10 +55,10 @@ class BallInCupCatch(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add a sensor that counts contacts; ``reject`` uses it so that no episode starts with a contact.
+        """Add a sensor that counts contacts, so that ``reject`` can refuse initial states with contacts.
 
-        Also add a keyframe with the ball in the cup. From the model's initial state alone, the probe that sizes MuJoCo
-        Warp's buffers would find too few constraints.
+        Also add a keyframe with the ball in the cup. MuJoCo Warp's buffers are sized by simulating the keyframes, and
+        the initial state alone has too few constraints.
         """
         suite.count_contacts(spec)
         spec.add_key(name="caught", qpos=[0.0, 0.0, 0.0, 0.333])

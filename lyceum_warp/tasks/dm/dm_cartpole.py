@@ -61,7 +61,7 @@ class BalanceSparseParams(Params):
 
 @lw.register
 class CartpoleBalanceSparse(CartpoleBalance):
-    """Balance a pole on a cart; the reward is 1 near the goal and 0 elsewhere."""
+    """Balance a pole on a cart. The reward is 1 near the goal and 0 elsewhere."""
 
     Params = BalanceSparseParams
 
@@ -86,6 +86,6 @@ class SwingupSparseParams(SwingupParams):
 
 @lw.register
 class CartpoleSwingupSparse(CartpoleBalance):
-    """Swing up a pole on a cart; the reward is 1 near the goal and 0 elsewhere."""
+    """Swing up a pole on a cart. The reward is 1 near the goal and 0 elsewhere."""
 
     Params = SwingupSparseParams

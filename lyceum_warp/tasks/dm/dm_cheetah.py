@@ -46,7 +46,7 @@ class CheetahRun(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Scale the densities to the total mass in the MJCF, because MuJoCo deprecates ``settotalmass``."""
+        """Scale the densities to the total mass in the MJCF, because ``settotalmass`` is deprecated."""
         mass, spec.compiler.settotalmass = spec.compiler.settotalmass, -1.0
         scale = mass / spec.copy().compile().body_subtreemass[0]
         for geom in spec.geoms:

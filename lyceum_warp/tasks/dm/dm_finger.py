@@ -1,6 +1,6 @@
 """FingerSpin: a finger with two joints spins a body.
 
-The target of the turning tasks is a mocap body, so that its position is part of the state.
+The target of the turning tasks is a mocap body, because its position is part of the state.
 """
 
 import mujoco
@@ -64,7 +64,7 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # planners get a reward that rises with the speed, also above the task's speed, and hold each torque for two steps
+    # planners hold each torque for two steps, and their reward rises with the speed without limit
     planning = lw.Planning(
         settings={
             "horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 2.0, "temperature": 0.02,
@@ -74,7 +74,7 @@ class FingerSpin(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with a contact; let the body spin easily, and hide the target."""
+        """Count contacts for ``reject``, let the body spin easily, and hide the target."""
         suite.count_contacts(spec)
         spec.joint("hinge").damping[0] = 0.03
         for site in ("target", "tip"):
@@ -135,7 +135,7 @@ class FingerTurnEasy(FingerSpin):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Count contacts, so that no episode starts with a contact, and give each world its own target."""
+        """Count contacts for ``reject``, and give each world its own target."""
         suite.count_contacts(spec)
         suite.free_target(spec)
         spec.site("target").size[0] = cls.target_radius

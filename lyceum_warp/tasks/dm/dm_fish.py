@@ -101,7 +101,7 @@ def randomize_swim(s: SwimWorld, p: SwimParams, rng: Row[wp.uint32]):
 class FishSwim(FishUpright):
     """A fish swims to a target.
 
-    The target is a mocap body, so that its position is part of the state.
+    The target is a mocap body, because its position is part of the state.
     """
 
     World, Params = SwimWorld, SwimParams

@@ -77,7 +77,7 @@ class HumanoidStand(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add a sensor for contacts (see ``reject``), and remove the force sensors that no function reads."""
+        """Add a sensor for contacts (see ``reject``), and remove force sensors that no function reads."""
         for sensor in list(spec.sensors)[1:]:
             spec.delete(sensor)
         suite.count_contacts(spec)

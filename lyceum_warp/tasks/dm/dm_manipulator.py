@@ -1,6 +1,6 @@
 """ManipulatorBringBall: a planar arm with a hand brings a ball to a target.
 
-The target is a mocap body, so that its pose is part of the state.
+The target is a mocap body, because its pose is part of the state.
 """
 
 import mujoco
@@ -121,8 +121,8 @@ class ManipulatorBringBall(lw.Task):
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Add a sensor for contacts (see ``reject``), give each world its own target, and remove unused objects.
 
-        Also add a keyframe with the ball in the hand. From the model's initial state alone, the probe that sizes MuJoCo
-        Warp's buffers would find too few constraints.
+        Also add a keyframe with the ball in the hand. MuJoCo Warp's buffers are sized by simulating the keyframes, and
+        the initial state alone has too few constraints.
         """
         suite.count_contacts(spec)
         for name in ("peg", "target_peg", "cup", "slot"):

@@ -10,7 +10,7 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.dm import suite
 
-RESOLUTION = wp.constant(0.01)  # distance between the initial heights that are tried, m
+RESOLUTION = wp.constant(0.01)  # distance between initial heights, m
 
 
 def solid(model: mujoco.MjModel, p: Any) -> np.ndarray:
@@ -108,7 +108,7 @@ class QuadrupedWalk(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Remove elements that only dm_control's other tasks use, and set the size of the floor."""
+        """Remove elements of dm_control's other tasks, and set the size of the floor."""
         unused = (spec.site("target"), spec.body("ball"), spec.geom("terrain"), spec.hfield("terrain"))
         for element in (*unused, *(spec.geom(f"wall_{side}") for side in ("px", "py", "nx", "ny"))):
             spec.delete(element)

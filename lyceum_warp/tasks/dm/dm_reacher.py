@@ -1,6 +1,6 @@
 """ReacherEasy: touch a large target with the finger of a planar arm.
 
-The target is a mocap body, so that its position is part of the state.
+The target is a mocap body, because its position is part of the state.
 """
 
 import mujoco
@@ -60,7 +60,7 @@ class ReacherEasy(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Give each world its own target of the task's size."""
+        """Give each world its own target."""
         suite.free_target(spec)
         spec.geom("target").size[0] = cls.target_radius
 

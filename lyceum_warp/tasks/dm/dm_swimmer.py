@@ -1,6 +1,6 @@
 """SwimmerSwimmer6: a chain of six links swims to a target.
 
-The target is a mocap body, so that its position is part of the state.
+The target is a mocap body, because its position is part of the state.
 """
 
 import mujoco

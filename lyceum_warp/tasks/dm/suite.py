@@ -1,4 +1,4 @@
-"""Load the models of dm_control's suite, and define the functions that several domains use."""
+"""Load the models of dm_control's suite, and define functions that several domains use."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def model(domain: str) -> lw.ModelFile:
 
 
 def free_target(spec: mujoco.MjSpec) -> None:
-    """Move the geom or the site "target" into a mocap body "target", so that each world has its own target."""
+    """Move the geom or site "target" into a mocap body "target", so that each world has its own."""
     fixed = spec.geom("target") or spec.site("target")
     target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
     looks = {"name": "target", "type": fixed.type, "size": fixed.size.copy(), "material": fixed.material}
@@ -33,13 +33,13 @@ def count_contacts(spec: mujoco.MjSpec) -> None:
 
 
 def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the indices in ``qpos`` of the joints with random initial positions: hinges, and joints with limits."""
+    """Return the indices in ``qpos`` of hinges and of joints with limits, which start at random positions."""
     drawn = model.jnt_limited.astype(bool) | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     return model.jnt_qposadr[drawn]
 
 
 def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2); +-pi for a hinge without limits."""
+    """Return the ranges of the joints in ``p.drawn_joints``, (joints, 2), or +-pi for a hinge without limits."""
     joints = np.searchsorted(model.jnt_qposadr, p.drawn_joints)
     return np.where(model.jnt_limited[joints, None], model.jnt_range[joints], [-np.pi, np.pi])
 

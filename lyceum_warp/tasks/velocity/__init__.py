@@ -1,4 +1,4 @@
-"""Walk at a commanded velocity: a family of tasks with one robot in each module."""
+"""Walk at a commanded velocity, with one robot in each module."""
 
 TASKS = {
     "go1_velocity": "go1",
@@ -10,4 +10,4 @@ TASKS = {
     "h1_velocity": "h1",
     "t1_velocity": "t1",
 }
-"""The modules of the tasks, by task name; the registry reads this dict without running the file."""
+"""The modules of the tasks by name. The registry reads this dict without running the file."""

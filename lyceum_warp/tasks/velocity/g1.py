@@ -1,6 +1,6 @@
 """G1Velocity: a Unitree G1 walks at a commanded velocity with its twelve leg joints; waist and arms keep their pose.
 
-G1Velocity is the only task of the G1 with a gait clock.
+No other task of the G1 has a gait clock.
 """
 
 import mujoco
@@ -44,13 +44,13 @@ class GaitParams(gait.Params, Params):
 
 
 class G1(walking.Biped):
-    """The model that the tasks of the G1 share."""
+    """The model of all G1 tasks."""
 
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add force sensors to the feet, and let the feet determine the friction with the ground."""
+        """Add force sensors to the feet, and let the feet set the friction with the ground."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
 
 

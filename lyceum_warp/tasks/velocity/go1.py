@@ -1,6 +1,6 @@
 """Go1Velocity: a Unitree Go1 walks at a commanded velocity, as in mjlab 1.6.0's Mjlab-Velocity-Flat-Unitree-Go1.
 
-Joints and feet are in the order FR, FL, RR, RL, with hip, thigh and calf for each leg. Feet are spheres.
+Joints and feet are in the order FR, FL, RR, RL. Each leg has hip, thigh and calf. Feet are spheres.
 """
 
 import warp as wp

@@ -1,7 +1,6 @@
-"""Add rough ground to velocity tasks: patches with levels of difficulty, a height scan, and changes of level.
+"""Add rough ground to velocity tasks: patches of increasing difficulty, a height scan, and changes of level.
 
-The kinds of patches, and their arrangement in columns, come from Isaac Lab's rough terrain, and the height scan comes
-from legged_gym.
+Patches and their columns come from Isaac Lab's rough terrain, and the height scan comes from legged_gym.
 """
 
 import warp as wp

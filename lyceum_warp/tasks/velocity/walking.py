@@ -1,14 +1,14 @@
 """Define velocity tasks for walking robots, which follow commanded velocities and yaw rates on flat ground.
 
-Actions are offsets of the joints' servo targets from the default pose. Each robot has a file, which lists the model,
-the actuated joints and the feet, and sets the robot's parameters. The tables in ``Params`` are computed from the model.
-Observations, rewards, commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
+Actions are offsets of the joints' servo targets from the default pose. Each robot's file lists the model, the actuated
+joints and the feet, and sets parameters. The tables in ``Params`` are computed from the model. Observations, rewards,
+commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
 
-The robot's base is the body of the model's first joint, which is a free joint. Functions read the state after the last
-substep. Only the forces on the feet are older: MuJoCo computes them at the start of the last substep. The forces are 0
-at the start of an episode. Positions and velocities of the feet are computed from the joints, which saves a forward
-pass. A foot is in contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance``
-depend on the shape of the ground.
+The base is the body of the model's first joint, a free joint. Functions read the state after the last substep. Only the
+forces on the feet are older, because MuJoCo computes them at the start of a substep. They are 0 at the start of an
+episode. Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in
+contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of
+the ground.
 """
 
 import math
@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# the reward terms get their arguments by name, and take the command from the state before the step
+# arguments of reward terms are found by name, and the command is that before the step
 
 
 @wp.func
@@ -390,7 +390,7 @@ def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
 
 
 class Velocity(lw.Task):
-    """A robot with any number of legs that follows velocity commands."""
+    """A legged robot that follows velocity commands."""
 
     frame_skip, horizon = 4, 1000
     training = lw.Training(algorithm="ppo", iterations=400)
@@ -410,7 +410,7 @@ class Velocity(lw.Task):
     metrics = ("velocity_error", "yaw_rate_error")
     terminations = ("fell_over", "too_low")
     deployment, mirror = staticmethod(walkers.deployment), staticmethod(walkers.mirror)
-    cleared = ("sensordata",)  # the forces are zero before the first substep; mjlab computes them for the first state
+    cleared = ("sensordata",)  # forces are zero before the first substep, where mjlab computes them for the first state
 
 
 @wp.struct
@@ -422,7 +422,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs that follows velocity commands; steps and a calm trunk are rewarded.
+    """A robot with two legs that follows velocity commands. Rewards favour steps and a calm trunk.
 
     Two sites mark the feet.
     """
