@@ -1,8 +1,4 @@
-"""Define a cheetah that runs at a commanded speed; the task uses most features that a task can have.
-
-``python examples/commanded_speed.py`` checks the task. ``lyceum-warp train examples/commanded_speed.py`` trains a
-policy.
-"""
+"""Define a cheetah that runs at a commanded speed; the task uses most features that a task can have."""
 
 from typing import Any
 

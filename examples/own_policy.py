@@ -17,7 +17,7 @@ import lyceum_warp as lw
 class Feedback(nn.Module):
     def __init__(self, nobs: int, low: torch.Tensor, high: torch.Tensor) -> None:
         super().__init__()
-        self.register_buffer("middle", 0.5 * (high + low))  # a buffer moves to the GPU with the module
+        self.register_buffer("middle", 0.5 * (high + low))
         self.register_buffer("extent", 0.5 * (high - low))
         nact = len(self.middle)
         self.gains = nn.Linear(nobs, nact)

@@ -25,9 +25,9 @@ def main(
         episodes: Number of episodes.
         steps: Number of steps per episode; by default the task's horizon.
         samples: Number of samples per plan; by default the task's setting.
-        seed: Seed of the first episode. Each later episode has the next seed.
+        seed: Seed of the first episode; the next episode has the next seed.
     """
-    plant = lw.make(task, autoreset=False)  # the controlled world
+    plant = lw.make(task, autoreset=False)
     # the planner simulates its samples in worlds of its own
     plan = lw.MPPI(task) if samples is None else lw.MPPI(task, samples=samples)
 

@@ -17,8 +17,6 @@ import lyceum_warp as lw
 
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
-    """Hyperparameters."""
-
     step: float = 1.0
     """Learning rate of the weights, for returns divided by their standard deviation."""
     noise: float = 0.5

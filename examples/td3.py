@@ -100,7 +100,6 @@ class TD3(lw.Learner):
         return loss.detach()
 
     def normal(self, like: torch.Tensor) -> torch.Tensor:
-        """Draw standard normal noise."""
         return torch.randn(like.shape, generator=self.generator, device=like.device)
 
     def state_dict(self) -> dict:
@@ -119,7 +118,6 @@ class TD3(lw.Learner):
 
 
 def descend(optimizer: torch.optim.Optimizer, loss: torch.Tensor) -> None:
-    """Take a step of gradient descent."""
     optimizer.zero_grad()
     loss.backward()
     optimizer.step()

@@ -28,7 +28,7 @@ def main(
     Args:
         task: Name of a task, or a file that defines one.
         nworld: Number of worlds; use thousands on a GPU.
-        iterations: Number of updates of the policy.
+        iterations: Number of iterations.
         samples: Transitions per iteration.
         device: cpu, or a CUDA device such as cuda:0.
         seed: Seed of the worlds, the networks and the noise.
@@ -37,12 +37,12 @@ def main(
     env = lw.make(task, nworld=nworld, device=device, seed=seed)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=samples), seed=seed)
 
-    for it in npg:  # the iterator never ends; each iteration samples and updates the policy
+    for it in npg:  # an endless iterator: each iteration samples and updates the policy
         print(f"iteration {it.iteration:3d}  return {it.return_mean:7.1f}  {it.samples_per_second:8,.0f} samples/s")
         if it.iteration == iterations:
             break
 
-    # a policy called with observations returns its mean actions, without noise
+    # mean actions, without noise
     episodes = lw.evaluate(env, npg.policy, 20, seed=seed + 1)
     print(f"mean policy: return {episodes.returns.mean():.1f} in {episodes.lengths.mean():.0f} steps")
 

@@ -145,7 +145,7 @@ _NAMES = {
     "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
-"""Public names by module. Type checkers read the imports above instead."""
+"""Public names by module."""
 # isort: on
 # fmt: on
 

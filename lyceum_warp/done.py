@@ -37,4 +37,4 @@ class Done(enum.IntFlag):
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)
-"""Bits of faults. The other two bits mark ordinary ends of an episode."""
+"""Bits of faults."""

@@ -48,7 +48,6 @@ Raises:
 
 
 def _document_arguments(function: Any) -> Any:
-    """Insert the arguments of ``make`` into a function's docstring and signature."""
     arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
     function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
     function.__signature__ = signature_of_options(function)
@@ -69,9 +68,9 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 class Env:
     """One task in many worlds. Every array is allocated once and shared with torch.
 
-    Write ``action``, call ``step``, and read the other buffers. They are updated in place. When an episode ends, the
-    world starts a new random episode in the same step. ``obs`` is then the new episode's first observation, and
-    ``final_obs`` is the old episode's last observation.
+    Write ``action``, call ``step``, and read the other buffers. When an episode ends, the world starts a new random
+    episode in the same step. ``obs`` is then the new episode's first observation, and ``final_obs`` is the old
+    episode's last observation.
 
     A world with a fault (see ``Done``) restarts and leaves all other worlds unchanged. ``fault_counts`` counts the
     faults. After a fault, the reward is 0, and ``final_obs`` is the last valid observation. On the Warp engine, all
@@ -191,7 +190,7 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            # find writes out of bounds before the task's functions run on the environment's own arrays
+            # find writes out of bounds before functions write to the environment's own arrays
             probe.check_bounds()
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # later, invalid values are faults
@@ -247,8 +246,6 @@ class Env:
 
     def step(self, action: torch.Tensor | None = None) -> None:
         """Advance every world by one step, and start new episodes in worlds whose episode ended.
-
-        ``Worlds.step_phases`` lists the phases of a step in order.
 
         Args:
             action: Actions to copy into ``env.action`` before the step, (nworld, nact).
@@ -374,9 +371,8 @@ class Env:
     ) -> torch.Tensor:  # fmt: skip
         """Get the rewards of the last step or of given transitions, (nworld,).
 
-        Scratch worlds compute the rewards of given transitions, so the environment does not change. Events of the task
-        run after the reward, so the result differs from ``env.reward`` if an event changed fields that the reward
-        reads.
+        The environment does not change. Events of the task run after the reward, so the result differs from
+        ``env.reward`` if an event changed fields that the reward reads.
 
         Args:
             before: States before the transitions, (nworld, state_space.size).
@@ -558,7 +554,7 @@ class Env:
         per world are repeated or cut.
         """
         nworld = self.nworld if nworld is None else nworld
-        # the model's file may have changed, so pass the parsed model
+        # the model's file may have changed
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
@@ -575,7 +571,7 @@ class Env:
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # prefer a parameter as it was given, such as an element's name
+        # prefer names of elements to their indices
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

@@ -46,7 +46,6 @@ INPUTS = ("ctrl", "xfrc_applied", "qfrc_applied", "mocap_pos", "mocap_quat", "us
 """Fields of the state that the engine only reads. A task may write these fields before a step."""
 
 INITIAL = ("qpos", "qvel", "act", "eq_active", *INPUTS)
-"""Fields that make up an initial state."""
 
 READ_ONLY = ("history", "plastic")
 """Fields of the integration state that only the engine writes."""
@@ -160,7 +159,7 @@ class Field:
     refresh: Stage
     """The stage that updates the field after a step."""
     reset: Stage
-    """The stage that updates the field after a reset; ``Stage.NONE`` if a reset sets it to zero."""
+    """The stage that updates the field after a reset; ``Stage.NONE`` if it becomes zero."""
     lagged: bool
     """Whether the field keeps the value from ``mj_step``, which is one substep older than the state."""
     snapshot: bool
@@ -170,7 +169,7 @@ class Field:
 
     @property
     def size(self) -> int:
-        """Number of scalars of the field in one world."""
+        """Number of scalars of the field in a world."""
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
@@ -196,19 +195,7 @@ def describe(
     Fields of the position and velocity stages always match the current state. Fields of the acceleration stage, such as
     ``qacc`` or ``cfrc_ext``, come from the last substep, which computes them before it moves the state. At the start of
     an episode, they are computed from the first state. In ``sensordata``, each sensor's columns belong to the sensor's
-    stage.
-
-    Args:
-        model: The compiled model.
-        name: MuJoCo's name of the field, an attribute of MjData.
-        lagged: Whether to keep the value from ``mj_step``, which is one substep older than the state. Fields of the
-            acceleration stage always lag, and fields of the integration state never do.
-        cleared: Whether the field is 0 at the start of an episode.
-        written: Whether the task writes the field before a step. Controls are always written.
-
-    Raises:
-        ValueError: There is no such field, MuJoCo computes it only for a sensor that is missing or disabled, or
-            ``written`` or ``cleared`` is not possible for it.
+    stage. Fields of the acceleration stage always lag (``Field.lagged``), and fields of the integration state never do.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -281,9 +268,6 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
     A joint may have several rows in ``qpos``, ``qvel``, ``dof_damping`` and similar fields. A sensor, an actuator and a
     flex may have several, too. A mocap body has one row in ``mocap_pos``. In all other fields, each object has one row.
-
-    Raises:
-        ValueError: The model has no such element, or the element has no rows in the field.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])

@@ -43,16 +43,7 @@ class Mirror:
         object.__setattr__(self, "parts", parts)
 
     def columns(self, parts: Mapping[str, slice], *, task: str, whole: str | None = None) -> Reflection:
-        """Combine the reflections of all parts into one reflection of an observation, an action or a state.
-
-        Args:
-            parts: Columns of each part, as in ``Space.parts``.
-            task: Name of the task, for error messages.
-            whole: Name of a reflection that replaces those of the parts, if the task declares it.
-
-        Raises:
-            ValueError: A part has no reflection, or one of a different size.
-        """
+        """Combine the reflections of all parts into one reflection of an observation, an action or a state."""
         if whole is not None and whole in self.parts:
             parts = {whole: slice(0, max(part.stop for part in parts.values()))}
         order, signs = list[int](), list[float]()

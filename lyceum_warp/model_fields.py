@@ -74,7 +74,6 @@ _COMPUTED = set(
     "actuator_length0 geom_rbound geom_aabb cam_pos0 cam_poscom0 cam_mat0 light_pos0 light_poscom0 light_dir0 "
     "eq_data".split()
 )
-"""Fields that MuJoCo computes from other fields."""
 
 _REASONS = (
     dict.fromkeys(
@@ -113,7 +112,6 @@ class ModelField:
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
-    """The constants that follow from the field."""
 
     @property
     def size(self) -> int:
@@ -159,11 +157,7 @@ class ModelField:
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
-    """Write values of model fields into a batch of states.
-
-    Raises:
-        ValueError: A field is unknown or shared by all worlds, or a value has the wrong size.
-    """
+    """Write values of model fields into a batch of states."""
     for name, value in values.items():
         field = describe_model_field(model, name)  # refuse a misspelt name
         if name not in columns:
@@ -193,17 +187,7 @@ def is_model_field(name: str) -> bool:
 
 
 def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
-    """Describe a field of a model.
-
-    Args:
-        model: The compiled model.
-        name: An attribute of MjModel or MjModel.opt, such as "body_mass" or "gravity".
-        varies: Whether the field must be able to differ between worlds.
-
-    Raises:
-        ValueError: There is no such field, its values are not floating-point numbers, or it cannot differ between
-            worlds.
-    """
+    """Describe a field of a model."""
     if not varies and name not in _FIELDS:
         value: Any = getattr(model, name, None)
         numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
@@ -237,11 +221,7 @@ MOVED_INERTIA = {"body_ipos", "body_iquat"}
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Refuse to move the inertial frame of a simple body (``body_simple``).
-
-    Raises:
-        ValueError: The field moves the inertial frame, and the model has a simple body.
-    """
+    """Refuse to move the inertial frame of a simple body (``body_simple``)."""
     if name in MOVED_INERTIA and (simple := np.flatnonzero(model.body_simple[1:]) + 1).size:
         raise ValueError(
             f"{name} can't differ between worlds while bodies are compiled as simple (the bodies {simple.tolist()}): "

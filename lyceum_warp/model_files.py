@@ -38,11 +38,7 @@ class ModelFile:
     """The name of a package for pip, or "MuJoCo Menagerie"."""
 
     def place(self) -> tuple[Path, str]:
-        """Find a folder with the models, and the file's path in it.
-
-        Raises:
-            FileNotFoundError: There is no such folder.
-        """
+        """Find a folder with the models, and the file's path in it."""
         raise NotImplementedError
 
     def path(self) -> Path:
@@ -79,7 +75,6 @@ class PackageFile(ModelFile):
     package: str
     """The package's name in Python."""
     within: str
-    """The folder of the models in the package."""
     install: str
     """The requirement for pip, such as "lyceum-warp[hand]"."""
     before_python: str | None = None
@@ -111,11 +106,7 @@ class MenagerieFile(ModelFile):
     """A model file of MuJoCo Menagerie."""
 
     def place(self) -> tuple[Path, str]:
-        """Find the first folder with the robot, and the file's path in it; see ``menagerie_model``.
-
-        Raises:
-            FileNotFoundError: MENAGERIE_ROOT has no models, or it is not set and no package has the robot.
-        """
+        """Find the first folder with the robot, and the file's path in it; see ``menagerie_model``."""
         if root := os.environ.get("MENAGERIE_ROOT"):
             return _checkout(root), self.file
         robot, _, rest = self.file.partition("/")
@@ -162,11 +153,7 @@ class PlaygroundFile(ModelFile):
     """The requirement for pip, such as "lyceum-warp[menagerie]"."""
 
     def place(self) -> tuple[Path, str]:
-        """Find a package's folder of scenes, preferably one with the file.
-
-        Raises:
-            FileNotFoundError: No package with Playground's files is installed.
-        """
+        """Find a package's folder of scenes, preferably one with the file."""
         folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
         if not folders:
             raise FileNotFoundError(
@@ -222,11 +209,7 @@ def playground_model(file: str) -> ModelFile:
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:
-    """Load a model file as an editable MjSpec.
-
-    Raises:
-        ValueError: MuJoCo cannot read the file.
-    """
+    """Load a model file as an editable MjSpec."""
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:

@@ -32,18 +32,17 @@ class OpenLoop:
 
     Write ``state`` and ``actions``, call ``run``, and read the other tensors. They are updated in place. Episodes
     continue after a termination, up to the horizon. The C engine simulates the whole horizon in one native call if the
-    results are exactly the same. Tasks with ``control`` or ``substep`` are simulated step by step. On the Warp engine,
-    the rollout is one graph.
+    results are exactly the same. Tasks with ``control`` or ``substep`` are simulated step by step.
 
     Args:
         env: Environment of the worlds. Do not use it for anything else.
         horizon: Number of steps.
-        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. Every run reads them. By
-            default, each world draws the same numbers as ``env.step`` from its state.
+        keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. By default, each world
+            draws the same numbers as ``env.step`` from its state.
         nominal_model: Whether to use the nominal values of model fields that differ between worlds, instead of the
             values in ``state``.
         models: Other values for model fields that differ between worlds, by name, each (n, size) float64 on the
-            environment's device. World w uses row w % n. Every run reads the values.
+            environment's device. World w uses row w % n. Every run reads ``keys`` and these values.
         states: Number of initial states. Each state starts nworld / states consecutive worlds.
 
     Raises:
@@ -98,7 +97,6 @@ class OpenLoop:
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
-            # stepwise rollouts need no controls for the whole horizon
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
@@ -230,7 +228,7 @@ class OpenLoop:
             ]
             args = [*self._transitions(), self.worlds.counters, *memories]
             launch_worlds(kernels.advance_rows, n, args, self.env.device)
-        else:  # the task does not change its memory
+        else:
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])

@@ -126,11 +126,7 @@ class PhysicsOptions:
         return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
-        """Replace ``base`` by the physics options of this name.
-
-        Raises:
-            ValueError: The task has no physics options of this name.
-        """
+        """Replace ``base`` by the physics options of this name."""
         if self.base is None:
             return self
         known = {"exact": PhysicsOptions(), **named}
@@ -185,7 +181,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # an MjModel gets a clearer error when the task is bound
+        # binding the task gives a clearer error
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
@@ -232,12 +228,10 @@ def _physics(given: Any) -> PhysicsOptions:
 
 _PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions) if field.name != "base")
 OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
-"""Names of all options."""
 
 _DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
 
 OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
-"""Docstrings of all options, for an ``Args:`` section."""
 
 _OTHER_WORDS = {
     "num_envs": "nworld", "n_envs": "nworld", "xml_file": "model", "max_episode_steps": "horizon", "record": "graphs",

@@ -75,8 +75,7 @@ def action_space(
 ) -> Space:
     """Make the space of actions, which are controls unless the task declares ``actions``.
 
-    An actuator without a name is named after its index. Controls are bounded by ``action_range`` or by their ranges.
-    Other actions are bounded only by ``action_range``.
+    Controls are bounded by ``action_range`` or by their ranges. Other actions are bounded only by ``action_range``.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -101,11 +100,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:
-    """Compute scales and offsets from actions to controls, (nu, 2).
-
-    Raises:
-        ValueError: ``action_range`` is given, but a control has no range.
-    """
+    """Compute scales and offsets from actions to controls, (nu, 2)."""
     if action_range is None:
         return np.tile((1.0, 0.0), (model.nu, 1))
     ranges = control_ranges(model)

@@ -37,13 +37,11 @@ class TaskFunction:
 
     name: str
     arguments: str
-    """The arguments, written as in a task's file."""
     result: type | None
     """Type of the result: float, bool, or None for a function that writes into its arguments."""
     about: str
     """Purpose and default, for the documentation."""
     default: str | None = None
-    """Body of the default function; None if there is no default."""
     optional: str = ""
     """Last arguments that a task may omit, written as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -130,7 +128,7 @@ FUNCTIONS = {
                      "``env.update_shared`` calls this function. Default: no change."),
     )
 }  # fmt: skip
-"""The functions of a task, by name. Checks, kernels, error messages and ``help(lw.Task)`` use this table."""
+"""The functions of a task, by name."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
@@ -149,7 +147,6 @@ def observer_name(group: str) -> str:
 
 
 def _document_functions(cls: type["Task"]) -> type["Task"]:
-    """Insert the table of functions into a class's docstring."""
     rows = []
     for function in FUNCTIONS.values():
         rows += [f"    {function.signature}", *textwrap.wrap(function.about, 108, initial_indent=" " * 8,
@@ -163,7 +160,6 @@ class Part:
     """A part of a world's memory or of an observation."""
 
     kind: str
-    """One of ``MEMORIES``, or "obs"."""
     size: int | str
     """Number of elements, or the name of a table in Params with a row per element."""
 
@@ -207,7 +203,7 @@ class Element(int):
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """Make an integer with the element's name. The integer's value is not used."""
+        """The integer's value is not used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
@@ -510,7 +506,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # World, Params and the Warp functions of the module when the class was defined
+    # World, Params and the Warp functions when the class was defined
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod
@@ -529,7 +525,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # a later cell of a notebook may define another task with the same names
+        # a later cell of a notebook may define another task
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

@@ -59,7 +59,7 @@ def _rough(x: np.ndarray, y: np.ndarray, amount: float, rng: np.random.Generator
     side = x[0]
     knots = np.arange(side[0], side[-1] + 0.2, 0.2)
     values = rng.uniform(-amount, amount, (len(knots), len(knots)))
-    for _ in range(2):  # interpolate along x, then along y
+    for _ in range(2):  # along x, then along y
         values = np.array([np.interp(side, knots, row) for row in values]).T
     return values
 

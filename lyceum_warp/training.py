@@ -187,11 +187,11 @@ def train(
 
 
 _PAIRS = 64
-"""Number of episodes in the comparison at the end of training. Each is played under both settings."""
+"""Number of episodes in the comparison at the end of training, each under both settings."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Write ``transfer.json`` if it was requested or if the comparison takes only seconds."""
+    """Compare if it was requested or if it takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -213,7 +213,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate until the target, the last iteration or the time limit. All ranks save and end together."""
+    """Iterate until the target, the last iteration or the time limit, with all ranks together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:
@@ -247,7 +247,6 @@ def _learn(
 
 
 def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> None:
-    """Load a run's checkpoint into the learner, and prepare the files for more iterations."""
     folder, content = run.folder, run.read(learner.env.obs.device, note=note)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
@@ -270,9 +269,9 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have rows that were not saved
+        cut_rows(run.metrics, done)  # a killed run may have unsaved rows
         now = versions(run.config["device"])
-        then = run.config.get("versions", now)  # runs of earlier releases have no versions in config.json
+        then = run.config.get("versions", now)  # earlier releases wrote no versions
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:
             text = ", ".join(f"{name} {then.get(name)} then, {value} now" for name, value in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
@@ -285,10 +284,10 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # options that do not affect results may differ, and note_changes compares the model
+    # these options may differ, and note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | dict(then.params)
-    # runs of earlier releases lack the newest hyperparameters
+    # earlier releases lack the newest hyperparameters
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
     for before, after in (
         ({"task": run.config.get("kept", {}).get("name", env.task.name)}, {"task": env.task.name}),

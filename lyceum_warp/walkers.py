@@ -18,7 +18,7 @@ from lyceum_warp.mirror import Mirror
 
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # contact sensor parameters
+_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3
 
 
 # joints
@@ -251,7 +251,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         found[:, :3] -= data.xanchor[_last_joint(model, foot)]
         spheres.append(found)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # pad with copies of spheres
+    return np.array([np.resize(found, (most, 4)) for found in spheres])  # pad with copies
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -318,7 +318,6 @@ def _last_joint(model: mujoco.MjModel, foot: int) -> int:
 
 
 def _straight(model: mujoco.MjModel) -> mujoco.MjData:
-    """Compute the kinematics with the base at the world's origin and all other coordinates 0."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
     start = int(model.jnt_qposadr[0])

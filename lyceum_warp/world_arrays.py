@@ -63,14 +63,12 @@ class WorldArrays:
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        """Sums of the metrics over the episode so far."""
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
         """Number of successes in a row, up to ``success_steps``. The array has no columns if ``success_steps`` is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        # fields after a step and before it
         self.after, self.before = kernels.Batch(), kernels.Batch()
         self._copies: dict[str, wp.array] = {}
         constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
@@ -112,20 +110,19 @@ class WorldArrays:
             setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
             self.buffers[name] = torch_view(getattr(self.outcome, name))
         self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        """The metrics of the last step, (nworld, number of metrics)."""
         self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
         """Sums of the metrics over the episode up to the last step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
         parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
-        self._judging = parts if self.device.is_cuda else 1  # number of threads that evaluate a transition
+        self._judging = parts if self.device.is_cuda else 1  # threads per transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
         self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
-        # number of threads that write a world's observations
+        # threads per observation
         self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
         self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
@@ -159,13 +156,12 @@ class WorldArrays:
         self.restarting = wp.zeros(n, dtype=bool)
         """Worlds whose episode ended in the last step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        """Worlds whose initial state was rejected."""
         self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that did not restart after the last step and thus ran events."""
+        """Worlds that did not restart, and thus ran events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
-        """Worlds whose physics an event of the last step changed."""
+        """Worlds whose physics an event changed."""
         self._changed = wp.zeros(n, dtype=bool)
-        """Worlds whose physics or memory an event of the last step changed."""
+        """Worlds whose physics or memory an event changed."""
         self._outdated = wp.zeros(n, dtype=bool)
         """Worlds that need a new observation after a restart or an event."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
@@ -201,7 +197,6 @@ class WorldArrays:
             launch_rows(state.narrow, self.mask, columns, array)
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
-        """Yield the array and the state's columns of each of ``own_parts``."""
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
         arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}

@@ -78,7 +78,6 @@ class Worlds(WorldArrays):
         del self.programs, self.step
 
     def _make_workers(self) -> Workers | None:
-        """Make threads for launches before and after engine calls, or return None if one thread suffices."""
         # Warp's kernels in debug mode are not thread-safe
         if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
             return None
@@ -127,7 +126,6 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases from the current state to the next, including the evaluation."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -136,7 +134,7 @@ class Worlds(WorldArrays):
         ]
 
     def _tally_phases(self) -> list[Phase]:
-        """List the phase that adds up the task's sums. On a CPU, atomic additions need a single thread."""
+        """On a CPU, atomic additions need a single thread."""
         kernel = self.task.kernels.tally_worlds if self.autoreset else None
         return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
 
@@ -157,7 +155,6 @@ class Worlds(WorldArrays):
         ]
 
     def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
-        """List the phases that set selected worlds to initial states, without derived fields."""
         phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
         if self.task.reset_dynamics:
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
@@ -168,7 +165,6 @@ class Worlds(WorldArrays):
         return phases
 
     def _event_phases(self) -> list[Phase]:
-        """List the phases of the task's events, which run after a step in worlds that continue."""
         kernel = self.task.kernels.run_events
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
@@ -188,7 +184,7 @@ class Worlds(WorldArrays):
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def _refresh_phases(self, mask: wp.array) -> list[Phase]:
-        if self.engine.reset_stage == Stage.NONE:  # there are no derived fields
+        if self.engine.reset_stage == Stage.NONE:
             return []
         return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
@@ -208,7 +204,7 @@ class Worlds(WorldArrays):
     def rehearsal(self) -> None:
         """Run every phase once that only launches kernels, so that ``compile_ahead`` can list the kernels."""
         self.seed_streams(0)
-        # all substeps after the first are equal, and with the Warp engine each would take milliseconds
+        # all substeps after the first are equal, and each would take milliseconds on the Warp engine
         step = self.step_phases(min(self.task.frame_skip, 2))
         phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -254,7 +250,6 @@ class Worlds(WorldArrays):
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
     ) -> None:
-        """Compute rewards, metrics, evaluations, ends and observations; see ``kernels.transitions``."""
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
@@ -275,7 +270,6 @@ class Worlds(WorldArrays):
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        """Set the selected worlds to the fixed initial state or to random ones."""
         self.engine.reset(mask)
         self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
@@ -296,7 +290,6 @@ class Worlds(WorldArrays):
             launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        """Draw new initial states for the selected worlds whose state the task rejects."""
         wp.copy(self._rejected, mask)
         for _ in range(self.task.task.draws - 1):
             # on a GPU, reading the mask would wait for the device
@@ -310,7 +303,6 @@ class Worlds(WorldArrays):
                 self.engine.apply_model(self._rejected)
 
     def _event(self, kernel: wp.Kernel) -> None:
-        """Run the events, and mark the worlds that they changed."""
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
         live = {name: getattr(self.after, name) for name in before}
         before |= self._model_copies
@@ -327,7 +319,7 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark worlds in which an event changed a field. ``physics`` is False for the task's memory."""
+        """Mark worlds in which an event changed a field, which belongs to the task's memory if ``physics`` is False."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
@@ -342,14 +334,13 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        """Compute observations, evaluations and terminations of the selected worlds, without a transition."""
         # a state that was set without a check may have faults, and its world keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
 
     def _read_state(self) -> None:
-        # with automatic resets, done_reason describes only the last step, so states contain 0
+        # with automatic resets, done_reason describes only the last step
         self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # called by Env and OpenLoop
@@ -357,7 +348,7 @@ class Worlds(WorldArrays):
     def judge_transition(self, action: torch.Tensor) -> None:
         """Evaluate the transition from ``before`` to the current state, ignoring engine faults."""
         torch_view(self.safe_action).copy_(action)
-        self._judged.zero_()  # the transition's faults are written here
+        self._judged.zero_()
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
     def seed_streams(self, seed: int) -> None:

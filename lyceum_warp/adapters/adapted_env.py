@@ -14,23 +14,13 @@ from lyceum_warp.viz.pictures import WorldPictures
 _SEEDS = 2**31
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that adapters replace, with the name of the adapter's argument."""
+"""Options of ``lw.make`` that are arguments of adapters, under another name."""
 
 
 def environment_of(
     task: str | type[Task] | Env, num_envs: int | None, words: Mapping[str, Any], *, autoreset: bool
 ) -> Env:
-    """Make an adapter's environment from a task, or check the given environment.
-
-    Args:
-        task: A task, as in ``lw.make``, or an ``Env``.
-        num_envs: Number of worlds; by default one, or the number in the given environment.
-        words: Options and parameters for ``lw.make``.
-        autoreset: Whether the environment resets worlds within a step.
-
-    Raises:
-        ValueError: An argument is invalid.
-    """
+    """Make an adapter's environment from a task, or check the given environment."""
     if not isinstance(task, Env):
         for word in _OTHER_WORDS.keys() & words.keys():
             raise ValueError(f"{word}= is not an argument of an adapter: use {_OTHER_WORDS[word]}")
@@ -48,11 +38,7 @@ def environment_of(
 def pictures_of(
     env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
 ) -> tuple[WorldPictures, dict[str, Any]]:
-    """Make an environment's renderer, and the ``metadata`` for Gymnasium and Stable-Baselines3.
-
-    Raises:
-        ValueError: There is no such render mode or camera, or the size is odd.
-    """
+    """Make an environment's renderer, and the ``metadata`` for Gymnasium and Stable-Baselines3."""
     if render_mode not in (None, "rgb_array"):
         raise ValueError(f"there is no render_mode {render_mode!r}: use 'rgb_array', or None for no pictures")
     metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / env.timestep))}
@@ -60,22 +46,13 @@ def pictures_of(
 
 
 class ResetSeeds:
-    """Chooses the seed of each reset: a random seed for the first, unless the user gave one, as the libraries expect.
-
-    Args:
-        seeded: Whether the user has seeded the environment.
-    """
+    """Chooses the seed of each reset. The first one is random unless the user gave a seed."""
 
     def __init__(self, *, seeded: bool) -> None:
         self._seeded = seeded
 
     def __call__(self, given: Any, drawn: Callable[[], Any]) -> int | None:
-        """Return the seed of a reset, or None to continue the random streams.
-
-        Args:
-            given: The seed passed to ``reset``, or None.
-            drawn: Returns a random seed; called if the worlds were never seeded.
-        """
+        """Return the seed of a reset, or None to continue the random streams."""
         if given is None and self._seeded:
             return None
         self._seeded = True

@@ -26,10 +26,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     - SAME_STEP resets the world within that step. The world returns the first observation of its next episode.
       ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observations and infos of ended episodes. The
-      masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False, these
-      entries exist only if an episode ended. ``final_obs`` is then an object array with None for the other worlds, as
-      Gymnasium's wrappers expect. If ``torch`` is True, the entries are tensors over all worlds and always exist,
-      because a check would wait for the device.
+      masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False,
+      ``final_obs`` and ``final_info`` exist only if an episode ended. ``final_obs`` is then an object array with None
+      for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, they are tensors over all worlds and
+      always exist, because a check would wait for the device.
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. Until then, a world keeps stepping, and
       its termination or truncation stays True. A world with a fault is reset at once, but returns its last valid
       observation.
@@ -136,9 +136,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         Args:
             actions: (num_envs, nact), a float32 array; with ``torch=True``, a tensor on the environment's device.
-
-        Returns:
-            Observations, rewards, terminations, truncations and infos.
 
         Raises:
             ResetNeeded: ``reset`` was not called yet.

@@ -5,17 +5,7 @@ import re
 
 
 def check_library(package: str, *, low: str, below: str, install: str) -> None:
-    """Check the installed release of a library.
-
-    Args:
-        package: The package's name for pip.
-        low: The lowest supported version, such as "2.9".
-        below: The first newer version that is not supported, such as "3".
-        install: The argument of ``pip install`` that installs a supported release.
-
-    Raises:
-        ImportError: The library is missing, or its release is not supported.
-    """
+    """Raise an ImportError unless a supported release of a library is installed."""
     try:
         found = importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:

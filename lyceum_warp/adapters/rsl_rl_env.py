@@ -33,17 +33,14 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
 
     Raises:
         ValueError: An argument is invalid.
-        ImportError: rsl_rl is missing or not supported. Importing this module raises the error.
+        ImportError: rsl_rl is missing or not supported (on importing this module).
     """
 
     num_envs: int
-    """Number of worlds."""
     num_actions: int
-    """The number of elements of an action."""
     max_episode_length: int
     """Steps after which an episode is truncated, or 2147483647 without a horizon."""
     device: torch.device
-    """Device of all tensors."""
     cfg: dict[str, Any]
     """The task, its parameters, the engine and the number of worlds, for rsl_rl's logs."""
 
@@ -61,7 +58,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             for groups in (env.obs_groups, env.final_obs_groups)
         )
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
-        self._episodes = torch.zeros((), device=self.device)  # number of episodes in the averages
+        self._episodes = torch.zeros((), device=self.device)
 
     @property
     def unwrapped(self) -> Env:
@@ -107,8 +104,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             actions: (nworld, nact), float32.
 
         Returns:
-            Observations, rewards (nworld,), dones (nworld,) bool, and a dict. After a reset, the observation is the
-            first of the new episode. The dict has these entries:
+            Observations, rewards (nworld,), dones (nworld,) bool, and a dict with these entries:
 
             - ``time_outs``: whether the time limit or a fault truncated the episode, (nworld,) bool. After a fault, the
               reward is 0, and the last valid observation is the final observation.
@@ -130,11 +126,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        """Average the metrics over recent episodes.
-
-        rsl_rl averages the log over the steps of an iteration. With only the last step in a log, a step that ends one
-        episode would weigh as much as a step that ends a thousand.
-        """
+        # rsl_rl averages the logs of an iteration's steps. If a log had only the last step's episodes, a step with one
+        # ended episode would weigh as much as a step with a thousand.
         env = self.env
         if not env.metrics:
             return {}

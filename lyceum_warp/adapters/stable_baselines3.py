@@ -97,11 +97,7 @@ class StableBaselines3VecEnv(VecEnv):
         self._host.set_action(actions)
 
     def step_wait(self) -> Any:
-        """Advance every world by one step.
-
-        Returns:
-            Observations, rewards, dones and info dicts.
-        """
+        """Advance every world by one step."""
         env, count = self.env, self._observations.count
         env.step()
         *values, reward, done = self._host.of(*self._observations.current, env.reward, env.done)
@@ -146,7 +142,7 @@ class StableBaselines3VecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all worlds: call set_attr without indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # set_params suggests similar names if there is no such parameter
+        else:  # set_params suggests similar names
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:

@@ -33,7 +33,7 @@ class Observations:
         env = self._env
         if env.autoreset:
             return [env.obs_groups[group] for group in self._groups]
-        # a fault always resets a world, so its row is already the first observation of the next episode
+        # a fault always resets a world, whose row is then already the first of the next episode
         done = env.done[:, None]
         return [torch.where(done, env.final_obs_groups[group], env.obs_groups[group]) for group in self._groups]
 
@@ -67,18 +67,14 @@ class HostArrays:
 
     def __init__(self, env: Env, *, copy: bool = True, one_world: bool = False) -> None:
         self._env, self._copy = env, copy
-        # on a GPU, stage the actions in pinned memory
+        # stage the actions in pinned memory on a GPU
         pinned = torch.empty(env.action.shape, pin_memory=True) if env.action.is_cuda else None
         self._pinned = pinned
         actions = (env.action if pinned is None else pinned).numpy()
         self._action = actions[0] if one_world else actions
 
     def set_action(self, action: Any) -> None:
-        """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64.
-
-        Raises:
-            ValueError: The actions are not a NumPy array, or have the wrong shape or type.
-        """
+        """Copy actions into the environment, (nworld, nact) or (nact,), float32 or float64."""
         if not isinstance(action, np.ndarray) or action.shape != self._action.shape or action.dtype.kind != "f":
             numpy = isinstance(action, np.ndarray)
             given = f"a {action.dtype} array of shape {action.shape}" if numpy else described(action)
@@ -99,8 +95,8 @@ class HostArrays:
 class Infos:
     """Collects the infos of a step in a dict.
 
-    ``eval`` is the evaluation metric after the step, and ``done_reason`` has the bits of ``lw.Done``. A task with a
-    goal adds ``success``. A task with metrics adds ``metrics``, and their sums over the episode as ``episode_metrics``.
+    A task with a goal adds ``success``. A task with metrics adds ``metrics``, and their sums over the episode as
+    ``episode_metrics``.
     """
 
     def __init__(self, env: Env) -> None:
@@ -114,7 +110,7 @@ class Infos:
 
     @property
     def tensors(self) -> list[torch.Tensor]:
-        """The buffers of all infos."""
+        """Return the buffers of all infos."""
         return [*self._plain.values(), *self._metrics.values()]
 
     def named(self, values: list[Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
 """Control one world synchronously or in real time, store its trajectory, and make reports.
 
-The *plant* is the world under control. A planner simulates its plans in separate worlds.
+The *plant* is the world under control.
 """

@@ -14,12 +14,7 @@ from lyceum_warp.support.validate import described, positive_number
 
 
 class CheckedController:
-    """Calls a controller, checks its actions, and selects a plan's action for each step of the plant.
-
-    Raises:
-        ValueError: The controller has the wrong arguments, plans in the plant itself, or plans for several plants. Or
-            neither time step, the controller's or the plant's, is a multiple of the other.
-    """
+    """Calls a controller, checks its actions, and selects a plan's action for each step of the plant."""
 
     def __init__(self, controller: Controller, env: Env) -> None:
         _check_call(controller)
@@ -43,20 +38,7 @@ class CheckedController:
         self._takes_shift = (signature := _signature(controller)) is not None and "shift" in signature.parameters
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
-        """Make a plan for a state.
-
-        Args:
-            state: State of the plant, (state_size,) float64.
-            obs: The plant's observation, (nobs,).
-            shift: Number of controller steps since the initial state of the last plan.
-            step: Step of the plant, for error messages.
-
-        Returns:
-            The plan, (horizon, nact) float32, on the CPU. A single action counts as a plan of horizon 1.
-
-        Raises:
-            ValueError: The plan has the wrong shape, or is not finite.
-        """
+        """Return the plan for a state, (horizon, nact) float32, on the CPU."""
         action = self._controller(state, obs, **({"shift": shift} if self._takes_shift else {}))
         plan = getattr(self._controller, "actions", None)
         # do not copy the returned action, because a second copy would wait for the device again
@@ -73,7 +55,7 @@ class CheckedController:
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
         failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
-        # the weights are undefined if all samples failed
+        # weights are undefined if all samples failed
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
@@ -88,14 +70,7 @@ class CheckedController:
         """Select the action for the time ``plant_steps`` after the plan's initial state.
 
         An action is held until the controller's next step, or interpolated towards the next action if the controller
-        has ``between="linear"``. The last action of the plan is held for ever.
-
-        Args:
-            plan: The plan, (horizon, nact).
-            plant_steps: Number of plant steps since the plan's initial state.
-
-        Returns:
-            The action, (nact,).
+        has ``between="linear"``. After the end of the plan, its last action is held.
         """
         index, rest = self.steps(plant_steps), plant_steps * self._plan_steps % self._plant_steps
         if rest and self._linear and index < len(plan) - 1:
@@ -103,11 +78,7 @@ class CheckedController:
         return plan[min(index, len(plan) - 1)]
 
     def check_horizon(self, horizon: int, steps: int) -> None:
-        """Check that a plan of ``horizon`` actions lasts for a number of plant steps.
-
-        Raises:
-            ValueError: The plan is too short.
-        """
+        """Check that a plan of ``horizon`` actions lasts for a number of plant steps."""
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = (
                 f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, only one action"
@@ -127,7 +98,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # a loaded file must give the same result, so convert all values to JSON types
+        # give the same result as a loaded file
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -144,11 +115,7 @@ class CheckedController:
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:
-    """Return how many plan steps and how many plant steps the longer time step lasts.
-
-    Raises:
-        ValueError: The larger time step is not a multiple of the smaller one.
-    """
+    """Return how many plan steps and how many plant steps the longer time step lasts."""
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
         raise ValueError(
@@ -174,7 +141,7 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature, or None if Python does not know it, as for some C functions."""
+    """Get a function's signature, or None for some C functions."""
     try:
         return inspect.signature(function)
     except (TypeError, ValueError):

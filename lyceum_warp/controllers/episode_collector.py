@@ -71,11 +71,7 @@ def begin_episode(
     """Reset the plant and the controller, unless ``reset`` is False.
 
     Returns:
-        The maximum number of steps, and the number of steps since the reset. The latter is 0 unless a run is continued.
-
-    Raises:
-        ValueError: The environment has several worlds or automatic resets, its episodes may never end, the episode is
-            over, or a seed is given without a reset.
+        Return the maximum number of steps, and the number of steps since the reset if the run is continued.
     """
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
@@ -111,7 +107,7 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        # action, plan, age, and whether the step was late
+        # action, plan, age, late
         self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
         self._outcomes: list[tuple[float, float, bool]] = []
         self._plans: list[tuple[int, float, float, float, float]] = []

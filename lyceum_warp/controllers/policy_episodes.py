@@ -26,19 +26,8 @@ def policy_episodes(
     The episodes equal those of ``lw.evaluate`` with the same seed and number of worlds. All worlds share a call of the
     policy, so the times in a trajectory are those of the whole batch.
 
-    Args:
-        env: An environment made with ``autoreset=False``; its worlds are reset.
-        policy: Function from observations (nworld, nobs) to actions (nworld, nact).
-        episodes: Number of episodes.
-        seed: Seed of the initial states. By default, the worlds continue their random streams.
-        controller: Description of the policy; see ``Trajectory.controller``.
-        progress: Called every ten steps with the steps so far and the maximum number of steps.
-
     Yields:
         The first episodes of all worlds, then their second episodes, and so on.
-
-    Raises:
-        ValueError: The environment has automatic resets, or its episodes may never end.
     """
     episodes = whole_number("episodes", episodes, low=1)
     if env.autoreset:
@@ -68,7 +57,7 @@ class _Batch:
         self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         self._actions: list[torch.Tensor] = []
         self._outcomes: list[torch.Tensor] = []
-        # time of the action, duration of the policy's call, and time of the step's end
+        # action's time, duration of the policy's call, step's end
         self._times: list[tuple[float, float, float]] = []
         self._lengths = torch.zeros(env.nworld, dtype=torch.long)
         self._reasons = torch.zeros(env.nworld, dtype=torch.long)
@@ -97,7 +86,6 @@ class _Batch:
         self._reasons[over] = env.done_reason.cpu()[over].long()
 
     def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        """Make a world's trajectory; ``origin`` has the attributes from ``provenance``."""
         env, steps = self.env, int(self._lengths[world])
         states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
         rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)

@@ -23,9 +23,7 @@ class RealTimeSetting:
     """The settings that determine a planner's planning time."""
 
     samples: int
-    """Number of samples."""
     horizon: int
-    """Number of steps in a plan."""
     physics: str | None = None
     """Name of the planner's physics options; None if they have no name."""
 
@@ -44,9 +42,7 @@ class RealTimeChoice:
     setting: RealTimeSetting
     """The largest setting that meets the deadline, or else the fastest one."""
     planning_time: float
-    """Planning time of the setting."""
     deadline: float
-    """Longest permitted planning time, in seconds."""
     larger: tuple[int, float] | None
     """The smallest measured number of samples that misses the deadline, and its planning time, or None."""
 
@@ -75,13 +71,6 @@ def choose_setting(
 
     If even the smallest number of samples is too slow, try shorter horizons, and then other physics options.
 
-    Args:
-        samples: Numbers of samples, in ascending order.
-        horizons: Horizons, the preferred one first.
-        physics: Names of physics options, the preferred one first.
-        measure: Returns the 99 % quantile of a setting's planning times, in seconds.
-        deadline: Longest permitted planning time, in seconds.
-
     Returns:
         The largest setting that meets the deadline, or else the fastest one.
     """
@@ -89,7 +78,7 @@ def choose_setting(
     for name in physics:
         for horizon in horizons:
             times: dict[int, float] = {}
-            low, high, tried = -1, len(samples), 0  # samples[low] meets the deadline, and samples[high] misses it
+            low, high, tried = -1, len(samples), 0  # samples[low] meets the deadline, samples[high] does not
             while high - low > 1:
                 setting = RealTimeSetting(samples[tried], horizon, name)
                 found = times[samples[tried]] = measure(setting)

@@ -19,9 +19,6 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
         paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. A
             folder stands for its ``.npz`` files in alphabetical order.
 
-    Returns:
-        The episodes by file, in the order of ``paths``.
-
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
         ValueError: A file is broken, comes from a newer release, or has a different task or model than the first file.
@@ -77,11 +74,7 @@ def episode_env(
 
 
 def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode") -> None:
-    """Check that an environment accepts the states of an episode.
-
-    Raises:
-        ValueError: The episode has a different task or a different layout of states.
-    """
+    """Check that an environment accepts the states of an episode."""
     if episode.task != env.task.name:
         raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of the task {env.task.name!r}")
     now = {part: [place.start, place.stop] for part, place in env.state_space.parts.items()}
@@ -118,10 +111,7 @@ def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> 
 
 
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """Describe how two state layouts differ, such as "qpos of 7 numbers, not 9".
-
-    Return "" if they are equal.
-    """
+    """Describe how two state layouts differ, such as "qpos of 7 numbers, not 9", or return ""."""
     for name in {**wanted, **found}:
         one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
         if one != other:
@@ -156,10 +146,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Explain why a file may contain another user's code, such as "it can be written by other users".
-
-    Return "" if it cannot.
-    """
+    """Explain why a file may contain another user's code, such as "it can be written by other users", or return ""."""
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
@@ -172,7 +159,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether only root or this user is in a group. Many systems make a group for each user."""
+    """Return whether only root or this user is in a group, as in the groups that many systems make for each user."""
     import grp
     import pwd
 

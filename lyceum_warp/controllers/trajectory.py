@@ -17,7 +17,7 @@ from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
-"""Version of the file format. It increases if older releases cannot read the new files."""
+"""Version of the file format. Increase it if older releases cannot read the new files."""
 
 # dtype and axes of each array
 _ARRAYS = {
@@ -68,8 +68,7 @@ class Trajectory:
     """Age of each action when it was applied, (steps,) float64, in seconds. The age is the wall time since the plant
     was in the plan's initial state. In a synchronous run, a plan's first action is as old as the planning time."""
     late: torch.Tensor
-    """Whether each step started late because the previous step took too long, (steps,) bool. In a synchronous run, no
-    step is late."""
+    """Whether each step started late because the previous step took too long, (steps,) bool."""
     plan_of: torch.Tensor
     """Index of the plan that contains each action, (steps,) int64."""
     plan_steps: torch.Tensor
@@ -114,7 +113,7 @@ class Trajectory:
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again. ``task`` is a name or
     "file:class", or None for a task from a notebook or script. ``params`` lists the names of the given parameters, and
-    ``options`` has the options. Files of earlier releases lack these entries."""
+    ``options`` has the options."""
 
     @property
     def steps(self) -> int:
@@ -186,7 +185,7 @@ class Trajectory:
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                # files of earlier releases have no "source"
+                # earlier releases have no "source"
                 info = {"source": {}, **json.loads(str(file["info"]))}
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
@@ -240,7 +239,7 @@ def provenance(env: Env) -> dict[str, Any]:
 
 
 _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "fields")
-"""Options that change neither the physics nor the states. Trajectories do not store them."""
+"""Options that change neither the physics nor the states, and are not stored."""
 
 
 def source(env: Env) -> dict[str, Any]:

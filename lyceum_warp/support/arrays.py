@@ -66,10 +66,6 @@ def part_of_worlds(part: int, parts: int) -> Iterator[None]:
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
-    """Launch a kernel over the current part of the worlds.
-
-    The kernel's last argument becomes the index of the first world.
-    """
     part, parts = _PART.get()
     first, end = (dim[axis] * k // parts for k in (part, part + 1))
     if end > first:
@@ -125,5 +121,5 @@ def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):
         some = list(pairs[i : i + PAIRS_A_LAUNCH])
         source, target = some[0]
-        some += [(source[:, :0], target[:, :0])] * (PAIRS_A_LAUNCH - len(some))  # fill up with empty copies
+        some += [(source[:, :0], target[:, :0])] * (PAIRS_A_LAUNCH - len(some))
         launch_worlds(kernel, len(mask), [mask, *(array for pair in some for array in pair)], mask.device)

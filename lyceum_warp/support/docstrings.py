@@ -1,7 +1,6 @@
 """Make ``help()`` show the docstrings of attributes and of overloaded Warp functions.
 
-Python discards a string after an attribute, so ``document_attributes`` reads these strings from the source and adds
-them to the class's docstring. An overloaded Warp function has no docstring, so ``document_overloads`` sets it.
+Python discards a string after an attribute, so ``document_attributes`` reads these strings from the source.
 """
 
 import ast

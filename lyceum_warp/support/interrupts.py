@@ -67,9 +67,6 @@ def _raise(number: int) -> None:
     """Send a signal to this process.
 
     The default handlers of SIGTERM and SIGHUP would end the program without its ``finally`` blocks.
-
-    Raises:
-        SystemExit: The signal has its default handler.
     """
     if signal.getsignal(number) is signal.SIG_DFL:
         raise SystemExit(128 + number)

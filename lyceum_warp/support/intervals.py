@@ -9,7 +9,7 @@ import numpy as np
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
 
-# a figure shows hundreds of intervals, mostly with the same degrees of freedom
+# a figure shows hundreds of intervals with the same degrees of freedom
 @functools.lru_cache(maxsize=256)
 def student_quantile(probability: float, freedom: float) -> float:
     """Compute a quantile of Student's t distribution by bisection on the integral of its density.
@@ -20,7 +20,7 @@ def student_quantile(probability: float, freedom: float) -> float:
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)
 
-    # substitute x = sqrt(freedom) tan(angle), which gives a smooth integrand on a finite interval
+    # substitute x = sqrt(freedom) tan(angle) for a smooth integrand on a finite interval
     def beyond_half(angle: float) -> float:
         at = 0.5 * angle * (_NODES + 1.0)
         density = math.sqrt(freedom) * np.exp(log_factor) * np.cos(at) ** (freedom - 1)
@@ -46,7 +46,7 @@ def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
     """Compute the difference of two paired proportions, with its 95 % confidence interval.
 
     Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". Each of a
-    pair's four outcomes gets half an observation more, so the interval is never empty.
+    pair's four outcomes gets half an observation more, so the width is positive even if all pairs agree.
 
     Args:
         first: First outcome of each pair, (pairs,) bool.

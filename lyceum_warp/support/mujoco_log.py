@@ -10,8 +10,7 @@ log = logging.getLogger(__name__)
 def quiet() -> None:
     """Send MuJoCo's warnings to the log, for the whole process.
 
-    By default, MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory. The engines report
-    warnings of a world in its ``done_reason``.
+    By default, MuJoCo prints each warning and appends it to MUJOCO_LOG.TXT in the working directory.
     """
     mujoco.set_mju_user_warning(_log)
 

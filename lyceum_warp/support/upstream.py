@@ -29,7 +29,7 @@ def extend_structs() -> None:
     codegen: Any = wp._src.codegen
 
     def merge(cls: Any, /, **keywords: Any) -> None:
-        if not issubclass(cls, codegen.StructInstance):  # skip Warp's own instance class
+        if not issubclass(cls, codegen.StructInstance):
             inherited: dict[str, Any] = {}
             for base in reversed(cls.__mro__[1:]):
                 inherited |= vars(base).get("__annotations__", {})
@@ -57,7 +57,7 @@ def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
         return False
 
 
-# the C engine does not need MuJoCo Warp, so import it on demand
+# the C engine does not need MuJoCo Warp
 
 
 def forward_functions() -> Mapping[str, Any]:

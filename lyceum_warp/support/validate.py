@@ -9,11 +9,7 @@ import torch
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
-    """Convert a number of any type to an int within bounds.
-
-    Raises:
-        ValueError: The value is not a whole number from low to high.
-    """
+    """Convert a number of any type to an int within bounds."""
     try:
         number = int(value)
         fits = number == value and low <= number <= high and not isinstance(value, bool)
@@ -25,64 +21,40 @@ def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> i
 
 
 def positive_number(name: str, value: Any, unit: str) -> float:
-    """Convert a positive, finite number to a float.
-
-    Raises:
-        ValueError: The value is not positive or not finite.
-    """
+    """Convert a positive, finite number to a float."""
     if not isinstance(value, (int, float)) or not 0 < value < math.inf:
         raise ValueError(f"{name} must be a positive number of {unit}, not {value!r}")
     return float(value)
 
 
 def check_kind(name: str, value: Any, kind: Any, example: str) -> None:
-    """Check the type of a value.
-
-    Raises:
-        ValueError: The value is not an instance of ``kind``.
-    """
+    """Check the type of a value."""
     if not isinstance(value, kind):
         wanted = getattr(kind, "__name__", str(kind).rpartition(".")[2])
         raise ValueError(f"{name} must be of type {wanted}, {example}, not {described(value)}")
 
 
 def check_flag(name: str, value: Any) -> None:
-    """Check that a value is True or False.
-
-    Raises:
-        ValueError: The value is neither True nor False.
-    """
+    """Check that a value is True or False."""
     if not isinstance(value, bool):
         raise ValueError(f"{name} must be True or False, not {value!r}")
 
 
 def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
-    """Check that a value is one of the given words.
-
-    Raises:
-        ValueError: The value is not one of the words.
-    """
+    """Check that a value is one of the given words."""
     if not isinstance(value, str) or value not in words:
         *first, last = map(repr, words)
         raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
 
 
 def check_group(group: Any, groups: Iterable[str], task: str) -> None:
-    """Check that a task has a group of observations.
-
-    Raises:
-        ValueError: The task has no such group.
-    """
+    """Check that a task has a group of observations."""
     if group not in (known := list(groups)):
         raise ValueError(f"the task {task!r} has no group {group!r} of observations: it has {', '.join(known)}")
 
 
 def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
-    """Check the widths of hidden layers.
-
-    Raises:
-        ValueError: The value is not a sequence of positive whole numbers.
-    """
+    """Check that the widths of hidden layers are positive whole numbers."""
     try:
         return [whole_number("a width", width, low=1) for width in hidden]
     except (TypeError, ValueError) as error:
@@ -90,11 +62,7 @@ def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
 
 
 def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
-    """Check that a value has the shape, the type and the device of a buffer.
-
-    Raises:
-        ValueError: The value is not a tensor, or has a different shape, type or device.
-    """
+    """Check that a value has the shape, the type and the device of a buffer."""
     if not isinstance(value, torch.Tensor) or value.shape != like.shape or value.dtype != like.dtype:
         raise ValueError(f"{name} must be {described(like)}, not {described(value)}")
     if value.device != like.device:
@@ -113,11 +81,7 @@ def described(value: Any) -> str:
 
 
 def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
-    """Convert a finite number of any type to a float within bounds.
-
-    Raises:
-        ValueError: The value is not a finite number from low to high.
-    """
+    """Convert a finite number of any type to a float within bounds."""
     if not isinstance(value, bool) and isinstance(value, numbers.Real):
         number = float(value)
         if math.isfinite(number) and low <= number <= high:

@@ -15,11 +15,7 @@ _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "nump
 
 
 def versions(device: str = "cpu") -> dict[str, Any]:
-    """Return the versions of packages and Python, a description of the machine, and the commit of a git checkout.
-
-    Args:
-        device: The run's device. For a CUDA device, the result has the GPU's name and the CUDA version.
-    """
+    """Return the versions of packages and Python, a description of the machine, and the commit of a git checkout."""
     found: dict[str, Any] = {}
     for package in _PACKAGES:
         try:

@@ -30,7 +30,7 @@ def start_warp() -> list[str]:
     with _lock:
         if _remarks is None:
             level = wp.LOG_WARNING if wp.config.log_level == wp.LOG_INFO else wp.config.log_level
-            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp's Python code would print one of these messages again
+            wp.config.log_level = max(level, wp.LOG_ERROR)  # Warp would print one of these messages again
             try:
                 printed = _stderr_of_start()
             finally:

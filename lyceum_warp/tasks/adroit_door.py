@@ -103,5 +103,4 @@ class AdroitDoor(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the door's frame a mocap body, so that the door's position can differ between worlds."""
         spec.body("frame").mocap = True

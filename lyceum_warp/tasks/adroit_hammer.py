@@ -109,5 +109,4 @@ class AdroitHammer(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the board a mocap body, so that its height can differ between worlds."""
         spec.body("nail_board").mocap = True

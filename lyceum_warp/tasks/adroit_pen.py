@@ -1,9 +1,9 @@
 """AdroitPen: turn a pen in the hand to a target orientation (Gymnasium-Robotics' AdroitHandPen-v1).
 
-Install the extra "hand" to get the hand's model. The target is a mocap body, because it is part of the state. The pen
-does not collide with the target, as it does in Gymnasium-Robotics. The original model lists the contact pair of ring
-and little fingertip twice, this one only once. As in Gymnasium-Robotics, positions are one substep old after
-``mj_step``. Success: the pen has been in the goal orientation in more than 20 steps of the episode.
+Install the extra "hand" to get the hand's model. The target is a mocap body, because it is part of the state. Unlike
+in Gymnasium-Robotics, the pen does not collide with the target. The original model lists the contact pair of ring and
+little fingertip twice, this one only once. As in Gymnasium-Robotics, positions are one substep old after ``mj_step``.
+Success: the pen has been in the goal orientation in more than 20 steps of the episode.
 """
 
 import mujoco
@@ -109,7 +109,6 @@ class AdroitPen(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the target a mocap body without collisions, so that its orientation can differ between worlds."""
         spec.body("target").mocap = True
         for geom in spec.body("target").geoms:
             geom.contype = geom.conaffinity = 0

@@ -104,7 +104,6 @@ class AdroitRelocate(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Make the target a mocap body, so that its position can differ between worlds."""
         fixed = spec.site("target")
         target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
         looks = {"size": fixed.size.copy(), "rgba": fixed.rgba.copy()}

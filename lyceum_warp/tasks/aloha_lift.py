@@ -101,7 +101,6 @@ class AlohaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Replace colliding meshes by simple shapes, and let the servos follow velocities."""
         spec.option.timestep, spec.option.integrator = 0.005, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for servo in spec.actuators:
             lw.follow_velocity(servo, 0.1 if servo.name.endswith("gripper") else 1.0)  # m/s or rad/s

@@ -1,9 +1,9 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
 The arm and the hand are the Kinova Jaco, whose model the extra "dm-control" installs. Goal, reward and initial states
-are Lyceum's, except for the distance from the ball to the goal. Lyceum's code uses the distance from the ball to (ball
-- goal), which is constant. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten
-consecutive steps, 0.2 s.
+are Lyceum's, except for the distance from the ball to the goal. Lyceum's code uses the distance from the ball to ball
+minus goal, which is constant.
+Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps, 0.2 s.
 """
 
 import mujoco
@@ -103,10 +103,9 @@ class ArmHandPickup(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add the hand, a table, and motors that control joint velocities."""
         spec.attach(jaco("jaco_hand.xml").spec(), site=spec.site("wristsite"), prefix="hand/")
         for geom in spec.geoms:
-            geom.contype, geom.conaffinity = 0, 1  # arm and hand do not collide with each other
+            geom.contype, geom.conaffinity = 0, 1
         # for large joints, small joints and fingers: gain, maximum rad/s and maximum N m
         for i, joint in enumerate(spec.joints):
             gain, speed, torque = ((500, 0.628, 30.5), (500, 0.838, 6.8), (100, 1.0, 1.0))[i // 3]

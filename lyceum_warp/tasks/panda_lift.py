@@ -12,7 +12,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # arm and fingers, gripper pointing down
+HOME = (0.0, 0.1, 0.0, -2.1, 0.0, 2.2, 0.785, 0.03, 0.03)  # gripper points down
 
 
 @wp.struct
@@ -97,7 +97,6 @@ class PandaLift(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add the hand, a table and the cube. Replace the motors by servos that follow velocities."""
         spec.option.timestep, spec.option.cone = 0.005, mujoco.mjtCone.mjCONE_ELLIPTIC
         for i, (motor, joint) in enumerate(zip(spec.actuators, spec.joints, strict=True)):
             kp, force = (4500.0, 87.0) if i < 4 else (2000.0, 12.0)  # the robot's published torque limits, N m

@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # the ball's first index in qpos and qvel; the ball has 8 corners with 3 numbers
+NODE = 4  # the ball's first index in qpos and qvel, and its 8 corners with 3 numbers
 
 
 @wp.struct

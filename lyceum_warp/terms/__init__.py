@@ -176,7 +176,7 @@ ARGUMENTS = {
     "wanted_air_time": "least duration of a rewarded swing (s)",
     "width": "number of elements of one value in a history",
 }
-"""The meanings of arguments by name. Memory is the task's memory, and Params is the task's struct of parameters."""
+"""The meanings of arguments by name."""
 
 for _name in __all__:
     document_arguments(globals()[_name], ARGUMENTS)

@@ -43,13 +43,9 @@ class Report:
     """The result of ``check_task`` for a task that follows every rule."""
 
     task: str
-    """The task's name."""
     engine: str
-    """The engine's name."""
     device: str
-    """The device of the worlds."""
     nworld: int
-    """Number of worlds."""
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Duration of each check in seconds, by the rule's name."""
     unused: list[str] = dataclasses.field(default_factory=list)
@@ -111,7 +107,7 @@ def check_task(
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
         start = time.perf_counter()
-        ctx.restart()  # do not depend on earlier checks
+        ctx.restart()
         try:
             check(ctx)
         except AssertionError as error:

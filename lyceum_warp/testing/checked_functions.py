@@ -19,7 +19,6 @@ from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
-"""Attributes of an array that are tuples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,9 +27,7 @@ class Place:
 
     function: str
     text: str
-    """The expression with the index."""
     where: str
-    """The file and the line."""
     verb: str
     """The kind of access: reads, writes or loops."""
 
@@ -60,9 +57,6 @@ class CheckedFunctions:
     A kernel takes the report, and the values of each argument in all worlds. These are a ``Batch`` for a World, an
     array (nworld,) or (1,) for Params, and an array (nworld, size) for a row. The report, (places, 3) int32, has a row
     for each index in the source. A row has the number of errors, the first wrong index, and the size of the array.
-
-    Raises:
-        Unchecked: A function can't be copied.
     """
 
     def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:
@@ -72,7 +66,7 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # functions may call each other, so make kernels after all copies
+        for scope, numbers in self._scopes:  # functions may call each other
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
@@ -162,7 +156,6 @@ class _Rewriter(ast.NodeTransformer):
         self.callees: list[int] = []
         self.loops = 0
         self.writes = False
-        """Whether the expression is part of an assignment target."""
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
         node.target = self.visit(node.target)
@@ -218,7 +211,6 @@ class _Rewriter(ast.NodeTransformer):
         return node
 
     def _check_atomic(self, node: ast.Call, key: str) -> None:
-        """Check the indices of ``wp.atomic_add(row, i, value)`` and similar functions."""
         text, values = ast.unparse(node), 2 if key == "atomic_cas" else 1
         row = self.visit(copy.deepcopy(node.args[0]))
         for axis, index in enumerate(node.args[1:-values]):
@@ -298,9 +290,6 @@ def checked_functions(
 
     ``name`` is the Warp module of the copies. ``views`` maps types of arguments to functions that read one world's
     value.
-
-    Raises:
-        Unchecked: A function can't be checked.
     """
     key = (*views.values(), *functions.items())
     if key not in _made:

@@ -18,7 +18,6 @@ OUTCOMES = (*step_types.OUTCOMES, "obs", "final_obs")
 """Buffers that a step fills."""
 
 SHORT = 8
-"""Number of steps in short checks."""
 
 
 @document_attributes
@@ -29,19 +28,13 @@ class Context:
     a: Env
     """The environment of most checks."""
     b: Env
-    """A second environment, for comparisons."""
     make: Callable[..., Env]
     """Makes another environment with the same options, except for given changes."""
     steps: int
-    """Number of steps in long checks."""
     seed: int
-    """Seed of the worlds and of the random actions."""
     task: str
-    """The task's name."""
     engine: str
-    """The engine's name."""
     rule: str = ""
-    """The rule that is being checked."""
 
     def fail(self, problem: str, world: int = 0) -> NoReturn:
         """Raise an AssertionError with the seed, and with the step and the state of a world of ``a``."""

@@ -92,7 +92,7 @@ def check_graphs(ctx: Context) -> None:
 def _memory(device: wp.Device) -> dict[str, int]:
     gc.collect()
     found = {"Python bytes": tracemalloc.get_traced_memory()[0]}
-    # isinstance would load modules that are loaded lazily
+    # isinstance would load lazy modules
     found["arrays"] = sum(issubclass(type(thing), (wp.array, torch.Tensor)) for thing in gc.get_objects())
     if device.is_cuda:
         found["Warp bytes"] = wp.get_mempool_used_mem_current(device)

@@ -11,7 +11,6 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
-    """Cause a fault in one world of environment a, and compare a with environment b."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     ctx.restart()
     others = ~ctx.mask(bad)
@@ -101,7 +100,7 @@ def check_not_finite(ctx: Context) -> None:
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
-    with ctx.changed(a, b, graphs=False):  # parameters that differ between worlds require new graphs
+    with ctx.changed(a, b, graphs=False):  # parameters that differ between worlds need new graphs
         for name in names:
             kept = a.task.params[name]
             ctx.restart()

@@ -37,7 +37,7 @@ def check_noise(ctx: Context) -> None:
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
     parts = env.state_space.parts
-    # copies of a state that differ only in their random streams
+    # these states differ only in their random streams
     same = state[:1].expand_as(state).contiguous()
     changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
     for name in ("episode", "step"):

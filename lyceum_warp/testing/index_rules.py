@@ -15,13 +15,11 @@ from lyceum_warp.testing.context import Context
 from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
-"""Functions of a reset, in order."""
 
 _FEW = 20
 """Number of steps on a slow engine: MuJoCo Warp on a CPU."""
 
 _MOST_LISTED = 8
-"""Maximum number of problems in a message."""
 
 
 def check_bounds(ctx: Context) -> None:
@@ -68,11 +66,10 @@ class _Run:
         self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
 
     def steps(self) -> None:
-        """Run the functions on the states of random steps and of resets between them."""
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # functions are the same on every engine, so a few steps suffice on a slow engine
+        # functions are the same on every engine
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -117,7 +114,6 @@ class _Run:
             dirty = name == "advance" or bool(written_fields(function))
 
     def _run_reset(self) -> None:
-        """Run a reset's functions on the engine's initial state."""
         self._copy(self.start, self.after)
         if "lasting_memory" in self.env.task.types:
             wp.copy(self.after.lasting_memory, self.worlds.after.lasting_memory)
@@ -125,7 +121,6 @@ class _Run:
             self._run(name, self.after)
 
     def _keep_start(self) -> None:
-        """Copy the initial state, which the task's functions change."""
         env = self.ctx.b
         env.engine.reset(env.worlds.everyone)
         self._copy(env.worlds.after, self.start)
@@ -135,7 +130,6 @@ class _Run:
         env.reset()
 
     def _run(self, name: str, state: Any) -> None:
-        """Run the copy of a function with ``state`` as its argument ``s`` or ``s1``."""
         if name not in self.functions:
             return
         draws = self.rng.integers(0, 2**32, (self.env.nworld, 1), dtype=np.uint32)
@@ -146,7 +140,8 @@ class _Run:
             values["obs"] = self.obs[name]
         types = self.functions[name].input_types
         form = FUNCTIONS.get("observe" if name in self.obs else name)
-        names = form.argument_names[: len(types)] if form else types  # a generated function has its own argument names
+        # generated functions have their own argument names
+        names = form.argument_names[: len(types)] if form else types
         given = [values[argument] for argument in names]
         kernel = self.checked.kernels[name]
         wp.launch(kernel, self.env.nworld, [self.report, *given], device=self.env.device)
@@ -161,10 +156,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Allocate zeros.
-
-        An empty array gets memory for one element, because a checked function may access it.
-        """
+        """An empty array gets memory for one element, because a checked function may access it."""
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

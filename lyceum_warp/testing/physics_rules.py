@@ -85,7 +85,7 @@ def check_inputs(ctx: Context) -> None:
             before = env.get_state()
             b.set_state(before)
             b.action.copy_(action)
-            b.worlds.act()  # call only the task's control
+            b.worlds.act()
             env.step(action)
             after = env.get_state()
             calm = ctx.calm(env) & ~ctx.faulty(env)
@@ -130,7 +130,6 @@ def check_dynamics(ctx: Context) -> None:
     ctx.restart()
     first = a.get_state()
     compare(a, first, "after rand_reset")
-    # their effect
     with ctx.changed(a, b, autoreset=False, horizon=0):
         for i, action in enumerate(ctx.actions(SHORT)):
             before = a.get_state()
@@ -144,7 +143,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # the random values are the same after many resets as after one
+    # the same random values as after one reset
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

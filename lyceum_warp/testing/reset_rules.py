@@ -17,7 +17,7 @@ def check_keyframe(ctx: Context) -> None:
     if (name := env.task.task.keyframe) is None:
         return
     key = env.task.model.key(name)
-    env.engine.reset(env.worlds.everyone)  # the initial state before the task's functions change it
+    env.engine.reset(env.worlds.everyone)
     state = env.get_state()
     env.rand_reset(ctx.seed)
     given = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act, "ctrl": key.ctrl, "mocap_pos": key.mpos}

@@ -38,7 +38,7 @@ def check_restoring(ctx: Context) -> None:
         first = ctx.run(a, actions)
         a.set_state(state)
         ctx.same_runs(ctx.run(a, actions), first, "after restoring")
-        b.rand_reset(ctx.seed + 5)  # a different random stream
+        b.rand_reset(ctx.seed + 5)
         ctx.run(b, ctx.actions(3, 2))
         b.set_state(state)
         ctx.same_runs(ctx.run(b, actions), first, "after restoring in another environment")
@@ -167,7 +167,7 @@ def check_reset(ctx: Context) -> None:
 
     reset()
     state, obs = _physics(env, env.get_state()), env.obs.clone()
-    noisy = bool(env.task.noisy_groups)  # each episode has different noise
+    noisy = bool(env.task.noisy_groups)
     if not noisy and not env.task.parameters.per_world:
         ctx.equal(obs, obs[:1].expand_as(obs).contiguous(), "the worlds' observations after reset")
     for action in ctx.actions(100):

@@ -17,7 +17,6 @@ def unused(task: BoundTask) -> list[str]:
 
 
 def _functions(task: BoundTask) -> list[str]:
-    """List functions that no function calls, no task uses, and no term takes as an argument."""
     module = vars(sys.modules[task.task.__module__])
     own = {name: value for name, value in module.items() if isinstance(value, wp.Function) and has_source(value)}
     used = {*FUNCTIONS, *task.source.terms.functions}

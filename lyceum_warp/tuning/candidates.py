@@ -9,7 +9,6 @@ from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
-"""Iteration limits to try, if they are lower than the model's limit."""
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
 """Number of degrees of freedom from which each engine uses a sparse Jacobian."""
@@ -22,13 +21,11 @@ class Setting:
     """Physics options to try together."""
 
     name: str
-    """Short description, or "" for the unchanged task."""
     group: str
-    """Kind of change. A combination has at most one setting per group."""
+    """A combination has at most one setting per group."""
     physics: Mapping[str, Any]
     """Options that differ from the task's, by their names in ``lw.PhysicsOptions``."""
     parts: tuple["Setting", ...] = ()
-    """Settings of a combination."""
 
 
 def candidates(env: Env) -> list[Setting]:
@@ -108,7 +105,6 @@ def _name(names: Mapping[str, Any], value: int) -> str | None:
 
 
 def _fewer(substeps: int) -> list[int]:
-    """List smaller numbers of substeps: a half, a quarter, and so on."""
     found = []
     while substeps > 1:
         substeps = (substeps + 1) // 2

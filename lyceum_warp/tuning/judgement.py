@@ -13,8 +13,7 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the unchanged task's mean absolute return."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation between returns under a planner's physics and under the plant's physics.
-bench/rank_loss.py compares rank correlations with losses of planned return."""
+"""Smallest accepted rank correlation of returns under a planner's and the plant's physics; see bench/rank_loss.py."""
 
 LEAST_GAIN = 1.03
 """Returns are compared only from this speed-up on, or if a setting takes less memory."""
@@ -40,7 +39,6 @@ class Difference:
         return self.low > tolerance or self.high < -tolerance
 
     def __str__(self) -> str:
-        """Format the interval in percent."""
         return f"[{100 * self.low:+.1f}, {100 * self.high:+.1f}]"
 
 

@@ -32,20 +32,13 @@ class Rankings:
     - standing: after a random reset;
     - moving: after 30 steps under a planner with the plant's physics that replans every 6 steps;
     - fallen: after random actions until the end of the episode (at most 200 steps), and 10 more steps.
-
-    Args:
-        states: Number of states of each kind.
-        repeats: Number of timed plans.
-        samples: Number of samples of a plan.
-        seed: Seed of states and noise.
-        words: Options and parameters for ``lw.MPPI``.
     """
 
     def __init__(
         self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
     ) -> None:
         self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
-        # after several improvements, each planner's samples would fit its own physics
+        # with several improvements, each planner's samples would fit its own physics
         self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
@@ -79,7 +72,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Plan from some states. Return the plans, and the returns (states, samples) of samples around them."""
+        """Return the plans, and the returns (states, samples) of samples around them."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)
@@ -87,7 +80,6 @@ class Rankings:
         return plan, self._returns(self.exact, start, plan)
 
     def _returns(self, planner: MPPI, start: torch.Tensor, plan: torch.Tensor) -> torch.Tensor:
-        """Compute returns of samples around a plan, (states, samples)."""
         planner.reset(self.seed + 1)
         planner.knot_actions.copy_(plan)
         planner(start, shift=0)
@@ -104,7 +96,7 @@ class Rankings:
         start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
             exact, own = self._seconds(self.one, start), self._seconds(one, start)
-            if repeat:  # the first plans load kernels, so do not time them
+            if repeat:  # the first plans load kernels
                 times.append(own)
                 ratios.append(exact / own)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}

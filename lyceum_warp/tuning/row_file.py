@@ -32,15 +32,11 @@ class RowFile:
     """Stores one row of results per setting in a file.
 
     Args:
-        path: The file, which need not exist.
         identity: Only rows with this identity are used; see ``identity``.
-
-    Raises:
-        ValueError: The file is not a file of results.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
-        self.path, self.identity = path, json.loads(json.dumps(identity))  # tuples become lists, as in JSON
+        self.path, self.identity = path, json.loads(json.dumps(identity))
         self._rows: dict[str, dict[str, Any]] = {}
         self._whole = 0
         lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []

@@ -85,8 +85,8 @@ def tune(
 
     Args:
         task: A task's name, file or class.
-        run: Folder of a run of the same task. Its policy plays further episodes to compare, and its parameters replace
-            the task's defaults.
+        run: Folder of a run of the same task. Returns are then compared under its policy, too, and its parameters
+            replace the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Largest 95 % interval of the difference of returns, relative to the mean absolute return: "strict" (2
             %), "loose" (5 %) or "any" (only faults count).
@@ -176,11 +176,11 @@ class _Search:
         settings = [setting for setting, _ in good]
         while (both := combined(settings)) is not None:
             row = self._row(both)
-            if row["name"] == both.name:  # a single setting was already tried alone
+            if row["name"] == both.name:
                 rows.append(row)
             if row["verdict"] == "same":
                 break
-            settings = settings[: settings.index(both.parts[-1])]  # remove the least useful setting
+            settings = settings[: settings.index(both.parts[-1])]
         rows.sort(key=lambda row: -row.get("speedup", 0.0))
         return Tuning(rows, reference, not_tried(env), self.file.path)
 

@@ -36,13 +36,12 @@ class Effort:
     repeats: int
     """Number of timed blocks of steps, each with the unchanged task and with the setting."""
     block_seconds: float
-    """Duration of a block with the unchanged task."""
     judging_seconds: float
     """Time limit for the unchanged task's episodes, once for random actions and once for the policy."""
     steps: int
     """Maximum number of steps in an episode, or 0 for the task's horizon."""
     recorded_at: tuple[int, ...]
-    """Steps after which states are recorded. Speed and divergence are measured from these states."""
+    """Steps after which states are recorded, to measure speed and divergence from them."""
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
@@ -54,7 +53,6 @@ class Trials:
 
     Args:
         reference: The unchanged task, made with ``autoreset=False``.
-        episodes: Number of episodes of each setting; by default, the interval's width and the time limit determine it.
     """
 
     def __init__(
@@ -177,7 +175,6 @@ class Trials:
         return count / float(np.median(own)), float(np.median(exact / own)), float(low)
 
     def _seconds(self, env: Env, k: int) -> float:
-        """Time a block of steps from the k-th recorded states, after one untimed step."""
         actions = self._actions[k]
         env.set_state(self._starts[k])
         env.step(actions[0])

@@ -1,7 +1,7 @@
 """Define what the tasks of this folder share: rewards for balance, and pushes.
 
-Balance is the distance of the capture point from the line between the feet. A foot at the capture point would stop the
-robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
+Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture point
+would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
 At each of ``push_times``, an impulse in a random horizontal direction changes the velocities of all bodies by impulse /
 mass. Planners do not foresee pushes.
@@ -57,7 +57,6 @@ def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # velocity of the cen
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
 
-# arguments of reward terms are found by name
 
 
 @wp.func

@@ -81,7 +81,7 @@ class G1Stand(balancing.Balance):
         hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
         for element in (*spec.sensors, *spec.keys, *servos, *hands):
             spec.delete(element)
-        for body in spec.bodies:  # most meshes are drawn twice, and every geom costs time
+        for body in spec.bodies:  # most meshes are drawn twice
             meshes = [geom.meshname for geom in body.geoms]
             for i, geom in enumerate(body.geoms):
                 if geom.meshname and geom.meshname in meshes[:i]:

@@ -64,7 +64,7 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # planners hold each torque for two steps, and their reward rises with the speed without limit
+    # planners hold each torque for two steps, and their reward rises with the speed even above the task's speed
     planning = lw.Planning(
         settings={
             "horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 2.0, "temperature": 0.02,
@@ -135,7 +135,6 @@ class FingerTurnEasy(FingerSpin):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Count contacts for ``reject``, and give each world its own target."""
         suite.count_contacts(spec)
         suite.free_target(spec)
         spec.site("target").size[0] = cls.target_radius

@@ -110,5 +110,4 @@ class FishSwim(FishUpright):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Give each world its own target."""
         suite.free_target(spec)

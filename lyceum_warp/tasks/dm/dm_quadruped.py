@@ -10,11 +10,10 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.dm import suite
 
-RESOLUTION = wp.constant(0.01)  # distance between initial heights, m
+RESOLUTION = wp.constant(0.01)  # m
 
 
 def solid(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the indices of the quadruped's geoms."""
     return np.flatnonzero(model.geom_bodyid > 0)
 
 

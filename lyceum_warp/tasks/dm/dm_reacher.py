@@ -60,7 +60,6 @@ class ReacherEasy(lw.Task):
 
     @classmethod
     def edit_model(cls, spec: mujoco.MjSpec) -> None:
-        """Give each world its own target."""
         suite.free_target(spec)
         spec.geom("target").size[0] = cls.target_radius
 

@@ -27,7 +27,6 @@ def free_target(spec: mujoco.MjSpec) -> None:
 
 
 def count_contacts(spec: mujoco.MjSpec) -> None:
-    """Add a sensor "contacts", which counts contacts."""
     found = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
     spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[found, 0, 1])
 

@@ -17,7 +17,6 @@ class Params(rough.Params, g1.Params):
 class G1RoughVelocity(rough.Rough, g1.G1):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Replace the floor by terrain, and the soles by capsules."""
         g1.G1.edit_model(spec)
         walkers.round_feet(spec, g1.FEET)
         rough.TERRAIN.add_to(spec)

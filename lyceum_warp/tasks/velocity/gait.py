@@ -4,7 +4,7 @@ The clock says when each foot should stand and when it should swing. It is part 
 reward depends on how well the feet follow it. Its frequency is ``gait_frequency``. Each foot stands for the first
 ``stance_share`` of its cycle and swings for the rest. The feet are half a cycle apart. Without the clock, policies make
 5 to 7 short steps a second with each foot. A cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast
-motion grow with the number of training steps. With the full costs from the start, a robot learns to stand still.
+motion grow with the number of steps. With the full costs from the start, a robot learns to stand still.
 """
 
 import warp as wp

@@ -16,5 +16,4 @@ class Params(rough.Params, go1.Params):
 class Go1RoughVelocity(rough.Rough, go1.Go1Velocity):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Replace the floor by terrain."""
         rough.TERRAIN.add_to(spec)

@@ -1,8 +1,8 @@
 """Define velocity tasks for walking robots, which follow commanded velocities and yaw rates on flat ground.
 
 Actions are offsets of the joints' servo targets from the default pose. Each robot's file lists the model, the actuated
-joints and the feet, and sets parameters. The tables in ``Params`` are computed from the model. Observations, rewards,
-commands, pushes and resets are taken from mjlab 1.6.0's velocity tasks.
+joints and the feet, and sets parameters. Observations, rewards, commands, pushes and resets are taken from mjlab
+1.6.0's velocity tasks.
 
 The base is the body of the model's first joint, a free joint. Functions read the state after the last substep. Only the
 forces on the feet are older, because MuJoCo computes them at the start of a substep. They are 0 at the start of an
@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# arguments of reward terms are found by name, and the command is that before the step
+# the command is that before the step
 
 
 @wp.func
@@ -422,10 +422,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs that follows velocity commands. Rewards favour steps and a calm trunk.
-
-    Two sites mark the feet.
-    """
+    """A robot with two legs that follows velocity commands. Rewards favour steps and a calm trunk."""
 
     frame_skip, keyframe = 5, "home"
     training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)
