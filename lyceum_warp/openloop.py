@@ -46,8 +46,8 @@ class OpenLoop:
         states: Number of initial states. Each state starts nworld / states consecutive worlds.
 
     Raises:
-        ValueError: The environment resets its worlds automatically, ``keys`` does not fit, the number of worlds is not
-            a multiple of the number of states, or the memory is too small.
+        ValueError: The environment has automatic resets, ``keys`` or ``states`` does not fit the worlds, or the memory
+            is too small.
     """
 
     state: torch.Tensor

@@ -101,7 +101,7 @@ class PhysicsOptions:
     rollouts."""
     njmax: int | None = _for_engine(None)
     """Number of constraints of each world that fit into the Warp engine; by default twice the peak in random rollouts,
-    plus room for inactive equality constraints."""
+    and more for inactive equality constraints."""
     deterministic: bool = _for_engine(False)
     """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, this
     takes 5 to 18 times as much time and 5 to 7 times as much memory."""

@@ -45,8 +45,9 @@ class TaskFunction:
     optional: str = ""
     """Last arguments that a task may omit, written as in a task's file."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """What the function may write into each argument: "inputs", "memory", "lasting" (lasting memory and the model), or
-    "start" (every field that a reset may write). Arguments for results, such as ``obs``, are always writable."""
+    """What the function may write into each argument. "lasting" means lasting memory and the model, and "start" means
+    everything that a reset may write. The other values are "inputs" and "memory". Arguments for results, such as
+    ``obs``, are always writable."""
 
     @property
     def signature(self) -> str:
@@ -405,10 +406,10 @@ class Task:
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``. Functions get the
     element's index. There are also ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
     ``lw.actuator``, ``lw.ctrl``, ``lw.act``, ``lw.tendon``, ``lw.equality``, ``lw.sensor`` and ``lw.mocap``. A field of
-    type ``wp.array[float]``, ``wp.array2d[wp.vec3]`` or similar is a table that all worlds share, such as a motion to
-    follow. Its default is a nested list or an array. ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")`` is a
-    table of elements; ``lw.bodies``, ``lw.geoms``, ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` and
-    ``lw.sensors`` work in the same way. ``lw.from_model`` computes a default from the compiled model.
+    a type such as ``wp.array[float]`` or ``wp.array2d[wp.vec3]`` is a table that all worlds share. Its default is a
+    nested list or an array. ``feet: wp.array[int] = lw.sites("left_foot", "right_foot")`` is a table of elements. There
+    are also ``lw.bodies``, ``lw.geoms``, ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` and
+    ``lw.sensors``. ``lw.from_model`` computes a default from the compiled model.
 
     Functions: {functions}
 
@@ -440,13 +441,13 @@ class Task:
     """
 
     model: ClassVar[Any]
-    """The model: a file (relative to the task's file, or one of gymnasium's models), ``lw.package_model(...)``, an
-    MjSpec, or a static method without arguments that returns one of these."""
+    """The model: a file name, ``lw.package_model(...)``, an MjSpec, or a static method without arguments that returns
+    one of these. A file is relative to the task's file, or one of gymnasium's models."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
-    """Parts of the observation and their sizes, such as ``{"position": 5, "velocity": 6}``, or a static method that
-    computes them from the Params. A task may have several groups of observations, such as ``{"policy": {"position": 5},
+    """Parts of the observation and their sizes, such as ``{"position": 5, "velocity": 6}``. A static method may compute
+    them from the Params. A task may have several groups of observations, such as ``{"policy": {"position": 5},
     "critic": {"position": 5, "mass": 1}}``. Then ``observe`` writes the group ``policy`` (``env.obs``).
     ``observe_critic`` has the same arguments and writes the group ``critic``. Omit ``obs`` if the last argument of
     ``observe`` is a Warp struct whose fields have the default ``lw.part(size)``."""
@@ -494,7 +495,7 @@ class Task:
     termination, reset and parameters are the same as there. Subclasses do not inherit this attribute."""
     trace: ClassVar[str | None] = None
     """Name of a site or body whose path the viewer draws for a planner's samples. By default, it draws the path of the
-    centre of mass if the robot has a floating base, or else of the end of the arm."""
+    centre of mass of a robot with a floating base, or of the end of an arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, for symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that
     returns an ``lw.Mirror``."""

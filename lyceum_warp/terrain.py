@@ -108,8 +108,8 @@ class Terrain:
 
     kinds: Mapping[str | Shape, int]
     """Kinds of patches, each with a number of columns. A kind is a name from the table or a function ``shape(x, y,
-    difficulty, rng)`` that returns the heights of a patch, (n, n) in m. Its arguments x and y are the points'
-    coordinates relative to the patch's centre, (n, n)."""
+    difficulty, rng)`` that returns heights, (n, n) in m. Its arguments x and y are the points' coordinates relative to
+    the patch's centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
@@ -233,7 +233,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
-        ValueError: There is no such height field, or it does not belong to exactly one geom that is fixed and upright.
+        ValueError: There is no such height field, or no single fixed and upright geom has it.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:

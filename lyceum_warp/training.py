@@ -81,10 +81,10 @@ def train(
     Policies are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise they are compared by
     ``return_mean``, the return of episodes under the policy before the update.
 
-    The policy and the complete state are saved at the start, at the end, and every 30 s or more often, if saving takes
-    at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the
-    same numbers. After Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and ends. A second
-    signal ends it at once.
+    The policy and the complete state are saved at the start, at the end, and every 30 s. They are saved more often if
+    this takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and
+    produces the same numbers. After Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and
+    ends. A second signal ends it at once.
 
     Args:
         learner: The algorithm, such as ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
@@ -99,11 +99,11 @@ def train(
         tensorboard: Whether to write the metrics for TensorBoard, too.
         video_every: Iterations between videos of the policy, such as ``videos/000100.mp4`` in the folder, or 0 for
             none. If a video fails, a warning is logged, and training continues without videos.
-        camera: Camera of the videos: a camera of the model by name or index, a ``viz.cameras.FreeCamera``, or "free"
-            for MuJoCo's default camera.
+        camera: Camera of the videos: the name or index of a camera in the model, a ``viz.cameras.FreeCamera``, or
+            "free" for MuJoCo's default camera.
         transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
-            only comparisons that take seconds are made: with the C engine after training on a GPU, and with the task's
-            exact physics after training with other physics options. ``transfer=True`` also compares each set of the
+            only comparisons that take seconds are made. After training on a GPU, this is the C engine; after training
+            with other physics options, it is the task's exact physics. ``transfer=True`` also compares each set of the
             task's physics options and, after training on CPU cores, the Warp engine.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
@@ -116,7 +116,7 @@ def train(
 
     Raises:
         ValueError: The folder is not empty, an argument is out of range, the run does not fit the learner, or another
-            process has locked or taken over the run.
+            process has the run.
         ImportError: ``tensorboard`` needs the extra ``tensorboard``.
         NoVideoError: ``video_every`` needs the extra ``viz``.
         OSError: The folder cannot be written. The run can later be resumed from its last save.

@@ -191,7 +191,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """List the joints from the base to each foot, (feet, most joints of a leg), with -1 after a shorter leg.
+    """List the joints from the base to each foot, (feet, most joints of a leg). Rows of shorter legs end with -1.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -202,13 +202,13 @@ def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_qpos(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the indices of ``leg_joints`` in ``qpos``, with -1 after a shorter leg."""
+    """Get the indices of ``leg_joints`` in ``qpos``. Rows of shorter legs end with -1."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_qposadr[joints])
 
 
 def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the indices of ``leg_joints`` in ``qvel``, with -1 after a shorter leg."""
+    """Get the indices of ``leg_joints`` in ``qvel``. Rows of shorter legs end with -1."""
     joints = leg_joints(model, p)
     return np.where(joints < 0, -1, model.jnt_dofadr[joints])
 
@@ -417,8 +417,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: For each new site, the name of a body (or of a joint or geom of it), and the site's position in this body,
-            in m.
+        feet: For each new site, a body's name and the site's position in the body, in m. A joint or geom stands for its
+            body.
 
     Raises:
         ValueError: The model has no element of this name.
@@ -434,8 +434,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
     """Turn the motors of joints into position servos in place. Existing servos do not change.
 
-    A servo keeps the motor's force limit and reaches it at a position error of ``reach`` rad, so kp = limit / reach. It
-    is critically damped for the joint's inertia M at ``qpos0``: M s^2 + kd s + kp has a double root.
+    A servo reaches its motor's force limit at a position error of ``reach`` rad, so kp = limit / reach. It is
+    critically damped at ``qpos0``: M s^2 + kd s + kp has a double root for the joint's inertia M.
 
     Args:
         spec: The model.
@@ -474,8 +474,8 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
     """Replace each colliding box of a foot by two capsules along its longer side, for use on height fields.
 
-    MuJoCo Warp 4.0 finds wrong normals and depths for contacts between boxes and height fields, which throw robots into
-    the air. The capsules lie within the outline of the sole and touch its lowest plane. Masses do not change.
+    MuJoCo Warp 4.0 finds wrong contacts between boxes and height fields, which throw robots into the air. The capsules
+    lie within the outline of the sole and touch its lowest plane. Masses do not change.
 
     Args:
         spec: The model after ``prepare_walker``. It is changed in place.

@@ -29,7 +29,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
       masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False,
       ``final_obs`` and ``final_info`` exist only if an episode ended. ``final_obs`` is then an object array with None
       for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, they are tensors over all worlds and
-      always exist, because a check would wait for the device.
+      always exist. A check would wait for the device.
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. Until then, a world keeps stepping, and
       its termination or truncation stays True. A world with a fault is reset at once, but returns its last valid
       observation.

@@ -109,9 +109,9 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             - ``time_outs``: whether the time limit or a fault truncated the episode, (nworld,) bool. After a fault, the
               reward is 0, and the last valid observation is the final observation.
             - ``final_obs``: the observations after the step and before any reset, by group.
-            - ``log``: ``metrics/NAME`` are averages of the task's metrics over about the last 100 ended episodes,
-              including the episodes that end in this step. ``faults/worlds`` is the number of worlds with a fault.
-              Averages are 0 until an episode has ended.
+            - ``log``: ``metrics/NAME`` are averages of the task's metrics over about the last 100 ended episodes. They
+              include episodes that end in this step. ``faults/worlds`` is the number of worlds with a fault. Averages
+              are 0 until an episode has ended.
 
         Raises:
             ValueError: The actions have the wrong shape, type or device.

@@ -21,9 +21,9 @@ from lyceum_warp.support.validate import positive_number
 class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
 
-    A value is None if there are too few plans, if the controller does not report it, or if it does not apply. The first
-    plan of each trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times
-    therefore exclude it; see ``first_plan_ms``.
+    A value is None if it does not apply, is not reported by the controller, or needs more plans. The first plan of each
+    trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times therefore exclude it;
+    see ``first_plan_ms``.
     """
 
     task: str

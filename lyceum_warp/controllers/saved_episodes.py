@@ -42,19 +42,19 @@ def episode_env(
     of all episodes.
 
     An episode's file names the file of its task, and making the environment runs that file as Python code. An episode
-    from another person could thus run foreign code. Without ``task``, this function runs a task file only if no other
-    user can write to the file or its folder. Both must belong to this user or to root.
+    from another person could thus run foreign code. Without ``task``, a task file therefore runs only if no other user
+    can write to the file or its folder. Both must belong to this user or to root.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, which must have the name of the episodes' task. It is required if the task was defined in a
-            notebook, if its file has moved, or if other users can write to the file.
+        task: The task, which must have the name of the episodes' task. It is required for a task from a notebook, after
+            its file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task is not found or has a different name, other users can write to its file, or the states do
-            not fit it.
+        ValueError: The task is not found, is a different one, does not fit the states, or has a file that other users
+            can write.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -146,7 +146,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Explain why a file may contain another user's code, such as "it can be written by other users", or return ""."""
+    """Return a reason why a file may have foreign code, such as "it can be written by other users", or ""."""
     if not hasattr(os, "getuid"):
         return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
@@ -159,7 +159,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether only root or this user is in a group, as in the groups that many systems make for each user."""
+    """Return whether a group has only root or this user. Many systems make a group for each user."""
     import grp
     import pwd
 

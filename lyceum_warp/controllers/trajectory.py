@@ -42,7 +42,7 @@ class Trajectory:
     """One episode of a controlled world, the plant. All tensors are on the CPU.
 
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
-    engine, call ``set_state`` with the first state and step with each action.
+    engine, set the first state and step with each action.
 
     Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
     asynchronous run.

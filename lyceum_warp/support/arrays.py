@@ -90,8 +90,8 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
     """Launch a kernel over (nworld, lanes).
 
-    Its last arguments become the number of lanes and the index of the first world. The lanes of a world are threads
-    that share the work: one thread on the CPU, and a warp on a GPU for coalesced memory access.
+    Its last arguments become the number of lanes and the index of the first world. Lanes are threads that share the
+    work on a world: one on the CPU, and a warp on a GPU for coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
@@ -115,7 +115,7 @@ PAIRS_A_LAUNCH = 4
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Copy the selected rows of several arrays with ``narrow_four`` or ``widen_four`` of ``kernels.state``.
 
-    On the CPU, a launch takes longer than a copy of a few short rows, so one launch copies four arrays.
+    On the CPU, a launch takes longer than a few copies, so one launch copies four arrays.
     """
     pairs = [pair for pair in pairs if pair[1].size]
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):

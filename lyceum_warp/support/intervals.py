@@ -45,8 +45,8 @@ def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """Compute the difference of two paired proportions, with its 95 % confidence interval.
 
-    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". Each of a
-    pair's four outcomes gets half an observation more, so the width is positive even if all pairs agree.
+    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". Half an
+    observation is added to each of the four outcomes of a pair. The width is thus positive even if all pairs agree.
 
     Args:
         first: First outcome of each pair, (pairs,) bool.

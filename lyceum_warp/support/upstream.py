@@ -24,7 +24,7 @@ def extend_structs() -> None:
     """Let a class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
 
     In Warp, a struct is not a type, so a class cannot extend it. A class that extends the struct's Python class would
-    lose the inherited fields, because Warp reads only the annotations of the class itself.
+    lose its fields, because Warp reads no inherited annotations.
     """
     codegen: Any = wp._src.codegen
 
@@ -86,9 +86,8 @@ class _PerThread(threading.local):
 def separate_captures() -> None:
     """Make captures of CPU launches thread-local.
 
-    Warp's native library captures only the thread that started a capture, but Warp's Python code applies the capture to
-    all threads. Loops of other threads would then become part of the graph, and launches of other threads would
-    overwrite the graph's arguments.
+    Warp's native library captures only one thread, but Warp's Python code applies the capture to all threads. Other
+    threads would then add their loops to the graph and overwrite its arguments.
     """
     for name in ("_apic_capture", "_apic_graph"):
         setattr(wp._src.context.Runtime, name, _PerThread())
@@ -102,8 +101,8 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock for kernels with tiles on the CPU. On x86, kernels store the address of their tiles in a static variable, so two
-threads would overwrite each other's tiles."""
+"""Lock for kernels with tiles on the CPU. On x86, a static variable has the address of a kernel's tiles, so two threads
+would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:

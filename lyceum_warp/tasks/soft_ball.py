@@ -2,7 +2,7 @@
 
 Squeezing the ball costs reward, and crushing it to two thirds of its width ends the episode. The policy observes the
 mean and the extents of the ball's vertices. Success: the ball has been within 3 cm of the target for half a second.
-MuJoCo Warp merges flex contacts that are less than 1 mm apart, so the engines differ if the ball is squeezed hard.
+MuJoCo Warp merges flex contacts less than 1 mm apart, so the engines differ if the ball is squeezed hard.
 """
 
 import warp as wp

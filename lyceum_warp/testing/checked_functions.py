@@ -1,8 +1,7 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-In a copy, a function checks each index into a row, vector or matrix, and each ``while`` loop counts its iterations.
-Otherwise a copy computes the same numbers as the original. Native functions (``wp.func_native``) are C++ and cannot be
-checked.
+A copy checks each index into a row, vector or matrix, and counts the iterations of each ``while`` loop. Otherwise it
+computes the same numbers as the original. Native functions (``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
@@ -54,9 +53,9 @@ class Unchecked(Exception):  # noqa: N818
 class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel takes the report, and the values of each argument in all worlds. These are a ``Batch`` for a World, an
-    array (nworld,) or (1,) for Params, and an array (nworld, size) for a row. The report, (places, 3) int32, has a row
-    for each index in the source. A row has the number of errors, the first wrong index, and the size of the array.
+    A kernel takes the report, and the values of each argument in all worlds. A World has a ``Batch``, Params have an
+    array (nworld,) or (1,), and a row has an array (nworld, size). The report, (places, 3) int32, has a row for each
+    index in the source. A row has the number of errors, the first wrong index, and the size of the array.
     """
 
     def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:

@@ -35,10 +35,11 @@ class Tuning:
 
     rows: list[Row]
     """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
-    "same", "different" or "not shown" if the interval of the returns lies within, outside or across the tolerance. It
-    is "faults" if there are more than twice as many faults as in the unchanged task. It is "no gain" if the setting is
-    less than 3 % faster and saves no memory; returns are then not compared. It is "refused" if MuJoCo or the engine
-    refuses the setting, for the reason in the entry ``refused``. A setting of a planner may also get "ranks badly"."""
+    "same" if the interval of the returns lies within the tolerance, "different" if it lies outside, and "not shown"
+    otherwise. It is "faults" if there are more than twice as many faults as in the unchanged task. It is "no gain",
+    without a comparison of returns, if the setting is less than 3 % faster and saves no memory. It is "refused" if
+    MuJoCo or the engine refuses the setting, for the reason in the entry ``refused``. A setting of a planner may also
+    get "ranks badly"."""
     reference: Row
     """Results of a comparison of the unchanged task with itself."""
     not_tried: list[str]
@@ -78,18 +79,18 @@ def tune(
 ) -> Tuning:
     """Find the fastest physics options that do not change a task's returns.
 
-    Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults,
-    divergence, and returns. Returns are those of the same episodes under random actions and under a policy. Settings
-    are first tried alone. Then the best settings of all groups are combined. While the combination changes the returns,
-    its least useful setting is removed.
+    Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence
+    and returns. Returns are those of the same episodes under random actions and under a policy. Settings are first
+    tried alone. Then the best settings of all groups are combined. While the combination changes the returns, its least
+    useful setting is removed.
 
     Args:
         task: A task's name, file or class.
         run: Folder of a run of the same task. Returns are then compared under its policy, too, and its parameters
             replace the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
-        tolerance: Largest 95 % interval of the difference of returns, relative to the mean absolute return: "strict" (2
-            %), "loose" (5 %) or "any" (only faults count).
+        tolerance: Bound on the 95 % interval of the difference of returns, relative to the mean absolute return. It is
+            "strict" (2 %), "loose" (5 %) or "any" (only faults count).
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
         episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, as many
             as the width of the interval needs, for at most a minute (5 s with ``short``).

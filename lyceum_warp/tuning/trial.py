@@ -164,8 +164,8 @@ class Trials:
     def _speed(self, env: Env) -> tuple[float, float, float]:
         """Measure steps per second of all worlds, and the speed-up's median and lower bound.
 
-        Other processes may slow down some blocks. The lower bound is therefore the lower quartile of the blocks'
-        speed-ups, or the speed-up between the fastest blocks if that is smaller.
+        Other processes may slow down some blocks. The lower bound is therefore the smaller of two numbers: the blocks'
+        lower quartile, and the speed-up between the fastest blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]

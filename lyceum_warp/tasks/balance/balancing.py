@@ -3,8 +3,8 @@
 Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture point
 would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
-At each of ``push_times``, an impulse in a random horizontal direction changes the velocities of all bodies by impulse /
-mass. Planners do not foresee pushes.
+At each of ``push_times``, a horizontal impulse in a random direction changes all velocities by impulse / mass. Planners
+do not foresee pushes.
 """
 
 import warp as wp
@@ -55,8 +55,6 @@ def observe(s: World, p: Params, obs: Row[float]):
 def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # velocity of the centre of mass, minus the desired velocity
     moved = (s1.subtree_com[0] - s0.subtree_com[0]) / p.dt
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
-
-
 
 
 @wp.func

@@ -2,8 +2,8 @@
 
 Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock. With zero actions,
 the robot steps in place and falls after about a second. A planner thus only corrects the steps. The servos have the
-gains of unitree_rl_gym, which also keeps waist and arms rigid. The 17 joints of the upper body and the dry friction of
-the legs would double the time of a substep.
+gains of unitree_rl_gym, which also keeps waist and arms rigid. A substep would take twice as long with the upper body's
+17 joints and the legs' dry friction.
 """
 
 import mujoco

@@ -116,7 +116,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AcrobotSwingup(lw.Task):
     model, frame_skip = suite.model("acrobot"), 1
     obs = {"orientations": 4, "velocity": 2}
-    # the motor is too weak to lift the arms at once, so reward the planner for the energy of the arms
+    # the motor is too weak to lift the arms at once, so the planner is rewarded for their energy
     planning = lw.Planning(
         settings={"horizon": 25, "samples": 24, "noise": 2.0, "temperature": 0.2},
         options={"timestep": 0.04, "integrator": "rk4"},
