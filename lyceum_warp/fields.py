@@ -127,8 +127,7 @@ _RANGES = (
     | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
     | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
 )  # fmt: skip
-"""Fields with several rows per object, by name or prefix. The entries are the kind of object, MjModel's array of first
-rows, and its array of row counts or total."""
+"""Fields with several rows per object, by name or prefix."""
 
 _COUNTS = {
     _Kind.mjOBJ_ACTUATOR: "nactuator",
@@ -193,9 +192,9 @@ def describe(
     """Describe a field of a model.
 
     Fields of the position and velocity stages always match the current state. Fields of the acceleration stage, such as
-    ``qacc`` or ``cfrc_ext``, are those at the start of the last substep. At the start of an episode, they are computed
-    from the first state. In ``sensordata``, each sensor's columns belong to the sensor's stage. Fields of the
-    acceleration stage always lag (``Field.lagged``), and fields of the integration state never do.
+    ``qacc`` or ``cfrc_ext``, are those at the start of the last substep. In ``sensordata``, each sensor's columns
+    belong to the sensor's stage. Fields of the acceleration stage always lag (``Field.lagged``), and fields of the
+    integration state never do.
     """
     if written and name not in INPUTS:
         raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
@@ -266,8 +265,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     """Get the rows of a named element in a field of MjData or MjModel.
 
-    A joint may have several rows in ``qpos``, ``qvel``, ``dof_damping`` and similar fields. A sensor, an actuator and a
-    flex may have several, too. A mocap body has one row in ``mocap_pos``. In all other fields, each object has one row.
+    A joint, a sensor, an actuator and a flex may have several rows, such as a free joint in ``qpos``.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
@@ -293,7 +291,7 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
 
 
 def has_several_rows(name: str) -> bool:
-    """Return whether an object may have several rows in a field. A ball joint has three in ``cdof``, for example."""
+    """Return whether an object may have several rows in a field, such as a ball joint in ``cdof``."""
     return name in _RANGES or name.partition("_")[0] in _RANGES
 
 

@@ -15,7 +15,7 @@ from lyceum_warp.model_fields import ModelField
 class Space:
     """A world's vector with named parts, a dtype and optional bounds.
 
-    A scalar has no axis. Arrays of an environment have another axis in front, over worlds.
+    Arrays of an environment have another axis in front, over worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
@@ -75,7 +75,7 @@ def action_space(
 ) -> Space:
     """Make the space of actions, which are controls unless the task declares ``actions``.
 
-    Controls are bounded by ``action_range`` or by their ranges. Other actions are bounded only by ``action_range``.
+    Controls are bounded by ``action_range`` or by their ranges.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -116,7 +116,7 @@ def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | Non
 
 
 def control_ranges(model: mujoco.MjModel) -> np.ndarray:
-    """Get the bounds of each control, (nu, 2). They are infinite if the model has none."""
+    """Get the bounds of each control, (nu, 2), infinite if there are none."""
     return np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
 
 

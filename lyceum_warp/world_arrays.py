@@ -64,7 +64,7 @@ class WorldArrays:
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of successes in a row, up to ``success_steps``. The array has no columns if ``success_steps`` is 1."""
+        """Number of successes in a row, without columns if ``success_steps`` is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}

@@ -53,10 +53,7 @@ class Worlds(WorldArrays):
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
-        """Set the horizon, automatic restarts, and whether to capture launches as graphs.
-
-        A graph contains the first two, so each combination has graphs of its own.
-        """
+        """Set the horizon, automatic restarts, and whether to capture launches as graphs."""
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
         if key not in self._programs:
@@ -73,7 +70,7 @@ class Worlds(WorldArrays):
         self.step = self.programs.step
 
     def drop_programs(self) -> None:
-        """Delete the programs. Their reference cycles would keep threads and memory alive."""
+        """Delete the programs, whose reference cycles would keep threads and memory alive."""
         self._programs.clear()
         del self.programs, self.step
 
@@ -325,7 +322,7 @@ class Worlds(WorldArrays):
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe the selected worlds. All others were observed during the evaluation."""
+        """Observe worlds that changed after the evaluation, which observed all others."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)

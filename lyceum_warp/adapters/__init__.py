@@ -1,1 +1,1 @@
-"""Adapt environments to other reinforcement learning libraries. Each library is an optional extra."""
+"""Adapt environments to other reinforcement learning libraries, which are optional extras."""

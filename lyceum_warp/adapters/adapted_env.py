@@ -60,7 +60,7 @@ class ResetSeeds:
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:
-    """Split a tensor with one row per world into rows. Repeat any other value for every world."""
+    """Split a tensor with one row per world, or repeat any other value."""
     if isinstance(value, torch.Tensor) and value.ndim and len(value) == nworld:
         return list(value)
     return [value] * nworld

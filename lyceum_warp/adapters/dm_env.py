@@ -30,7 +30,6 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
 
     Raises:
-        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 

@@ -29,7 +29,6 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
         **words: Options and parameters for ``lw.make``.
 
     Raises:
-        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 

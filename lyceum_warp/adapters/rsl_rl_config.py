@@ -28,7 +28,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the mean policy.
 
     Args:
-        env: The environment. Its observation groups are the inputs of the networks.
+        env: The environment of the networks' inputs.
         config: Hyperparameters; by default ``PPOConfig()``.
 
     Returns:

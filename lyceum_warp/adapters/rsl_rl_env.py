@@ -32,7 +32,6 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ValueError: An argument is invalid.
         ImportError: rsl_rl is missing or not supported (on importing this module).
     """
 

@@ -42,7 +42,6 @@ class StableBaselines3VecEnv(VecEnv):
         **words: Options and parameters for ``lw.make``.
 
     Raises:
-        ValueError: An argument is unknown or invalid.
         FileNotFoundError: The package with the task's model is not installed.
     """
 

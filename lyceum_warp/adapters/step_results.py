@@ -16,7 +16,7 @@ class Observations:
     """Returns observations in an adapter's format: the group ``policy``, or a dict of all groups.
 
     Args:
-        dict_obs: Whether to return a dict of all groups. By default, True if the task has several groups.
+        dict_obs: Whether to return a dict of all groups.
     """
 
     def __init__(self, env: Env, *, dict_obs: bool | None) -> None:
@@ -60,8 +60,7 @@ class HostArrays:
     """Transfers actions and results between NumPy arrays and an environment's buffers.
 
     Args:
-        copy: Whether to copy results. Without copies, results on the CPU are live buffers, which the next step
-            overwrites.
+        copy: Whether to copy results. Otherwise results on the CPU are live buffers.
         one_world: Whether actions have the shape (nact,) instead of (nworld, nact).
     """
 
@@ -84,7 +83,7 @@ class HostArrays:
             self._env.action.copy_(self._pinned, non_blocking=True)
 
     def of(self, *tensors: torch.Tensor) -> list[np.ndarray]:
-        """Convert tensors to NumPy arrays. This waits for the device at most once."""
+        """Convert tensors to NumPy arrays, waiting for the device at most once."""
         if self._pinned is None:
             return [tensor.numpy().copy() if self._copy else tensor.numpy() for tensor in tensors]
         copies = [tensor.to("cpu", non_blocking=True) for tensor in tensors]
@@ -93,11 +92,7 @@ class HostArrays:
 
 
 class Infos:
-    """Collects the infos of a step in a dict.
-
-    A task with a goal adds ``success``. A task with metrics adds ``metrics``, and their sums over the episode as
-    ``episode_metrics``.
-    """
+    """Collects the infos of a step in a dict."""
 
     def __init__(self, env: Env) -> None:
         self._plain = {"eval": env.eval, "done_reason": env.done_reason}

@@ -50,7 +50,7 @@ class CheckedController:
             reset(seed)
 
     def quality(self) -> tuple[float, float]:
-        """Get the last plan's number of failed samples and its effective sample size. Unknown values are NaN."""
+        """Get the last plan's number of failed samples and effective sample size, or NaN if unknown."""
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
@@ -70,7 +70,7 @@ class CheckedController:
         """Select the action for the time ``plant_steps`` after the plan's initial state.
 
         An action is held until the controller's next step, or interpolated towards the next action if the controller
-        has ``between="linear"``. After the end of the plan, its last action is held.
+        has ``between="linear"``.
         """
         index, rest = self.steps(plant_steps), plant_steps * self._plan_steps % self._plant_steps
         if rest and self._linear and index < len(plan) - 1:

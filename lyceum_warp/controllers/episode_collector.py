@@ -68,11 +68,7 @@ def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: 
 def begin_episode(
     env: Env, controller: CheckedController, steps: int | None, seed: int | None, *, reset: bool
 ) -> tuple[int, int]:
-    """Reset the plant and the controller, unless ``reset`` is False.
-
-    Returns:
-        Return the maximum number of steps, and the number of steps since the reset if the run is continued.
-    """
+    """Reset the plant and the controller, unless ``reset`` is False."""
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
             "a control loop needs one world without automatic resets, not "
@@ -94,10 +90,7 @@ def begin_episode(
 
 
 class EpisodeCollector:
-    """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory``.
-
-    A loop calls ``before_step``, steps the plant, and calls ``after_step``.
-    """
+    """Collects the states, actions, outcomes and plans of an episode, and makes a ``Trajectory``."""
 
     def __init__(
         self, env: Env, controller: CheckedController, *, mode: str, period: float, seed: int | None,

@@ -70,9 +70,6 @@ def choose_setting(
     """Choose the largest number of samples for which planning meets a deadline.
 
     If even the smallest number of samples is too slow, try shorter horizons, and then other physics options.
-
-    Returns:
-        The largest setting that meets the deadline, or else the fastest one.
     """
     budget, missed = SHARE * deadline, []
     for name in physics:
@@ -98,7 +95,7 @@ def choose_setting(
 
 
 def planning_time(plant: Env, planner: Controller) -> float:
-    """Measure a planner in real time for about half a second. Restore the plant's state.
+    """Measure a planner in real time for about half a second, and restore the plant's state.
 
     Returns:
         The 99 % quantile of the planning times, in seconds.

@@ -41,9 +41,9 @@ def episode_env(
     The environment has the first episode's parameters, model and physics options. ``env.set_state`` accepts the states
     of all episodes.
 
-    An episode's file names the file of its task, and making the environment runs that file as Python code. An episode
-    from another person could thus run foreign code. Without ``task``, a task file therefore runs only if no other user
-    can write to the file or its folder. Both must belong to this user or to root.
+    An episode's file names the file of its task, and making the environment runs that file as Python code. Without
+    ``task``, a task file therefore runs only if this user or root owns the file and its folder, and no other user can
+    write to them.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
@@ -159,7 +159,7 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether a group has only root or this user. Many systems make a group for each user."""
+    """Return whether a group has only root or this user."""
     import grp
     import pwd
 

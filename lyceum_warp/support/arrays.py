@@ -18,7 +18,7 @@ _SPARE = 256
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
-    """View an array's memory with a different type, shape or strides. The view keeps the memory alive."""
+    """View an array's memory with a different type, shape or strides, and keep the memory alive."""
     view: Any = wp.array(ptr=array.ptr, dtype=dtype, shape=shape, strides=strides, device=array.device)
     view.owner = array
     return view
@@ -78,7 +78,7 @@ def _block(device: wp.Device | None) -> int:
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
-    """Launch a kernel with one thread per world. Its last argument becomes the index of the first world."""
+    """Launch a kernel with one thread per world. Its last argument is the first world's index."""
     _launch(kernel, (nworld,), 0, args, device, block_dim=_block(device))
 
 
@@ -90,18 +90,15 @@ def launch_parts(kernel: wp.Kernel, parts: int, nworld: int, args: Sequence[Any]
 def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device) -> None:
     """Launch a kernel over (nworld, lanes).
 
-    Its last arguments become the number of lanes and the index of the first world. Lanes are threads that share the
-    work on a world: one on the CPU, and a warp on a GPU for coalesced memory access.
+    Its last arguments are the number of lanes and the first world's index. Lanes are threads that share the work on a
+    world: one on the CPU, and a warp on a GPU for coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
-    """Launch a copying kernel of ``kernels.state`` over the selected rows of the target, (nworld, n).
-
-    Its last arguments become the number of threads per row and the first row.
-    """
+    """Launch a copying kernel of ``kernels.state`` over the selected rows of the target, (nworld, n)."""
     if target.size == 0:
         return
     lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
@@ -115,7 +112,7 @@ PAIRS_A_LAUNCH = 4
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Copy the selected rows of several arrays with ``narrow_four`` or ``widen_four`` of ``kernels.state``.
 
-    On the CPU, a launch takes longer than a few copies, so one launch copies four arrays.
+    One launch copies four arrays, because a launch on the CPU takes longer than a few copies.
     """
     pairs = [pair for pair in pairs if pair[1].size]
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):

@@ -13,8 +13,7 @@ from typing import Any
 def replaced(path: Path, *, durable: bool = False, previous: Path | None = None) -> Iterator[Path]:
     """Replace a file atomically: a reader finds either the old file or the complete new file.
 
-    Write to the yielded path, a temporary file beside the target. If the body of the ``with`` statement raises an
-    error, the target stays unchanged.
+    Write to the yielded path, a temporary file beside the target.
 
     Args:
         path: The file.

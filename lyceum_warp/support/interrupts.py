@@ -36,11 +36,10 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
     Args:
         handler: The handler of the signals; by default it raises Interrupted.
-        replaces: Replace only this handler. By default, replace all handlers except those that ignore a signal. Shells
-            let background programs ignore SIGINT, and nohup lets programs ignore SIGHUP.
+        replaces: Replace only this handler. By default, replace all handlers except those that ignore a signal.
 
     Yields:
-        The replaced handlers, by signal. They are restored afterwards.
+        The replaced handlers by signal, which are restored afterwards.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set signal handlers
@@ -56,10 +55,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted although ``signals`` has already raised it.
-
-    The user can then cancel long work at the end of a program.
-    """
+    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted although ``signals`` has already raised it."""
     return signals(replaces=_ignore)
 
 
@@ -81,10 +77,6 @@ def postponed(*, insist: bool = False) -> Iterator[list[int]]:
 
     Args:
         insist: Whether a second signal is handled at once.
-
-    Raises:
-        Interrupted: A signal arrived, and ``signals`` handles it.
-        SystemExit: A signal arrived, and the program has no handler for it.
     """
     noted: list[int] = []
 

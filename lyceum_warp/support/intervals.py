@@ -15,7 +15,7 @@ def student_quantile(probability: float, freedom: float) -> float:
     """Compute a quantile of Student's t distribution by bisection on the integral of its density.
 
     Args:
-        probability: At least 0.5.
+        probability: A number of at least 0.5.
         freedom: The number of degrees of freedom.
     """
     log_factor = math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2) - 0.5 * math.log(freedom * math.pi)

@@ -1,10 +1,10 @@
 """HerbReach: move the hands of two 7-joint Barrett arms to targets in space (HERB in the Lyceum paper).
 
 The paper's model is not published, so this model uses published data of the robot (see herb.xml). An action is a
-fraction of each motor's peak torque, fingers included. The motors add it to gravity compensation. The targets are mocap
-bodies, because they are part of the state. They are drawn from two boxes within reach, in front of the shoulders.
-Episodes start near HERB's home position. Success: both palms have been within 5 cm of their targets for ten consecutive
-steps, 0.2 s. If two boxes of the arms touch, MuJoCo Warp finds fewer contact points than MuJoCo.
+fraction of each motor's peak torque, fingers included. The motors add it to gravity compensation. The targets are drawn
+from two boxes within reach, in front of the shoulders. Episodes start near HERB's home position. Success: both palms
+have been within 5 cm of their targets for ten consecutive steps, 0.2 s. If two boxes of the arms touch, MuJoCo Warp
+finds fewer contact points than MuJoCo.
 """
 
 import warp as wp

@@ -1,8 +1,7 @@
 """Reach: move the hand of a 7-joint arm to a target in space (the arm that the Lyceum paper calls Sawyer).
 
-The model has no gravity. The target is a mocap body, because it is part of the state. Success: the hand's mean distance
-from the target over the last ten steps is below 5 cm. With ``random_start``, one episode in five begins with the palm
-inside the table, and contact forces push it out.
+The model has no gravity. Success: the hand's mean distance from the target over the last ten steps is below 5 cm. With
+``random_start``, one episode in five begins with the palm inside the table, and contact forces push it out.
 """
 
 import warp as wp

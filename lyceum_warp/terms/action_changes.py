@@ -1,7 +1,6 @@
 """Compute reward terms for the change of actions between steps.
 
-A task's ``advance`` stores earlier actions in memory, so that terms and observations can read earlier actions from
-``s1``::
+A task's ``advance`` stores earlier actions in memory, which terms and observations read from ``s1``::
 
     lw.put(s1.earlier_action, 0, s0.previous_action)
     lw.put(s1.previous_action, 0, s0.last_action)

@@ -1,9 +1,8 @@
 """Measure how long feet are in contact, and compute reward terms for swings, slips and landings.
 
 The tables ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts`` (sensors) must list the feet in
-the same order. Rows of memory with one element per foot have this order, too. Call ``run_clocks`` in ``substep``, and
-``follow_swing`` in ``advance``. Heights are measured from the plane z = 0. On uneven ground, a task must measure the
-heights itself and sum ``clearance`` over the feet.
+the same order. Call ``run_clocks`` in ``substep``, and ``follow_swing`` in ``advance``. Heights are measured from the
+plane z = 0. On uneven ground, a task must measure the heights itself and sum ``clearance`` over the feet.
 """
 
 import warp as wp

@@ -1,7 +1,6 @@
 """Store the last values of a row in a ring buffer, for observation histories and delays.
 
-To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``. The row
-holds a counter and the ring buffer. The history is empty at the start of an episode, because memory is 0.
+To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``.
 """
 
 import warp as wp

@@ -1,7 +1,6 @@
 """Compute reward terms for a robot's joints: pose, limits, velocities, accelerations, torques and power.
 
-All tables list the joints in the same order: ``joints``, ``joint_qpos``, ``joint_dof``, the default pose and the
-standard deviations.
+All tables list the joints in the same order.
 """
 
 import warp as wp

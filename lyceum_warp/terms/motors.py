@@ -1,6 +1,6 @@
 """Compute torques of servos and of DC motors.
 
-``control`` runs once per step, so torques are constant over a step's substeps.
+Torques are constant over a step's substeps, because ``control`` runs once per step.
 """
 
 import warp as wp

@@ -8,8 +8,7 @@ A command is stored in several rows of memory, and a separate function fills eac
     terms.draw_flag(s.standing, p.standing_share, rng)
     terms.draw_forward_only(s.drawn_velocity, p.forward_share, p.least_forward_velocity, rng)
 
-The order of the calls follows ``UniformVelocityCommand`` of mjlab 1.6.0. ``velocity_command`` computes the command from
-these rows.
+The order of the calls follows ``UniformVelocityCommand`` of mjlab 1.6.0.
 """
 
 import warp as wp

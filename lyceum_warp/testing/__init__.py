@@ -1,7 +1,6 @@
 """Check that a task's environment follows the package's rules, on any engine.
 
-Each check tests one rule, and leaves the environments usable for the next check. The AssertionError of a check names
-the task, the engine, the rule, the values, the seed and a world's state.
+The AssertionError of a check names the task, the engine, the rule, the values, the seed and a world's state.
 """
 
 import dataclasses
@@ -86,7 +85,6 @@ def check_task(
 
     Raises:
         AssertionError: The task breaks rules, which the message lists.
-        ValueError: ``nworld`` is less than 2, ``steps`` is less than 1, or an option is not valid.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))

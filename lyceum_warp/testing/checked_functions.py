@@ -1,7 +1,7 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-A copy checks each index into a row, vector or matrix, and counts the iterations of each ``while`` loop. Otherwise it
-computes the same numbers as the original. Native functions (``wp.func_native``) are C++ and cannot be checked.
+A copy also counts the iterations of each ``while`` loop, and otherwise computes the same numbers. Native functions
+(``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
@@ -53,9 +53,7 @@ class Unchecked(Exception):  # noqa: N818
 class CheckedFunctions:
     """Makes checked copies of functions, and a kernel for each copy.
 
-    A kernel takes the report, and the values of each argument in all worlds. A World has a ``Batch``, Params have an
-    array (nworld,) or (1,), and a row has an array (nworld, size). The report, (places, 3) int32, has a row for each
-    index in the source. A row has the number of errors, the first wrong index, and the size of the array.
+    The report, (places, 3) int32, has a row for each index in the source: number of errors, first wrong index, size.
     """
 
     def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:
@@ -285,11 +283,7 @@ _made: dict[Any, CheckedFunctions] = {}
 def checked_functions(
     name: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function], device: wp.Device
 ) -> CheckedFunctions:
-    """Get checked copies of a task's functions, compiled for a device. Equal functions share copies.
-
-    ``name`` is the Warp module of the copies. ``views`` maps types of arguments to functions that read one world's
-    value.
-    """
+    """Get checked copies of a task's functions, compiled for a device."""
     key = (*views.values(), *functions.items())
     if key not in _made:
         module = sources.free_module_name(f"lyceum_warp.checked.{name}")

@@ -69,7 +69,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Draw random actions, (steps, nworld, nact). A missing bound is -1 or 1."""
+        """Draw random actions, (steps, nworld, nact), from -1 to 1 without bounds."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
@@ -79,7 +79,7 @@ class Context:
         return (low + draws * (high - low)).to(env.action)
 
     def mask(self, *worlds: int) -> torch.Tensor:
-        """Return a mask of the given worlds, (nworld,) bool. By default, it has every second world."""
+        """Return a mask of the given worlds, by default every second world, (nworld,) bool."""
         numbers = torch.arange(self.a.nworld)
         mask = torch.isin(numbers, torch.tensor(worlds)) if worlds else numbers % 2 == 0
         return mask.to(self.a.action.device)

@@ -25,9 +25,6 @@ def check_truncation(ctx: Context) -> None:
     """An episode is truncated at the horizon.
 
     ``final_obs`` is then its last observation, and ``obs`` the first observation of the next episode.
-
-    Truncation does not set ``terminated``. In worlds that continue, both are equal. This holds for every group of
-    observations.
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):

@@ -93,10 +93,7 @@ def check_bad_warmstart(ctx: Context) -> None:
 
 
 def check_not_finite(ctx: Context) -> None:
-    """A reward or an observation that is not finite is a fault of its world, and changes no other world.
-
-    The check makes each of the task's parameters infinite in one world.
-    """
+    """A reward or an observation that is not finite is a fault of its world, and changes no other world."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]

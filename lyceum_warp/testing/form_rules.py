@@ -89,8 +89,6 @@ def check_success_steps(ctx: Context) -> None:
     """``success`` requires ``success_steps`` successes in a row.
 
     The current number is part of the state, and a reset clears it.
-
-    The check sets this number to its maximum and reads ``success``, to find out whether a state meets the goal.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:
@@ -126,7 +124,7 @@ def check_success_steps(ctx: Context) -> None:
 def check_events(ctx: Context) -> None:
     """An event runs after a step's reward and termination, and changes the state and the next observation.
 
-    It does not run in worlds that restart. Worlds without an event do not change.
+    It does not run in worlds that restart, and changes no other world.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:

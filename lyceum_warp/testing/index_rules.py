@@ -25,8 +25,7 @@ _MOST_LISTED = 8
 def check_bounds(ctx: Context) -> None:
     """No function of the task reads or writes out of range in a row, a vector or a matrix.
 
-    Warp counts negative indices from the end, but only constants such as ``-1`` are allowed. The check runs
-    instrumented copies of the functions on the states of random steps.
+    Warp counts negative indices from the end, but only constants such as ``-1`` are allowed.
     """
     run = _Run(ctx)
     with ctx.changed(ctx.a, autoreset=False):
@@ -87,10 +86,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run a step's functions on the state in which a fault ended the episode.
-
-        The fault may come from a read out of range that returned NaN.
-        """
+        """Run a step's functions on the state of a fault, which a read out of range (NaN) may have caused."""
         env = self.ctx.b
         env.set_state(state)
         env.action.copy_(action)

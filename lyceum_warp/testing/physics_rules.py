@@ -1,6 +1,6 @@
 """Check that a world's inputs, such as applied forces, and its own model fields affect its physics.
 
-The reference is ``mj_step``. The engine must come closer to it than ``mj_step`` without these inputs and fields.
+The engine must come closer to ``mj_step`` than ``mj_step`` without these inputs and fields.
 """
 
 import copy
@@ -110,8 +110,7 @@ def check_inputs(ctx: Context) -> None:
 def check_dynamics(ctx: Context) -> None:
     """A world's model fields are part of its state and affect its physics.
 
-    Random changes do not accumulate over resets. ``reset`` restores nominal values, except for fields that are
-    randomized once per world.
+    Random changes do not accumulate over resets.
     """
     a, b = ctx.a, ctx.b
     varied = [field.name for field in a.task.dynamics]

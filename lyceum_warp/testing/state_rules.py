@@ -150,8 +150,7 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    Some columns survive a reset, and other columns may depend on them. The check therefore makes these columns equal in
-    all worlds first.
+    The columns that survive a reset are first made equal in all worlds, because others may depend on them.
     """
     env = ctx.a
     lasting = _lasting_columns(env)

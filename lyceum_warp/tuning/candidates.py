@@ -71,7 +71,7 @@ def not_tried(env: Env) -> list[str]:
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """Combine settings. Earlier settings have priority. None if the result is one of the settings.
+    """Combine settings, or return None if the result is one of them.
 
     A setting is left out if an earlier one has the same group or sets the same option.
     """

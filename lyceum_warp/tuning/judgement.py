@@ -43,10 +43,7 @@ class Difference:
 
 
 def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
-    """Compare returns of the same episodes, each (episodes,).
-
-    The difference is infinite if all returns of the unchanged task are 0.
-    """
+    """Compare returns of the same episodes, each (episodes,)."""
     change, scale = returns - reference, float(np.abs(reference).mean())
     if not change.any():
         return Difference(0.0, 0.0, 0.0, len(change))
@@ -74,7 +71,7 @@ class Correlation:
 def episodes_needed(found: Difference, half_width: float) -> int:
     """Estimate how many episodes give an interval of a given half-width.
 
-    The estimate uses only the spread of the returns, so it does not depend on their mean (Stein's two-stage procedure).
+    It uses only the spread of the returns, and thus does not depend on the result (Stein's two-stage procedure).
     """
     now = (found.high - found.low) / 2
     return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))

@@ -25,9 +25,9 @@ _IMPROVEMENTS = 2
 class Rankings:
     """Compares a planner's physics options with the plant's options.
 
-    From each state, both planners draw the same samples around the same plan. A planner uses only the order and the
-    differences of returns. The rank correlation of the returns thus says whether coarser physics is good enough. There
-    are three kinds of states:
+    From each state, both planners draw the same samples around the same plan. Their rank correlation says whether
+    coarser physics is good enough, because a planner uses only the order and the differences of returns. There are
+    three kinds of states:
 
     - standing: after a random reset;
     - moving: after 30 steps under a planner with the plant's physics that replans every 6 steps;
@@ -115,10 +115,7 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, without rows of equal numbers.
-
-    Equal numbers get the mean of their ranks.
-    """
+    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, without rows of equal numbers."""
     a, b = (_ranks(values.double()) for values in (first, second))
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     spread = a.square().sum(1) * b.square().sum(1)

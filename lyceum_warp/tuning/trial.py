@@ -23,7 +23,7 @@ DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
 """Standard deviation of a perturbation of positions and velocities, which shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the confidence interval of the difference. It determines the number of episodes."""
+"""Target half-width of the difference's confidence interval, for the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -71,10 +71,7 @@ class Trials:
     # recorded states and actions
 
     def _record(self) -> None:
-        """Record states, and 50 actions after each.
-
-        Half of the worlds follow the policy, and the others act at random.
-        """
+        """Record states in worlds of which half follow the policy and the others act at random."""
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
@@ -164,8 +161,8 @@ class Trials:
     def _speed(self, env: Env) -> tuple[float, float, float]:
         """Measure steps per second of all worlds, and the speed-up's median and lower bound.
 
-        Other processes may slow down some blocks. The lower bound is therefore the smaller of two numbers: the blocks'
-        lower quartile, and the speed-up between the fastest blocks.
+        As other processes may slow down blocks, the lower bound is the smaller of two numbers: the blocks' lower
+        quartile, and the speed-up between the fastest blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
@@ -205,7 +202,7 @@ class Trials:
     def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
         """Compare returns, and count faults and steps on both sides.
 
-        The spread in the first batch of episodes determines the number of batches, within the time limit.
+        The spread in the first batch determines the number of batches.
         """
         pairs: list[np.ndarray] = []
         faults, steps = np.zeros(2), np.zeros(2)
@@ -228,9 +225,9 @@ class Trials:
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
-        """Compute the returns of one episode per world (nworld,), and the numbers of faults and steps.
+        """Run one episode per world, and return returns (nworld,), faults and steps.
 
-        Episodes of the same batch have the same initial states, random streams and random actions.
+        Equal batches have equal initial states, random streams and random actions.
         """
         seed = self.seed + 1 + batch
         self.reference.rand_reset(seed)
@@ -252,7 +249,7 @@ class Trials:
 
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
-    """Yield batches of uniform random actions, (nworld, nact). Actions without bounds lie between -1 and 1."""
+    """Yield uniform random actions, (nworld, nact), from -1 to 1 without bounds."""
     device, low, high = env.obs.device, env.action_space.low, env.action_space.high
     assert low is not None and high is not None
     generator = torch.Generator(device).manual_seed(seed)

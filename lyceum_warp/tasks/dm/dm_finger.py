@@ -1,7 +1,4 @@
-"""FingerSpin: a finger with two joints spins a body.
-
-The target of the turning tasks is a mocap body, because its position is part of the state.
-"""
+"""FingerSpin: a finger with two joints spins a body."""
 
 import mujoco
 import warp as wp

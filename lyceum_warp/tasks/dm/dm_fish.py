@@ -99,10 +99,7 @@ def randomize_swim(s: SwimWorld, p: SwimParams, rng: Row[wp.uint32]):
 
 @lw.register
 class FishSwim(FishUpright):
-    """A fish swims to a target.
-
-    The target is a mocap body, because its position is part of the state.
-    """
+    """A fish swims to a target."""
 
     World, Params = SwimWorld, SwimParams
     observe, reward, randomize = observe_swim, reward_swim, randomize_swim

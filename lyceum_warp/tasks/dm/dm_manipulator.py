@@ -1,7 +1,4 @@
-"""ManipulatorBringBall: a planar arm with a hand brings a ball to a target.
-
-The target is a mocap body, because its pose is part of the state.
-"""
+"""ManipulatorBringBall: a planar arm with a hand brings a ball to a target."""
 
 import mujoco
 import warp as wp

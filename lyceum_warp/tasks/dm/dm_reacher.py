@@ -1,7 +1,4 @@
-"""ReacherEasy: touch a large target with the finger of a planar arm.
-
-The target is a mocap body, because its position is part of the state.
-"""
+"""ReacherEasy: touch a large target with the finger of a planar arm."""
 
 import mujoco
 import warp as wp

@@ -1,7 +1,4 @@
-"""SwimmerSwimmer6: a chain of six links swims to a target.
-
-The target is a mocap body, because its position is part of the state.
-"""
+"""SwimmerSwimmer6: a chain of six links swims to a target."""
 
 import mujoco
 import warp as wp

@@ -17,7 +17,7 @@ def model(domain: str) -> lw.ModelFile:
 
 
 def free_target(spec: mujoco.MjSpec) -> None:
-    """Move the geom or site "target" into a mocap body "target", so that each world has its own."""
+    """Move the geom or site "target" into a mocap body, so that its position is part of the state."""
     fixed = spec.geom("target") or spec.site("target")
     target = spec.worldbody.add_body(name="target", mocap=True, pos=fixed.pos)
     looks = {"name": "target", "type": fixed.type, "size": fixed.size.copy(), "material": fixed.material}
