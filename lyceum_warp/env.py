@@ -123,10 +123,9 @@ class Env:
     timestep: float
     """Simulated duration of a step, in seconds."""
     device: wp.Device
-    """The Warp device. ``obs.device`` is the same device in torch."""
+    """The Warp device."""
     options: EnvOptions
-    """The options of the environment. ``options.physics`` has the physics options themselves, even if they were given
-    by name."""
+    """The options of the environment."""
     task: BoundTask
     """The task with its model, its parameters (``task.params``) and its kernels."""
     engine: Engine
@@ -136,7 +135,7 @@ class Env:
     obs_space: Space
     """Parts of an observation and their columns."""
     obs_spaces: dict[str, Space]
-    """Spaces of all groups of observations. The space of ``policy`` is ``obs_space``."""
+    """Spaces of all groups of observations."""
     action_space: Space
     """Names, columns and bounds of actions."""
     state_space: Space
@@ -479,8 +478,8 @@ class Env:
     def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
         """Update ``shared`` with the task's ``share``, which reads sums over the transitions since the last update.
 
-        Observations that depend on ``shared`` are updated, too. Learners call this method after each rollout. It does
-        not wait for the device.
+        Observations that depend on ``shared`` are updated. Learners call this method after each rollout. It does not
+        wait for the device.
 
         Args:
             total: Function that sums an int64 tensor over several processes in place, such as ``Team.sum``. All

@@ -1,7 +1,7 @@
 """Register all tasks with Gymnasium: ``gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=64)``.
 
-Importing this module registers each task under its class name, such as ``lyceum/HalfCheetah-v0``. A task's file is
-loaded when an environment is made. ``register`` adds a task of your own.
+Importing this module registers each task under its class name, such as ``lyceum/HalfCheetah-v0``. ``register`` adds a
+task of your own.
 """
 
 import re

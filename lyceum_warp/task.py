@@ -411,7 +411,8 @@ class Task:
     are also ``lw.bodies``, ``lw.geoms``, ``lw.joints``, ``lw.qposes``, ``lw.dofs``, ``lw.actuators`` and
     ``lw.sensors``. ``lw.from_model`` computes a default from the compiled model.
 
-    Functions: {functions}
+    Functions:
+    {functions}
 
     The argument ``s`` has one world's fields in the current state, ``s0`` before the step, and ``s1`` after the step.
     Fields of the position and velocity stages belong to this state. Fields of the acceleration stage (forces,
