@@ -5,11 +5,10 @@
     lyceum-warp bench compare ../before ../after --short --ignore '*/metrics.csv/new_column'
 
 OLD and NEW are git revisions or folders with a checkout; NEW is this working tree by default. Each checkout runs in a
-subprocess, with the same Python and packages, and both compute the same units of work side by side. A unit is one part
-of the comparison for one task on one engine.
+subprocess with the same packages, and uses only public names (probes/checkout.py). OLD runs again in every comparison,
+because its numbers depend on the processor.
 
-OLD runs again in every comparison, because its numbers depend on the processor. The program uses only public names of
-the package (probes/checkout.py). Exit code: 0 without differences, 1 with differences, 2 for bad input.
+Exit code: 0 without differences, 1 with differences, 2 for bad input.
 """
 
 import contextlib
@@ -38,9 +37,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages that both checkouts use; --out stores the versions of these packages."""
+"""Packages whose versions --out stores."""
 LINES = 12
-"""Maximum number of differences that are printed per unit; --out writes all of them."""
+"""Maximum number of printed differences per unit."""
 
 Part = Literal["env", "plans", "learners", "commands"]
 PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
@@ -48,13 +47,12 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""Tasks on which all planners are compared; on other tasks, only MPPI is compared."""
+"""On other tasks, only MPPI is compared."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
 SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
-"""Tasks of --short: one without contacts, one with a mocap body, one whose episodes end early, and one with all other
-features."""
+"""One task without contacts, one with a mocap body, one whose episodes end early, and one with all other features."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +95,6 @@ class Unit:
     task: str
     engine: str
     more: Mapping[str, Any]
-    """Additional arguments of the part."""
     variant: str = ""
 
     @property
@@ -107,23 +104,19 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """A difference between the old and the new array with the same name, or a failure of a checkout."""
+    """A difference between two arrays of the same name, or a failure of a checkout."""
 
     name: str
     kind: Literal["numbers", "form", "added", "removed", "failure"]
     text: str
-    """A description in one line."""
     first: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Index of the first different element: a dict from the name of each axis to the index along it."""
+    """Index of the first different element, by the names of the axes."""
     old: str = ""
-    """The old value at the index ``first``."""
     new: str = ""
     largest: float | None = None
     """The largest absolute difference; None if it is not finite."""
     count: int = 0
-    """Number of different elements."""
     size: int = 0
-    """Number of elements."""
 
 
 # arrays
@@ -136,20 +129,12 @@ def digest(array: np.ndarray) -> str:
 
 
 def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Return a flat mask of the elements that differ in any bit between two arrays of equal type and shape."""
+    """Return a flat mask of the elements that differ in any bit."""
     rows = [np.ascontiguousarray(a).reshape(-1).view(np.uint8).reshape(a.size, a.itemsize) for a in (old, new)]
     return (rows[0] != rows[1]).any(axis=1)
 
 
 def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
-    """Return the difference between two arrays, or None if they are bitwise equal.
-
-    Args:
-        name: Their name.
-        old: An array of numbers or strings.
-        new: The array to compare with it.
-        axes: Names of the leading axes.
-    """
     if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string dtypes contain a length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
@@ -176,7 +161,7 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
 def differences(
     unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
 ) -> Iterator[Difference]:
-    """Yield the differences between a unit's old and new arrays, in the order in which they were computed."""
+    """Yield the differences in the order in which the arrays were computed."""
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
         whole = f"{unit}/{name}"
@@ -189,7 +174,6 @@ def differences(
 
 
 def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """Return the arrays whose names begin with a prefix; the returned names omit it."""
     return {name.removeprefix(f"{prefix}/"): array for name, array in arrays.items() if name.startswith(f"{prefix}/")}
 
 
@@ -198,15 +182,7 @@ def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray
 
 @contextlib.contextmanager
 def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
-    """Provide the folder of a checkout and a text that describes it.
-
-    Args:
-        given: A folder with a checkout, or a git revision. A revision is unpacked.
-        folder: An empty folder for the checkout.
-
-    Raises:
-        ValueError: ``given`` is neither a folder with a checkout nor a revision.
-    """
+    """Yield the folder of a checkout and a description; unpack a git revision into the empty ``folder``."""
     if Path(given, PACKAGE, "__init__.py").is_file():
         yield Path(given).resolve(), str(Path(given).resolve())
         return
@@ -224,13 +200,7 @@ def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
 
 
 class Side:
-    """The subprocess of a checkout. The process starts with the first request, and restarts if it has died.
-
-    Args:
-        name: "old" or "new".
-        root: The checkout.
-        folder: An empty folder for the files of the subprocess.
-    """
+    """The subprocess of a checkout, which restarts if it has died."""
 
     def __init__(self, name: str, root: Path, folder: Path) -> None:
         self.name, self.root, self.folder = name, root, folder
@@ -242,15 +212,14 @@ class Side:
         # Warp's compiler leaves temporary files here if the process is killed
         own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
-            # Python's flag -P keeps bench/ off sys.path, because modules in bench/ could shadow other modules. A
-            # separate process group can be killed as a whole
+            # -P keeps bench/ off sys.path, where its modules could shadow others
             self._process = subprocess.Popen(
                 [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | own, text=True,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
             )  # fmt: skip
 
     def contents(self) -> dict[str, Any]:
-        """Start the checkout's process; return its tasks and learners, or a failure."""
+        """Return the checkout's tasks and learners, or a failure."""
         found = self.answer()
         if "file" in found and not Path(found["file"]).is_relative_to(self.root):
             text = f"imports {found['file']} instead of {self.root}"
@@ -267,7 +236,6 @@ class Side:
             print(json.dumps(unit), file=self._process.stdin, flush=True)
 
     def answer(self) -> dict[str, Any]:
-        """Return the answer of the process, or a failure if the process ended."""
         assert self._process is not None and self._process.stdout is not None
         if line := self._process.stdout.readline():
             return json.loads(line)
@@ -277,14 +245,12 @@ class Side:
         return {"failure": {"text": f"the process ended with {code}", "trace": trace, "missing": False}}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays of the last compared unit of work."""
         if not self._file.exists():
             return {}
         with np.load(self._file) as file:
             return dict(file)
 
     def close(self) -> None:
-        """Kill the process and its children."""
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
@@ -296,13 +262,6 @@ class Side:
 
 
 def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> Iterator[Unit]:
-    """Yield the units of work in the order of the comparison.
-
-    Args:
-        options: The options.
-        tasks: The tasks that both checkouts have.
-        learners: The learners that both checkouts have.
-    """
     given = set(options.tasks)
 
     def chosen(default: Sequence[str]) -> list[str]:
@@ -334,20 +293,16 @@ def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> It
 
 @dataclasses.dataclass
 class Report:
-    """The results of a comparison."""
-
     ignore: Sequence[str]
     units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
     skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Maps the name of each skipped unit to the message about its missing model."""
+    """Messages about missing models, by the name of the unit."""
     arrays: int = 0
-    """Number of compared arrays."""
     ignored: int = 0
-    """Number of arrays that --ignore excluded."""
 
     def kept(self, name: str) -> bool:
-        """Return whether a name is compared; count the names that --ignore excludes."""
+        """Return whether a name is compared, and count excluded names."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False
@@ -356,7 +311,7 @@ class Report:
     def add(
         self, name: str, found: Sequence[Difference], seconds: float = 0.0, digests: Mapping[str, Any] | None = None
     ) -> None:
-        """Add and print the differences of a unit; ``digests`` holds two digests of each array, old and new."""
+        """Add and print the differences of a unit, given the old and the new digest of each array."""
         digests = digests or {}
         self.found += found
         self.arrays += len(digests)
@@ -373,8 +328,7 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """Return a unit's failures; each message names the checkout. A failure of both checkouts is also listed, because
-    nothing was compared."""
+    """Return a unit's failures. A failure of both checkouts counts, too, because nothing was compared."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
@@ -382,7 +336,6 @@ def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Differ
 
 
 def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report) -> None:
-    """Let both checkouts compute a unit, and add the differences to the report."""
     began = time.perf_counter()
     request = {"part": unit.part, "task": unit.task, "engine": unit.engine, "device": device, **unit.more}
     for side in sides:
@@ -397,7 +350,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
     found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # arrays that are missing after a failure are not counted as additional differences
+    if found:  # arrays that are missing after a failure are not additional differences
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
     for side, arrays in (("old", old), ("new", new)):
@@ -410,11 +363,6 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
 
 
 def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
-    """Compare two checkouts.
-
-    Raises:
-        ValueError: A task exists in neither checkout.
-    """
     for side in sides:
         side.start()
     contents = {side.name: side.contents() for side in sides}
@@ -443,7 +391,6 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 
 
 def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    """Return the content of the file that --out writes."""
     return {
         "checkouts": checkouts,
         "options": dataclasses.asdict(options) | {"out": str(options.out)},
@@ -458,11 +405,6 @@ def written(report: Report, options: Options, checkouts: Mapping[str, str], seco
 
 
 def run(options: Options) -> int:
-    """Compare, print a report, and return the exit code.
-
-    Raises:
-        ValueError: An option is invalid.
-    """
     if options.steps < 1 or options.iterations < 2:
         raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can be interrupted")
     if options.out is not None and not options.out.resolve().parent.is_dir():
@@ -494,7 +436,7 @@ def run(options: Options) -> int:
 
 
 def main(options: Options) -> int:
-    """Run the program; the exit code is 1 if there are differences, 2 for bad input, and 130 or 143 after a signal."""
+    """Run the program; return 1 if there are differences, 2 for bad input, and 130 or 143 after a signal."""
     for number in (signal.SIGTERM, signal.SIGHUP):  # SIGTERM raises SystemExit, so temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:

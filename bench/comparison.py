@@ -6,16 +6,15 @@ import math
 import numpy as np
 
 MOST_SPLITS = 20_000
-"""Maximum number of splits of the seeds in the permutation test; if there are more, a random subset is used."""
+"""If there are more splits of the seeds, the test uses a random subset."""
 
 
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Test at every point whether the curves a and b have the same distribution; p-values are adjusted for all points.
+    """Test at every point whether the curves a and b have the same distribution.
 
     The test permutes whole curves, and compares each point's Welch statistic with the largest statistic over all points
-    (Westfall and Young 1993, single step). The probability of a false positive at any point is therefore at most the
-    level, however the points depend on one another. With few curves, the p-values cannot be small: five against five
-    curves can be split in only 252 ways.
+    (Westfall and Young 1993, single step). With few curves, the p-values cannot be small: ten curves can be split in
+    only 252 ways.
 
     Args:
         a: Curves, (curves, points).
@@ -43,6 +42,5 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _welch(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the absolute Welch statistics of all points, (points,)."""
     spread = a.var(axis=0, ddof=1) / len(a) + b.var(axis=0, ddof=1) / len(b)
     return np.abs(a.mean(axis=0) - b.mean(axis=0)) / np.sqrt(np.maximum(spread, 1e-300))

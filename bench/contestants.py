@@ -1,8 +1,7 @@
 """Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
-A sample is one environment step; the caller must have received its observation and reward. All contestants use the same
-model, substeps and bounds of uniformly random actions. Worlds start from random initial states, step a few times before
-the clock starts, and restart when an episode ends. Each contestant runs with its best number of worlds per thread.
+A sample is one environment step whose observation and reward the caller has received. All contestants use the same
+model, substeps and bounds of uniformly random actions, and each its best number of worlds per thread.
 """
 
 import importlib.util
@@ -42,35 +41,19 @@ GPU_WORLDS = 16_384
 
 
 def worlds(contestant: str, threads: int, device: str) -> int:
-    """Return the default number of worlds of a library or engine."""
     if contestant == "warp" and device.startswith("cuda"):
         return GPU_WORLDS
     return WORLDS[contestant] * (1 if contestant == "gym-sync" else threads)
 
 
 def takes_part(contestant: str, task: str) -> bool:
-    """Return whether a contestant supports a task."""
     return contestant != "envpool" or task in sampling.ENVPOOL
 
 
 def measure(
     contestant: str, task: str, *, worlds: int, threads: int, device: str, seed: int, seconds: float, warm: int
 ) -> dict[str, Any]:
-    """Measure environment steps per second.
-
-    Args:
-        contestant: A name in ``LABELS``.
-        task: A task of this package.
-        worlds: Number of worlds.
-        threads: Number of threads and cores.
-        device: Device of the Warp engine.
-        seed: Seed of actions and initial states.
-        seconds: Duration of the measurement.
-        warm: Number of steps before the measurement.
-
-    Raises:
-        experiment.Skipped: The contestant is not installed, or there are too few cores.
-    """
+    """Measure environment steps per second of a contestant in ``LABELS``."""
     torch.set_num_threads(1)
     with experiment.cores(threads):
         if contestant in ("c", "warp"):
@@ -85,15 +68,12 @@ def measure(
 
 
 def python_of(contestant: str) -> Path:
-    """Return the path of the Python interpreter that runs a library."""
     if contestant.startswith("gym") or (contestant == "envpool" and importlib.util.find_spec("envpool")):
         return Path(sys.executable)
     return venvs.python_of(contestant)
 
 
 class LyceumWarp:
-    """An environment of this package."""
-
     def __init__(self, contestant: str, task: str, nworld: int, threads: int, device: str, seed: int) -> None:
         engine = {"engine": "mujoco", "nthread": threads} if contestant == "c" else {"engine": "warp", "device": device}
         self.env = lw.make(task, nworld=nworld, seed=seed, **engine)
@@ -109,18 +89,14 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return the actions of several steps as a list of tensors (nworld, nact), because indexing a tensor takes time."""
+    """Return the actions of several steps as a list, because indexing a tensor takes time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
-    """``mujoco.rollout`` without a task; each environment step is one call.
-
-    Each step starts in the same state as lyceum_warp's environment, with the same controls, substeps and restarts, but
-    computes no observations or rewards.
-    """
+    """``mujoco.rollout`` without observations and rewards, in the states of lyceum_warp's environment."""
 
     def __init__(self, task: str, nworld: int, threads: int, seed: int, warm: int) -> None:
         ours = LyceumWarp("c", task, nworld, threads, "cpu", seed)

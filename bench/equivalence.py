@@ -2,11 +2,9 @@
 
     lyceum-warp bench equivalence --device cuda
 
-The area under a learning curve is the run's mean return: the mean return of the episodes that ended in an iteration,
-averaged over all iterations. Two one-sided t tests (TOST) at the level 0.05 decide whether the areas of 20 seeds on
-each engine are equivalent. The areas are equivalent if the 90 % interval of the difference of the means (Welch) lies
-within the margin. The margin is one standard deviation between seeds, pooled over both engines. The margin, the tasks
-and the seeds were chosen before the first run.
+The area under a learning curve is the run's mean return over all iterations. Two one-sided t tests (TOST) at the level
+0.05 compare the areas of 20 seeds on each engine. They are equivalent if the 90 % interval of the difference of the
+means (Welch) lies within one standard deviation between seeds. This margin was chosen before the first run.
 """
 
 import dataclasses
@@ -25,7 +23,6 @@ from lyceum_warp.engines.placement import find_device
 from lyceum_warp.support.intervals import student_quantile
 
 SAMPLES = {"inverted_double_pendulum": 100_000, "hopper": 200_000, "half_cheetah": 200_000}
-"""Number of samples of a run, by task."""
 
 ENGINES = {"mujoco": "C engine", "warp": "Warp engine"}
 SEEDS, NWORLD, PER_ITERATION = 20, 10, 10_000
@@ -33,8 +30,6 @@ SEEDS, NWORLD, PER_ITERATION = 20, 10, 10_000
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One run."""
-
     task: str
     engine: str
     seed: int
@@ -45,7 +40,6 @@ class Case:
 
 
 def cases(options: experiment.Options) -> list[Case]:
-    """List the runs, alternating between the engines."""
     short = options.short
     engines = choose(options.contestants, ENGINES, what="contestant")
     return [
@@ -81,16 +75,8 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
 
 
 def equivalence(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
-    """Test whether two means are equivalent.
-
-    Args:
-        a: Areas of one engine, at least two.
-        b: Areas of the other engine, at least two.
-
-    Returns:
-        The difference of the means (b minus a), its 90 % interval, the margin, and the verdict: "equivalent",
-        "different" (the interval lies outside the margin) or "not shown" (neither).
-    """
+    """Return the difference of the means (b minus a), its 90 % interval, the margin, and the verdict: "equivalent",
+    "different" (the interval lies outside the margin) or "not shown" (neither)."""
     parts = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
     spread = sum(parts)
     freedom = spread**2 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1)) if spread else 1.0

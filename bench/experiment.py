@@ -1,9 +1,7 @@
 """Run experiments: cases, stored results, tables and figures.
 
-An experiment is a module that defines ``EXPERIMENT``, an object made of functions: one lists the cases, one measures a
-case, and others make tables and a figure from stored results. ``main`` prints the expected duration, and skips cases
-with stored results from the same hardware and software. Each result is written immediately: an interrupted run loses at
-most one case per job, and the same command continues it.
+An experiment is a module that defines ``EXPERIMENT``. ``main`` skips cases with stored results from the same hardware
+and software. Each result is written immediately, so the same command continues an interrupted run.
 """
 
 import concurrent.futures
@@ -35,20 +33,19 @@ FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "equivalence",
          "soak")  # fmt: skip
-"""Names of the experiments."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
-"""Packages whose versions must be equal, like the hardware, for a comparison of results."""
+"""Results are compared only if the versions of these packages are equal."""
 
 STYLES = (
     ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
     ("#E69F00", "v", (0, (5, 1))), ("#56B4E9", "P", (0, (3, 1, 1, 1))), ("#000000", "X", "-"),
 )  # fmt: skip
-"""Colour (Okabe and Ito's palette for colour-blind readers), marker and line style of the n-th curve."""
+"""Colours (Okabe and Ito's palette for colour-blind readers), markers and line styles."""
 
 
 class Skipped(Exception):  # noqa: N818
-    """This machine cannot measure a case; the message gives the reason in one line."""
+    """This machine cannot measure a case."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +79,6 @@ class Row:
     """One result, stored as a line of the results file."""
 
     case: dict[str, Any]
-    """The measured case."""
     result: dict[str, Any]
     provenance: dict[str, Any]
     """Machine, versions, commit and date."""
@@ -92,8 +88,6 @@ class Row:
 
 @dataclasses.dataclass(frozen=True)
 class Table:
-    """A text table."""
-
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
@@ -105,50 +99,42 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """An experiment.
+    """An experiment. A case is a frozen dataclass with everything that affects the result except machine and versions.
 
-    A case is a frozen dataclass with everything that affects the result, except for the machine and the versions.
     List the cases with repeats as the outer loop and contestants as the inner loop, so that compared contestants take
     turns.
     """
 
     name: str
-    """Name of the program and of its results file."""
     summary: str
-    """Description in one line."""
     cases: Callable[[Any], Sequence[Any]]
-    """Return the cases for the options, in the order of measurement."""
+    """Return the cases in the order of measurement."""
     estimate: Callable[[Any], float]
     """Return the expected seconds of a case on two cores."""
     measure: Callable[[Any, Any], dict[str, Any]]
-    """Measure a case; raise Skipped if this machine cannot. The arguments are the case and the options."""
+    """Measure a case; raise Skipped if this machine cannot."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Make tables from the stored results of one machine."""
     figure: Callable[[Sequence[Row]], Any] | None = None
-    """Draw the stored results of one machine with matplotlib; return None if there is nothing to draw."""
+    """Draw the stored results of one machine; return None if there is nothing to draw."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Other libraries whose versions are stored with the results."""
     apart: bool = False
-    """Whether each case runs in a subprocess."""
     parallel: bool = False
     """Whether cases run in subprocesses if there are several jobs."""
     pooled: bool = False
-    """Whether results are independent of the machine; the tables then combine all machines."""
+    """Whether the tables combine the results of all machines."""
 
 
 def load(name: str) -> Experiment:
-    """Import an experiment by name; raise ValueError if the name is unknown."""
+    """Import an experiment by name."""
     choose((name,), NAMES, what="experiment")
     return importlib.import_module(name).EXPERIMENT
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names, or else the default names, or else all known names.
-
-    Raises:
-        ValueError: A name is unknown.
-    """
+    """Return the given names, or else the default names, or else all known names."""
     known = tuple(known)
     for name in given:
         if name not in known:
@@ -159,11 +145,6 @@ def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = 
 
 
 def installed(module: str, requirement: str) -> Any:
-    """Import a peer's package.
-
-    Raises:
-        Skipped: The package is not installed.
-    """
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -176,12 +157,7 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    """Map the given experiments, or all experiments with results, to their results files in a folder.
-
-    Raises:
-        ValueError: A name is unknown.
-        FileNotFoundError: There are no results.
-    """
+    """Return the results files of the given experiments, or of all experiments with results, by name."""
     found = {name: results / f"{name}.jsonl" for name in choose(names, NAMES, what="experiment")}
     if not names:
         found = {name: path for name, path in found.items() if path.exists()}
@@ -194,17 +170,12 @@ def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
 
 
 def read(path: Path) -> list[Row]:
-    """Read a results file; drop an incomplete last line with a warning.
-
-    Raises:
-        ValueError: A line is not a result.
-    """
+    """Read a results file; drop an incomplete last line with a warning."""
     rows, _ = _read(path)
     return rows
 
 
 def _read(path: Path) -> tuple[list[Row], int]:
-    """Return the rows and the end offset of the last row."""
     rows, size = [], 0
     for number, line in enumerate(path.read_bytes().splitlines(keepends=True), start=1):
         try:
@@ -219,7 +190,6 @@ def _read(path: Path) -> tuple[list[Row], int]:
 
 
 def append(path: Path, row: Row) -> None:
-    """Append a row to a results file, and flush it to the disk."""
     with path.open("ab") as file:
         file.write(json.dumps(dataclasses.asdict(row)).encode() + b"\n")
         file.flush()
@@ -237,7 +207,7 @@ def software(row: Row) -> tuple[Any, ...]:
 
 
 def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Group rows by hardware and software under names such as "64-cores-h200"; keep the last row of each case."""
+    """Group the last rows of all cases by hardware and software, under names such as "64-cores-h200"."""
     groups: dict[tuple[Any, ...], dict[str, Row]] = {}
     for row in rows:
         groups.setdefault((machine(row), software(row)), {})[key(row.case)] = row
@@ -251,14 +221,12 @@ def by_machine(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def slug(row: Row) -> str:
-    """Return a short name for a row's machine."""
     cores, gpu = row.provenance["cores"], row.provenance.get("gpu")
     model = [] if gpu is None else [word.lower() for word in gpu.split() if any(map(str.isdigit, word))][:1] or ["gpu"]
     return "-".join([f"{cores}-cores", *model])
 
 
 def described(rows: Sequence[Row]) -> str:
-    """Describe machine, versions and commits of one machine's rows in one line."""
     found = rows[-1].provenance
     parts = [f"{found['cores']} cores ({found['cpu']})"]
     if found.get("gpu"):
@@ -283,13 +251,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Divide each contestant's values of a quantity by the reference contestant's value in the same repeat.
-
-    Args:
-        rows: Rows whose cases differ only in contestant and ``repeat``.
-        quantity: Name of the quantity in the results.
-        unit: Name of the reference contestant.
-    """
+    """Divide each contestant's values by those of the contestant ``unit`` in the same repeat."""
     values: dict[str, dict[int, float]] = {}
     for row in rows:
         values.setdefault(row.case["contestant"], {})[row.case["repeat"]] = row.result[quantity]
@@ -298,7 +260,6 @@ def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[floa
 
 
 def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
-    """Format the median, and the smallest and largest value in parentheses. Return "" if there are no values."""
     if not values:
         return ""
     middle = format(statistics.median(values), form)
@@ -307,11 +268,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Restrict this thread, and all threads and processes that it starts later, to the first ``number`` cores.
-
-    Raises:
-        Skipped: There are too few cores.
-    """
+    """Restrict this thread, and all threads and processes that it starts later, to the first ``number`` cores."""
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
         raise Skipped(f"{number} threads need {number} cores, and this process has {len(before)}")
@@ -342,11 +299,7 @@ def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
 
 
 def run(experiment: Experiment, options: Options) -> int:
-    """Measure the cases without a stored result; return the exit code.
-
-    Raises:
-        ValueError: An option is invalid.
-    """
+    """Measure the cases without a stored result; return the exit code."""
     kind, _, number = options.device.partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
         raise ValueError(f"there is no device {options.device!r}: give cpu, cuda or cuda:1")
@@ -397,7 +350,7 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    """Yield each case with the duration of its measurement, and with the result or the exception."""
+    """Yield each case with its duration and the result or the exception."""
     if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
@@ -435,7 +388,7 @@ def outcomes(
 
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
-    """Measure a case in this subprocess; the subprocess ends on SIGTERM, or when the parent process ends."""
+    """Measure a case in this subprocess, which ends on SIGTERM or with its parent."""
     # SIGTERM must raise KeyboardInterrupt, so that the subprocesses of the case also end
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
@@ -450,11 +403,7 @@ def _interrupt_after_parent() -> None:
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
-    """Return disjoint sets of cores, one per job.
-
-    Raises:
-        ValueError: There are too few cores.
-    """
+    """Return disjoint sets of cores, one per job."""
     usable = sorted(os.sched_getaffinity(0))
     each = threads or len(usable) // max(1, jobs)
     if jobs < 1 or each < 1 or jobs * each > len(usable):
@@ -479,7 +428,7 @@ def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
 
 
 def guarded(program: Callable[[], int], name: str) -> int:
-    """Run a program, and report bad input and Ctrl-C in one line; return the exit code."""
+    """Run a program; report bad input and Ctrl-C in one line."""
     try:
         return program()
     except (ValueError, FileNotFoundError) as error:

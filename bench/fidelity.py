@@ -3,12 +3,13 @@
     lyceum-warp bench fidelity --device cuda --jobs 4
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
-compared with the Warp engine (float32), with itself when its state is rounded to float32 after every step, and with
-itself from an initial state perturbed by float32 rounding. Chaos separates any two trajectories, so the last two
-comparisons set the scale: if the Warp engine does not diverge earlier than they do, it is as accurate as float32
-allows. Two states of a world are compared by their observations: each difference is divided by max(1, |value|), and the
-largest quotient counts. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds
-continue after the end of an episode, and are excluded after a fault.
+compared with the Warp engine (float32), and with itself when its state is rounded to float32: after every step, or once
+at the start. Chaos separates any two trajectories. If the Warp engine does not diverge earlier than the rounded C
+engine, it is as accurate as float32 allows.
+
+Two states are compared by their observations: each difference is divided by max(1, |value|), and the largest quotient
+counts. Contact forces are excluded, because a solver is accurate only to its tolerance. Worlds are excluded after a
+fault.
 """
 
 import dataclasses
@@ -29,16 +30,15 @@ from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)
-"""Steps at which differences are stored; the last step is always stored."""
+"""Steps at which differences are stored, besides the last."""
 
 SETTLING = 20
-"""Number of steps before the trajectories start. In these steps, robots come into contact with the ground."""
+"""Steps before the trajectories start, in which robots come into contact with the ground."""
 
 ROUNDING = 2.0**-24
-"""Largest relative rounding error of float32."""
 
 APART = 0.01
-"""Two trajectories have diverged if their observations differ by more than this number."""
+"""Two trajectories have diverged if their observations differ by more than this."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +53,6 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Trajectories of one task."""
-
     task: str
     nworld: int
     steps: int
@@ -75,7 +73,6 @@ def cases(options: Options) -> list[Case]:
 
 
 def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
-    """Round states to float32, except for counters."""
     near = state.float().double()
     for name in COUNTERS:
         if (part := env.state_space.parts.get(name)) is not None:
@@ -145,14 +142,13 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float | None]]:
-    """Return the median and the 99 % quantile of the worlds' differences after each of the given numbers of steps."""
+    """Return the median and the 99 % quantile of the worlds' differences at each of the given steps."""
     rows = error[[t - 1 for t in shown]].double()
     found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
     return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}
 
 
 def half_apart(error: torch.Tensor) -> int | None:
-    """Return the number of steps after which half of the worlds have diverged; None if fewer diverge."""
     ever = (error > APART).cummax(0).values.double().mean(1) >= 0.5
     return int(ever.int().argmax()) + 1 if ever.any() else None
 

@@ -3,13 +3,14 @@
     lyceum-warp bench gate --policy runs/g1
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
 
-The mean policy controls the robot on the C engine under the task's exact physics. A Unitree G1 must pass nanoG1's gate
-(kingjulio8238/nanoG1, eval.py). The gate tests six commands of 20 s, each from four noisy initial states. The gate also
-measures the gait in 2,000 steps at 0.5 m/s. The gate has no noise, no pushes and no differences between robots. In
-nanoG1, actions are clipped to 1 and multiplied by 0.25 rad. To compare with nanoG1's limit, the action change is
-computed here as the change of a servo's target, divided by 0.25 rad. Any other robot is tested in 100 episodes of 20 s.
-Noise and differences between robots are the same as in training. The 100 episodes combine ten commands with ten initial
-states, and are played once without and once with pushes. After a fall, a world returns to its initial state.
+The mean policy controls the robot on the C engine under the task's exact physics.
+
+A Unitree G1 must pass nanoG1's gate (kingjulio8238/nanoG1, eval.py): six commands of 20 s, each from four initial
+states, and the gait of 2,000 steps at 0.5 m/s, without noise and pushes. nanoG1's actions are in units of 0.25 rad, so
+the action change is the change of a servo's target, divided by 0.25 rad.
+
+Any other robot is tested in 100 episodes of 20 s with noise: ten commands from ten initial states, once without and
+once with pushes.
 """
 
 import dataclasses
@@ -29,20 +30,18 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
 NEVER = 1e6
-"""Seconds until the next push or command: longer than any episode, so that neither occurs."""
+"""Seconds until the next push or command, longer than any episode."""
 NOISES = ("linear_velocity_noise", "angular_velocity_noise", "gravity_noise", "joint_position_noise",
           "joint_velocity_noise")  # fmt: skip
 STEPS = 1000
 BATTERY = ((0.8, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.3, 0.0, 1.0), (0.3, 0.0, -1.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.0))
 """nanoG1's commands: forward and lateral velocity, m/s, and yaw rate, rad/s."""
 GAIT = (0.5, 0.0, 0.0)
-"""The command for nanoG1's measurement of the gait. The gait is measured for twice as many steps as the tracking of
-each command in ``BATTERY``."""
+"""The command for nanoG1's measurement of the gait."""
 COMMANDS = (
     (1.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0),
     (0.5, 0.0, 0.5), (0.5, 0.0, -0.5), (0.5, 0.3, 0.0), (0.0, 0.0, 0.0),
 )  # fmt: skip
-"""The commands for other robots."""
 STARTS, NOISY_STARTS, JOINT_NOISE = 10, 4, 0.05
 
 LIMITS: dict[str, dict[str, tuple[str, float, str]]] = {
@@ -66,7 +65,7 @@ BESIDE = {
     "pushed_falls": "falls with pushes", "pushed_velocity_error": "velocity error with pushes, m/s",
     "pushed_yaw_rate_error": "yaw rate error with pushes, rad/s",
 }  # fmt: skip
-"""Descriptions of measured numbers for which the gates set no limit."""
+"""Descriptions of measured numbers without a limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +86,6 @@ class Case:
     task: str
     gate: str
     run: str
-    """Name of the run's folder."""
     policy: str
     """Hash of the policy's file."""
     starts: int
@@ -119,7 +117,6 @@ class Steps:
     yaw_rate_error: torch.Tensor
     """(steps, nworld), rad/s."""
     fell: torch.Tensor
-    """(steps, nworld), bool."""
     action: torch.Tensor
     """(steps, nworld, nact)."""
     velocity: torch.Tensor
@@ -128,15 +125,8 @@ class Steps:
 
 @torch.no_grad()
 def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: int, start: torch.Tensor) -> Steps:
-    """Run a policy from given states under fixed commands; after a fall, a world returns to its initial state.
-
-    Args:
-        env: The environment, which must have no horizon.
-        policy: Function from observations to actions.
-        commands: The command of each world.
-        steps: Number of steps.
-        start: States, as ``env.get_state`` returns them.
-    """
+    """Run a policy from the states ``start`` under each world's command; after a fall, a world returns to its initial
+    state."""
     parts = env.state_space.split(start)
     parts["drawn_velocity"][:] = torch.tensor(commands)
     parts["heading_controlled"][:], parts["standing"][:], parts["command_timer"][:] = 0.0, 0.0, NEVER
@@ -153,14 +143,13 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 
 
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
-    """Make worlds of the run's task. The worlds have the run's parameters and no time limit."""
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
     words = place | {"horizon": 0, "seed": 1000}
     return run_worlds(Run.open(folder), words, params, nworld=nworld, task=options.task, trust=False)
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Return parameters that turn off noise, pushes and differences between robots. Friction does not change."""
+    """Return parameters that turn off noise, pushes and differences between robots, except for friction."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],
@@ -181,7 +170,6 @@ def rms(numbers: torch.Tensor) -> float:
 
 
 def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
-    """Run a policy under the commands of nanoG1's gate, and measure the gait."""
     policy = lw.load(folder, which=options.which)
     quiet = calm(worlds(folder, 1, options))
     commands = [command for command in BATTERY for _ in range(case.starts)]
@@ -242,7 +230,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table for each policy. The table shows every number beside its limit."""
     made = []
     for row in rows:
         case, result = row.case, row.result

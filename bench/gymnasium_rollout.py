@@ -15,14 +15,12 @@ from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
 
 TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
-"""Gymnasium's names of this package's tasks."""
 
 
 class GymnasiumRollout(Rollout):
-    """Fill NPG's rollout buffer from a Gymnasium vector environment; ``Rollout`` fills it from an ``Env``.
+    """Fill NPG's rollout buffer from a Gymnasium vector environment.
 
-    When an episode ends, the next one begins within the same step. The first episode of each world starts at the step
-    count of the same world in ``env``.
+    The first episode of each world starts at the step count of the same world in ``env``.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
@@ -32,8 +30,7 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # this attribute belongs to the TimeLimit wrapper, which is the outermost wrapper in both vector
-            # environments
+            # an attribute of the outermost wrapper, TimeLimit
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 
@@ -71,7 +68,6 @@ class GymnasiumRollout(Rollout):
 
 
 def vector(task: str, nworld: int, mode: str) -> VectorEnv:
-    """Make Gymnasium's vector environment without its environment checker."""
     made = [functools.partial(gymnasium.make, TASKS[task], disable_env_checker=True)] * nworld
     if mode == "sync":
         return SyncVectorEnv(made, autoreset_mode=AutoresetMode.SAME_STEP)
@@ -80,7 +76,6 @@ def vector(task: str, nworld: int, mode: str) -> VectorEnv:
 
 
 def rates(task: str, nworld: int, steps: int) -> dict[str, float]:
-    """Measure steps per second of Gymnasium's two vector modes with random actions."""
     found = {}
     for mode in ("sync", "async"):
         with contextlib.closing(vector(task, nworld, mode)) as envs:

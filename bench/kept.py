@@ -1,11 +1,8 @@
 """Compare the step time of an environment with the step time of its physics engine alone, on the same states.
 
-Environment and bare engine (the engine without a task) alternate every ten steps. The environment's states before each
-step are copied to the bare engine while the clock is stopped. Both therefore step the same states, also after resets,
-under the same machine load. The bare engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``, with
-the same model, controls and substeps. ``kept`` is the bare engine's step time divided by the environment's step time:
-the fraction of the engine's speed that the environment keeps. ``added`` is the environment's step time minus the bare
-engine's step time.
+Environment and bare engine (the engine without a task) alternate every ten steps, from the same states. The bare engine
+is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``. ``kept`` is the bare engine's step time divided by
+the environment's step time, and ``added`` is their difference.
 """
 
 import statistics
@@ -27,11 +24,10 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.support.arrays import launch_worlds
 
 BLOCK = 10
-"""Number of steps that environment and bare engine take per turn."""
+"""Steps per turn."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
-    """Return the controls of the environment's next step, (nworld, nu)."""
     if (control := env.task.kernels.control_worlds) is None:
         low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
         return env.action.clamp(low, high)
@@ -51,7 +47,6 @@ class BareC:
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
 
     def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return states and controls of the environment's next step."""
         return self.rows.copy(), next_controls(self.env).numpy()
 
     def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
@@ -78,7 +73,6 @@ class BareWarp:
         self.graph = capture.graph
 
     def snapshot(self) -> tuple[wp.array, torch.Tensor]:
-        """Return states and controls of the environment's next step."""
         with wp.ScopedDevice(self.env.device):
             state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
             mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
@@ -111,22 +105,13 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
 
 
 def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **place: Any) -> dict[str, Any]:
-    """Measure the step times of an environment and of its bare engine on the same states; return medians over blocks.
-
-    Args:
-        task: Name of a task.
-        nworld: Number of worlds.
-        blocks: Number of blocks.
-        policy: Folder of the run whose policy acts; by default actions are random.
-        **place: Engine, device and threads, as in lw.make.
-    """
+    """Return the median step times of an environment and of its bare engine; ``policy`` is the folder of a run."""
     env = lw.make(task, nworld=nworld, **place)
     actions = contestants.actions(env, seed=0)
     acting = None if policy is None else lw.load(policy, device=env.obs.device)
     bare = bare_engine(env)
 
     def choose_actions() -> None:
-        """Write the policy's next actions into ``actions``, outside the measured time."""
         if acting is not None:
             start = env.get_state()
             for t in range(BLOCK):
@@ -140,7 +125,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # warm-up: graphs are captured, and the worlds leave their initial states; a robot needs two seconds until it walks
+    # warm-up: graphs are captured, and a robot needs two seconds until it walks
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

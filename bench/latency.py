@@ -4,12 +4,9 @@
     lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda
     lyceum-warp bench latency --tasks dm/cartpole_swingup --own --seconds 50
 
-A case combines a task, the physics of the planner's worlds, a number of samples, a horizon, an engine and its device.
-Episodes run in real time (``lw.control_async``) until their total duration reaches ``--seconds``: the plant keeps its
-rate, and the planner plans as often as it can. A plan meets its deadline if it takes no longer than one step of the
-plant. Run the benchmark on idle cores, because other processes delay plans. Without --samples and --horizons, cases
-whose plans would take long on two cores are omitted. With --own, each task has one case, with the samples and the
-horizon that the task suggests for planners.
+Episodes run in real time (``lw.control_async``) until their total duration reaches ``--seconds``. A plan meets its
+deadline if it takes no longer than one step of the plant. Run the benchmark on idle cores, because other processes
+delay plans.
 """
 
 import dataclasses
@@ -31,10 +28,9 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds to simulate one step of one sample on two cores, by task and planning physics. By default, the tasks in
-the keys are measured."""
+"""Microseconds to simulate one step of one sample on two cores, by task and planning physics."""
 LONGEST = 0.2
-"""Maximum expected duration of a plan, in seconds; longer plans run only if samples or horizons are given."""
+"""Plans that take more seconds run only if samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
 CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 
@@ -58,15 +54,12 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """The settings of one measurement, which is one cell of the table."""
-
     task: str
     physics: str
     """Name of the planner's physics; "own" if the task suggests options that have no name."""
     samples: int
     horizon: int
     contestant: str
-    """Engine of the planner's worlds."""
     device: str
     threads: int
     seconds: float
@@ -75,7 +68,6 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the cases of each task, small plans first."""
     short, cuda = options.short, options.device.startswith("cuda")
     tasks = options.tasks or (("point_mass",) if short else tuple(dict.fromkeys(task for task, _ in COST)))
     contestants = choose(options.contestants, CONTESTANTS, ("warp",) if cuda else ("mujoco",), what="contestant")
@@ -99,7 +91,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    """Return the given names that the task defines, or the task's default physics if no names are given."""
+    """Return the given names that the task defines, or the task's default physics."""
     found = find_task(task)
     if names:
         return [name for name in names if name == "exact" or name in found.physics]
@@ -108,7 +100,6 @@ def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
 
 
 def expected(task: str, physics: str, samples: int, horizon: int) -> float:
-    """Return the expected seconds of a plan on two cores."""
     return 1e-6 * COST.get((task, physics), 20.0) * samples * horizon
 
 
@@ -120,7 +111,7 @@ def estimate(case: Case) -> float:
 
 @torch.no_grad()
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Run episodes in real time until their total duration reaches the seconds of the case."""
+    """Run episodes in real time for the seconds of the case."""
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
     torch.set_num_threads(1)
@@ -150,7 +141,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make one table per task."""
     made: dict[str, list[list[str]]] = {}
     deadlines = {row.case["task"]: row.result["deadline_ms"] for row in rows}
     order = ("physics", "contestant", "device", "horizon", "samples", "repeat")

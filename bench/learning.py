@@ -3,11 +3,10 @@
     lyceum-warp bench learning --device cuda
     lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
 
-The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean
-return is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If
-iterations are too short for whole episodes, the mean is taken over 16 separate episodes of the stochastic policy every
-few iterations. On go1_velocity, a robot that stands still also reaches high returns. For go1_velocity, the program
-therefore also measures the tracking errors and falls of the mean policy, over 10 s in new worlds with noise and pushes.
+The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean return
+is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If iterations
+are too short for whole episodes, it is taken over 16 separate episodes of the stochastic policy. On go1_velocity, a
+robot that stands still also reaches high returns, so the program also measures tracking errors and falls.
 """
 
 import collections
@@ -34,15 +33,13 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "half_cheetah": ("npg", 5000.0, 4096, 65_536, 5),
     "humanoid": ("npg", 4500.0, 8192, 131_072, 5),
 }
-"""By task: algorithm, target return, worlds, samples per iteration, and iterations between evaluations (with 0, the
-last 100 training episodes are used instead)."""
+"""By task: algorithm, target return, worlds, samples per iteration, and iterations between evaluations (0: none)."""
 
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
-"""Hyperparameters that differ from the algorithm's defaults."""
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Number of episodes per evaluation, number of episodes in a run's mean return, and (worlds, steps) in the test of
-tracking errors and falls."""
+"""Episodes per evaluation, episodes in a run's mean return, and (worlds, steps) in the test of tracking errors and
+falls."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,9 +62,7 @@ class Case:
     seed: int
     nworld: int
     target: float
-    """Mean return at which the run ends."""
     seconds: float
-    """Seconds after which the run ends."""
     device: str
 
 
@@ -82,7 +77,6 @@ def cases(options: Options) -> list[Case]:
 
 
 def learner(case: Case, nworld: int, **changes: Any) -> Any:
-    """Make the learner of a case."""
     env = lw.make(case.task, nworld=nworld, seed=case.seed, device=case.device)
     words = {**changes, **SETTINGS[case.setting]}
     if case.algorithm == "ppo":
@@ -104,7 +98,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # an iteration ends with a copy to the host, and the copy waits for the device
+        it = next(made)  # an iteration ends with a copy to the host, which waits for the device
         seconds += time.perf_counter() - began
         if judge is None:
             returns = made.rollout.episode_return[made.rollout.done]
@@ -122,8 +116,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @torch.no_grad()
 def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
-    """Return the mean tracking errors and falls of a mean policy in new worlds; a fall is an early end of an
-    episode."""
+    """Return the mean tracking errors and falls of a mean policy in new worlds."""
     nworld, steps = WALKED
     env = lw.make(case.task, nworld=min(nworld, case.nworld), seed=1000, device=case.device)
     sums = torch.zeros(3, dtype=torch.float64, device=env.obs.device)
@@ -136,13 +129,12 @@ def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
 
 
 class Judge:
-    """Evaluate a stochastic policy in 16 worlds, always with the same initial states and noise."""
+    """Evaluate a stochastic policy, always with the same initial states and noise."""
 
     def __init__(self, env: lw.Env) -> None:
         self.env = env.replicate_few(JUDGED)
 
     def __call__(self, policy: lw.GaussianPolicy) -> float:
-        """Return the mean return."""
         policy, out = moved(policy, self.env), torch.empty_like(self.env.action)
         generator = torch.Generator(out.device).manual_seed(0)
 
@@ -175,7 +167,6 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Plot the returns of go1_velocity over seconds, together with mjlab's returns."""
     groups: dict[str, list[Row]] = {}
     for row in rows:
         if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):

@@ -11,7 +11,7 @@ from typing import Any
 from lyceum_warp.support.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""Entries that describe the hardware; two measurements are compared only if these entries are equal."""
+"""Measurements are compared only if these entries are equal."""
 
 _QUERY = {
     "driver": "driver_version",
@@ -24,7 +24,6 @@ _QUERY = {
 
 
 def context(device: str = "cpu") -> dict[str, Any]:
-    """Return the package versions, machine and commit, and the current state of a GPU."""
     found = versions(device)
     program = shutil.which("nvidia-smi") if device.startswith("cuda") else None
     if program is not None:
@@ -38,8 +37,7 @@ def context(device: str = "cpu") -> dict[str, Any]:
 
 
 def write(path: Path, rows: Sequence[Any], device: str = "cpu", **more: Any) -> None:
-    """Write rows (dataclasses) and their context as JSON. Call this right after the measurement, because it reads the
-    GPU's clocks."""
+    """Write dataclasses and their context as JSON, right after the measurement, because this reads the GPU's clocks."""
     content = {"versions": context(device), "rows": [dataclasses.asdict(row) for row in rows], **more}
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(content, indent=2) + "\n")

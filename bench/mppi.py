@@ -3,13 +3,10 @@
     lyceum-warp bench mppi --threads 16
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
-``episodes``: success and time of episodes of 75 steps, on the paper's planning tasks with the paper's settings.
-``plans``: the planning time from given states.
-
-The Python planner (python_mppi.py) sends one message per plan to each process. All planners control the same plant, and
-take turns in blocks of episodes. The contestants named "a set at a time" run last: one planner controls the plants of
-all episodes in a set. With --jobs, blocks run at the same time, each in a subprocess on separate cores. ``mppi_fast``
-plans with the physics that a task names "fast"; the plant keeps the exact physics.
+``episodes``: success and time of episodes of 75 steps, with the paper's settings. ``plans``: the planning time from
+given states. All planners control the same plant, and take turns in blocks of episodes. In the contestants "a set at a
+time", one planner controls the plants of all episodes in a set. ``mppi_fast`` plans with the physics that a task names
+"fast"; the plant keeps the exact physics.
 """
 
 import dataclasses
@@ -33,7 +30,7 @@ from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
             "arm_hand_pickup": 300}  # fmt: skip
-"""Tasks and the steps of their episodes; the default is the paper's two tasks."""
+"""Steps of an episode, by task."""
 PAPER = ("reach", "adroit_pen")
 PLANS = ("reach", "half_cheetah", "adroit_pen")
 TASKS = ("reach", "half_cheetah", "adroit_pen", "herb_reach", "panda_lift", "aloha_lift", "arm_hand_pickup")
@@ -68,7 +65,7 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A block of episodes or a series of plans of one contestant."""
+    """A block of episodes, or a series of plans."""
 
     part: str
     task: str
@@ -76,11 +73,8 @@ class Case:
     repeat: int
     """Number of the repeat or of the set of seeds."""
     first: int
-    """The first seed."""
     count: int
-    """Number of episodes."""
     steps: int
-    """Number of steps of an episode."""
     seconds: float
     """Seconds spent on timing plans, apart from the episodes."""
     threads: int
@@ -128,7 +122,6 @@ def estimate(case: Case) -> float:
 
 @functools.cache
 def planner(task: str, contestant: str, threads: int, device: str, plants: int = 1) -> lw.MPPI:
-    """Make a planner of this package."""
     if contestant in ON_WARP:
         return lw.MPPI(task, engine="warp", device=device, plants=plants)
     physics = "fast" if contestant == "mppi_fast" else "exact"
@@ -137,7 +130,7 @@ def planner(task: str, contestant: str, threads: int, device: str, plants: int =
 
 @functools.cache
 def python_planner(task: str, threads: int) -> Any:
-    """Make the Python planner with one process per thread; idle processes wait for messages."""
+    """Make the Python planner with one process per thread."""
     return python_mppi.PythonMPPI(task, planner(task, "mppi", threads, "cpu"), threads)
 
 
@@ -156,7 +149,6 @@ def controller(case: Case, options: Options) -> Any:
 
 
 def run_episodes(case: Case, options: Options) -> dict[str, Any]:
-    """Run a block of episodes, one after the other or all together."""
     seeds = range(case.first, case.first + case.count)
     plans = {}
     if case.contestant in TOGETHER:
@@ -177,7 +169,7 @@ def run_episodes(case: Case, options: Options) -> dict[str, Any]:
 def episodes_together(
     case: Case, options: Options, seeds: Sequence[int]
 ) -> tuple[list[bool], list[float], list[float]]:
-    """Run episodes with one planner for all plants; return successes, returns, and each episode's share of the time."""
+    """Run episodes with one planner; return successes, returns, and each episode's share of the time."""
     made = planner(case.task, case.contestant, case.threads, options.device, case.count)
     env, one = plant(case.task, case.steps, case.count, case.threads), plant(case.task, case.steps)
     starts = []
@@ -206,12 +198,12 @@ def episodes_together(
 
 @functools.cache
 def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
-    """Return the states of an episode (steps, state_size) from which all contestants plan."""
+    """Return the states of an episode, (steps, state_size)."""
     return lw.control(plant(task, steps), planner(task, "mppi", threads, "cpu"), seed=seed).states[:-1]
 
 
 def run_plans(case: Case, options: Options) -> dict[str, Any]:
-    """Plan from the states of an episode until the time is up; the first four plans do not count."""
+    """Plan from the states of an episode; the first four plans do not count."""
     made, given = controller(case, options), states(case.task, case.first, case.steps, case.threads)
     made.reset(case.first)
     times: list[float] = []
@@ -234,7 +226,7 @@ RUN = {"plans": run_plans, "episodes": run_episodes}
 def measure(case: Case, options: Options) -> dict[str, Any]:
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
-    # new threads and processes use only these cores
+    # new threads and processes inherit these cores
     with experiment.cores(case.threads):
         return RUN[case.part](case, options)
 
@@ -243,7 +235,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str) -> dict[str, dict[str, list[Row]]]:
-    """Group the rows of a part by task and by contestant."""
     found: dict[str, dict[str, list[Row]]] = {}
     for row in sorted(rows, key=lambda row: TASKS.index(row.case["task"])):
         if row.case["part"] == part:
@@ -257,7 +248,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
-    """Return episodes (seed, success, return, seconds) by set and seed; the seconds may be None."""
+    """Return (seed, success, return, seconds or None) of the episodes, by set and seed."""
     sets: dict[int, dict[int, list[Any]]] = {}
     for row in rows:
         sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})
@@ -269,7 +260,6 @@ def flat(rows: Sequence[Row]) -> list[list[Any]]:
 
 
 def mean_seconds(each: Sequence[Sequence[Any]]) -> float | None:
-    """Return the mean time of the timed episodes."""
     timed = [episode[3] for episode in each if episode[3] is not None]
     return statistics.fmean(timed) if timed else None
 

@@ -2,14 +2,11 @@
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both NPGs are the same class with the same settings, number of worlds and seeds. The two NPGs differ only in the
-environments that fill the rollout buffer; Gymnasium uses the faster of its two vector modes. The PPO of
-stable-baselines3 and the TRPO of sb3-contrib each learn for twelve minutes, with the settings that RL Baselines3 Zoo
-tuned for these tasks. With --device cuda, lw.NPG and lw.PPO learn on the same worlds on a GPU.
-
-All policies are evaluated by their mean actions in single Gymnasium environments, from the same initial states. The
-clock stops during evaluations, and starts after kernels are compiled and environments are made. Each case runs in a
-subprocess on separate cores; runs on a GPU need --jobs 1.
+Both NPGs are the same class with the same settings and seeds; only the environments differ. Gymnasium uses the faster
+of its two vector modes. The PPO of stable-baselines3 and the TRPO of sb3-contrib learn for twelve minutes, with the
+settings of RL Baselines3 Zoo. All policies are evaluated by their mean actions in single Gymnasium environments, from
+the same initial states. The clock starts after kernels are compiled and environments are made, and stops during
+evaluations.
 """
 
 import contextlib
@@ -43,7 +40,6 @@ CONFIGS = {
 """Settings of NPG: the defaults, except for Swimmer's discount."""
 
 SHORT: dict[str, Any] = {"samples": 500, "value_epochs": 1}
-"""Settings of NPG under --short."""
 
 CONTESTANTS = {
     "npg": "NPG, lyceum_warp",
@@ -60,13 +56,11 @@ ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("
 GPU_WORLDS = {"npg_gpu": 2048, "ppo_gpu": 4096}
 
 EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
-"""Numbers of samples at which the curves are compared."""
 
 LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
-"""Maximum learning time of a run in seconds."""
 
 EVALUATIONS, EPISODES = 20, 16
-"""Number of evaluations per run, not counting the first one, and number of episodes per evaluation."""
+"""Evaluations per run after the first, and episodes per evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -107,8 +101,6 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One run."""
-
     task: str
     contestant: str
     seed: int
@@ -116,12 +108,10 @@ class Case:
     nworld: int | None
     """Number of worlds; None if the contestant's settings determine it."""
     samples: int | None
-    """Number of samples after which the run ends."""
     short: bool
 
     @property
     def limit(self) -> float:
-        """Return the seconds of learning after which the run ends."""
         return LIMITS.get(self.contestant, math.inf) / (10.0 if self.short else 1.0)
 
 
@@ -158,13 +148,12 @@ Act = Callable[[np.ndarray], np.ndarray]
 
 
 class Judge:
-    """Evaluate policies in single Gymnasium environments, always from the same initial states."""
+    """Evaluate policies in Gymnasium, always from the same initial states."""
 
     def __init__(self, task: str, episodes: int) -> None:
         self.envs = [gymnasium.make(TASKS[task], disable_env_checker=True) for _ in range(episodes)]
 
     def __call__(self, act: Act) -> float:
-        """Return the mean return over the episodes."""
         current = [env.reset(seed=2**31 - 1 - i)[0] for i, env in enumerate(self.envs)]
         returns, running = np.zeros(len(self.envs)), list(range(len(self.envs)))
         while running:
@@ -179,7 +168,7 @@ class Judge:
 
 
 class Curve:
-    """Collect the learning curve of a run; the run's clock stops during evaluations."""
+    """Collect the learning curve of a run, whose clock stops during evaluations."""
 
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)
@@ -188,7 +177,6 @@ class Curve:
         self._stopped, self._next = 0.0, 0
 
     def start(self, act: Act) -> None:
-        """Evaluate the first policy and start the clock."""
         self._stopped = time.perf_counter()
         self.add(0, act)
 
@@ -196,20 +184,18 @@ class Curve:
         return time.perf_counter() - self._stopped
 
     def ended(self, samples: int) -> bool:
-        """Return whether the run has ended."""
         return samples >= (self.case.samples or math.inf) or self.seconds() >= self.case.limit
 
     def due(self, samples: int) -> bool:
-        """Return whether an evaluation is due. Evaluations are evenly spaced, and the last one is at the end."""
+        """Return whether one of the evenly spaced evaluations is due."""
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:
-        """Return the run's progress as a fractional number of evaluations."""
         progress = max(samples / (self.case.samples or math.inf), self.seconds() / self.case.limit)
         return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Evaluate a policy and add a point to the curve, unless the curve has a point at this number of samples."""
+        """Evaluate a policy and add a point, unless there is one at this number of samples."""
         if self.points and self.points[-1][0] == samples:
             return
         seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1
@@ -222,7 +208,7 @@ class Curve:
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """Copy a policy, and return a function that computes the copy's mean actions."""
+    """Return a function that computes the mean actions of a copy of a policy."""
     now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
@@ -266,7 +252,6 @@ def npg(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
 
 
 def ppo(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
-    """Run PPO with its default settings."""
     assert case.nworld is not None
     config = lw.PPOConfig(mean_every=0)
     next(lw.PPO(environment(case, options, config.minibatches), config=config, seed=case.seed))  # compiles kernels
@@ -275,11 +260,10 @@ def ppo(case: Case, options: Options, curve: Curve) -> dict[str, Any]:
 
 
 def iterate(learner: Any, curve: Curve) -> dict[str, Any]:
-    """Run a learner of this package until its curve is complete."""
     sampling = 0.0
     curve.start(mean_action(learner.policy))
     while not curve.ended(learner.samples):
-        sampling += next(learner).time_sample  # an iteration ends with a copy to the host; the copy waits for the GPU
+        sampling += next(learner).time_sample  # an iteration ends with a copy to the host, which waits for the GPU
         if curve.due(learner.samples):
             curve.add(learner.samples, mean_action(learner.policy))
     curve.add(learner.samples, mean_action(learner.policy))
@@ -346,7 +330,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def runs(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
-    """Group runs by task and contestant."""
     found: dict[str, dict[str, list[Row]]] = {task: {} for task in TASKS}
     for row in rows:
         found[row.case["task"]].setdefault(row.case["contestant"], []).append(row)
@@ -363,7 +346,6 @@ def values_at(row: Row, samples: Sequence[float]) -> np.ndarray:
 
 
 def seconds_to(row: Row, target: float) -> float | None:
-    """Return the seconds of learning until the mean policy first reached a return."""
     return next((point[1] for point in row.result["curve"] if point[2] >= target), None)
 
 
@@ -377,8 +359,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Make a table of the runs' final results, and of the time until they reach 90 % of the final return of NPG on
-    Gymnasium."""
+    """Tabulate final results, and the time until 90 % of the final return of NPG on Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}
@@ -412,7 +393,6 @@ def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
 
 
 def pace(row: Row) -> float:
-    """Return the seconds of learning per sample."""
     return row.result["seconds"] / row.result["samples"]
 
 
@@ -422,8 +402,7 @@ def interval(found: tuple[float, float], form: str = ",.0f") -> str:
 
 
 def agreement(task: str, same: dict[str, list[Row]]) -> Table | None:
-    """Compare the returns of both NPGs every 100,000 samples; return None if there is only one seed, or if runs have
-    fewer samples."""
+    """Compare the returns of both NPGs every 100,000 samples; return None if there is too little data."""
     ours, fed = (np.array([values_at(row, EVERY_100K) for row in same[name]]) for name in ("npg", "npg_gymnasium"))
     there = ~np.isnan(np.concatenate([ours, fed])).any(axis=0)
     if not there.any() or min(len(ours), len(fed)) < 2:
@@ -472,10 +451,9 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
-    """Draw a contestant's curves over samples (x = 0) or seconds (x = 1)."""
     color, marker, line = STYLES[list(CONTESTANTS).index(name)]
     last = min(row.result["curve"][-1][x] for row in group)
-    # the first policy is at 0 seconds, which a logarithmic axis cannot show
+    # a logarithmic axis cannot show 0 seconds
     first = min(max(row.result["curve"][x][x] for row in group), last)
     grid = np.linspace(first, last, 101) if x == 0 else np.geomspace(first, last, 101)
     curves = [

@@ -1,7 +1,7 @@
 """Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
-``PythonMPPI`` does not use this package's worlds. Each subprocess has an environment and gets one message per plan, and
-NumPy computes noise and weights. ``PythonMPPI`` takes its settings from an ``lw.MPPI`` and controls the same plant.
+Each subprocess has an environment and gets one message per plan; NumPy computes noise and weights. ``PythonMPPI`` takes
+its settings from an ``lw.MPPI`` and controls the same plant.
 """
 
 import multiprocessing
@@ -43,11 +43,7 @@ class ReachEnv:
 class GymnasiumEnv:
     """An environment of Gymnasium or Gymnasium-Robotics that can be set to a state of this package's task.
 
-    Args:
-        name: Gymnasium's name.
-        model: The model of this package's task; states belong to this model.
-        target: Name of a mocap body of ``model``. In Gymnasium's model, the target is a body of the same name with a
-            constant orientation.
+    ``target`` is a mocap body of ``model``; in Gymnasium's model, it is a body with a constant orientation.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:
@@ -80,24 +76,18 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
     "half_cheetah": lambda model: GymnasiumEnv("HalfCheetah-v5", model),
     "adroit_pen": lambda model: GymnasiumEnv("AdroitHandPen-v1", model, "target"),
 }
-"""Environments by the names of this package's tasks; their actions are bounded by -1 and 1."""
+"""Environments by this package's task names; their actions are bounded by -1 and 1."""
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Smooth the noise, (samples, horizon, nact), over time and in place. The first two steps stay unchanged."""
+    """Smooth the noise, (samples, horizon, nact), over time and in place, except for the first two steps."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise
 
 
 class PythonMPPI:
-    """MPPI over single environments in subprocesses, with one message per plan and process.
-
-    Args:
-        task: A name in ``ENVS``.
-        plan: Planner of this package that provides the settings.
-        count: Number of subprocesses.
-    """
+    """MPPI over single environments in ``count`` subprocesses, with the settings of ``plan``."""
 
     def __init__(self, task: str, plan: lw.MPPI, count: int) -> None:
         config = plan.config
@@ -109,13 +99,12 @@ class PythonMPPI:
             pipe, other = context.Pipe()
             settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
             context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
-            other.close()  # close the child's end here, so that recv raises EOFError if the subprocess has ended
+            other.close()  # with the child's end closed here, recv raises EOFError if the subprocess has ended
             self.pipes.append(pipe)
         for pipe in self.pipes:
             pipe.recv()
 
     def reset(self, seed: int | None) -> None:
-        """Set the plan to zero, and seed the noise."""
         self.plan[:] = 0.0
         for pipe in self.pipes:
             pipe.send(seed)

@@ -2,11 +2,10 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl belongs to one task and one setting, and holds the rank correlations that
-``lyceum-warp tune --planning`` measures. The line also holds three returns of the same episodes; the plant always has
-the task's own physics. The planner uses the task's physics for R_exact, and the setting's physics for R_setting; R_none
-is measured without a planner. The loss is (R_exact - R_setting) / (R_exact - R_none). Episodes do not run in real time,
-so the results do not depend on the load of the machine.
+Each line of results/rank-loss.jsonl holds, for a task and a setting, the rank correlations that ``lyceum-warp tune
+--planning`` measures, and three returns of the same episodes. The planner uses the task's physics for R_exact and the
+setting's physics for R_setting; R_none is measured without a planner. The loss is (R_exact - R_setting) / (R_exact -
+R_none). Episodes do not run in real time, so the load of the machine does not matter.
 """
 
 import dataclasses
@@ -40,11 +39,9 @@ def iterations(limit: int) -> dict[str, Any]:
 @dataclasses.dataclass(frozen=True)
 class Study:
     plants: int
-    """Number of episodes."""
     steps: int
     settings: tuple[dict[str, Any], ...]
     words: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner."""
 
 
 STUDIES = {
@@ -67,7 +64,7 @@ STUDIES = {
 
 
 def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> np.ndarray:
-    """Run one episode per plant with a planner that uses the given physics; return the episodes' returns, (plants,)."""
+    """Return the returns of one episode per plant, (plants,), with a planner that uses the given physics."""
     env = lw.make(task, nworld=study.plants, autoreset=False)
     env.rand_reset(1000)
     plan = lw.MPPI(task, plants=study.plants, seed=1000, physics=physics, **study.words)

@@ -3,11 +3,10 @@
     lyceum-warp bench records --device cuda --tasks go1_velocity g1_velocity --seeds 42 43 44
     lyceum-warp bench records --tasks hopper --cache cold
 
-The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
-when the run's config.json says that the target is reached. With a cold cache, all kernels are compiled. Before a
-measurement with a warm cache, the same command trains for one iteration while the clock is stopped. A run that lasts
-longer than --seconds is stopped. The same command continues the run; the seconds of all calls are summed, and include
-every start of the process.
+The clock starts before the command, so the seconds include imports, compilation and graph captures. It stops when the
+run's config.json says that the target is reached. With a cold cache, all kernels are compiled. With a warm cache, the
+same command has trained for one iteration before. A run that lasts longer than --seconds is stopped; the same command
+continues it, and the seconds of all calls are summed.
 """
 
 import contextlib
@@ -31,13 +30,11 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags for tasks whose target applies to the mean return of the training episodes, which have exploration noise."""
+"""Flags for targets of the training episodes' mean return."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags for tasks whose target applies to the mean policy's return in 16 episodes; the clock includes these
-evaluations."""
+"""Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
-"""Flags that all tasks of dm_control's suite share."""
 
 RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "go1_velocity": (80.0, {"cuda": WALKING}),
@@ -52,7 +49,7 @@ RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "humanoid": (4500.0, {"cuda": (*NPG, "--nworld", "8192", "--samples", "131072")}),
     **{name: (900.0, {"cuda": SUITE}) for name in package_task_names() if name.startswith("dm/")},
 }
-"""Each task's threshold, and the flags of `lyceum-warp train` for each kind of device."""
+"""Each task's threshold, and its flags of `lyceum-warp train` by device."""
 
 COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
 
@@ -77,11 +74,11 @@ class Case:
     cache: str
     device: str
     flags: str
-    """Flags of the command, without the flags that all runs have in common."""
+    """Flags that not all runs have in common."""
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs of all tasks that have training flags for the device."""
+    """List the runs of tasks that have flags for the device."""
     kind = options.device.partition(":")[0]
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
@@ -95,7 +92,7 @@ def cases(options: Options) -> list[Case]:
 
 
 def command(case: Case, folder: Path, device: str) -> list[str]:
-    """Return the command that starts a run, or that continues the run if the folder has a checkpoint."""
+    """Return the command that starts a run, or continues it if there is a checkpoint."""
     train = [sys.executable, "-m", "lyceum_warp.cli", "train"]
     if (folder / "checkpoint.pt").exists():
         return [*train, "--resume", str(folder), *COMMON]
@@ -106,7 +103,7 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Train until the target is reached; raise Skipped if the time limit of this call is exceeded."""
+    """Train until the target is reached; raise Skipped after the time limit of this call."""
     name = f"{file_name(case.task)}-{case.device}-{case.cache}-{case.seed}"
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
@@ -130,7 +127,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """Return the command's environment variables. They select an empty or a filled kernel cache."""
+    """Return the command's environment variables, which select a kernel cache."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:
@@ -150,11 +147,7 @@ def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[
 def timed(
     words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
-    """Run the command to its target, or for ``limit`` seconds; return the entry in config.json and the seconds.
-
-    Raises:
-        RuntimeError: The command failed.
-    """
+    """Run the command to its target, or for ``limit`` seconds; return the entry in config.json and the seconds."""
     began, reached = time.perf_counter(), None
     process = run(words, environment)
     config = folder / "config.json"
@@ -176,7 +169,7 @@ def timed(
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table with one line for each combination of task, cache and flags. A line combines all seeds."""
+    """Make a table with a line for each combination of task, cache and flags."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))

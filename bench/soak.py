@@ -4,20 +4,17 @@
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. The
-program injects invalid states, states with excessive velocities, and non-finite actions. For the other faults, the
-program writes a variant of the task (``VARIANT``), in which an additional action requests a NaN reward, a NaN
-observation or a negative mass. Every fault must be reported in the world and the step in which it was injected, no
-other fault may be reported, and ``env.fault_counts`` must agree. A second environment without faults must give bitwise
-equal numbers for each world until its first fault. Every fourth world gets no faults, so its numbers must be equal in
-both environments throughout.
+Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average: an invalid
+state, an excessive velocity or a non-finite action. For a NaN reward, a NaN observation or a negative mass, the program
+writes a variant of the task (``VARIANT``) with an additional action. Every fault must be reported in its world and
+step, and no other fault may be reported. A second environment without faults must give bitwise equal numbers for each
+world until its first fault. Every fourth world gets no faults.
 
-A run is divided into chunks. Each chunk is one result, and ends by writing the worlds' states to a file in the folder
-``--work``. The next chunk continues from this file, even on another machine with a copy of the folder.
+A run is divided into chunks. Each chunk continues from the states that the chunk before it wrote into the folder
+``--work``.
 
-Part "random": worlds step under uniformly random actions, without injected faults. The result has the number of faults
-by reason, and the step and world of the first fault. Part "memory": environments are made and deleted. Part "kills":
-training runs are killed and resumed, and must give the same results as an uninterrupted run.
+Part "random": worlds step under random actions, without injected faults. Part "memory": environments are made and
+deleted. Part "kills": training runs are killed and resumed, and must give the same results as an uninterrupted run.
 """
 
 import collections
@@ -52,14 +49,11 @@ from lyceum_warp.support.validate import whole_number
 PARTS = ("faults", "random", "memory", "kills")
 KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": Done.REWARD,
          "observation": Done.OBSERVATION, "model": Done.MODEL}  # fmt: skip
-"""The kinds of faults, named after where they are injected, and the reason that must be reported for each kind. Kinds
-are numbered from 1."""
+"""The reason that must be reported for each kind of fault. Kinds are numbered from 1."""
 NBIT = len(Done)
 EVERY = 16
-"""Number of steps between writes of invalid states. If writes are less frequent, each write affects more worlds, so the
-number of faults stays the same."""
+"""Steps between writes of invalid states. If writes are less frequent, each of them affects more worlds."""
 SAMPLES = 5
-"""Number of times that memory is measured per chunk."""
 TASKS = {
     "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
@@ -67,12 +61,11 @@ TASKS = {
 }  # fmt: skip
 """By task: worlds, steps per chunk, chunks, and seconds per million steps on two cores."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""Worlds, steps per chunk, chunks, and seconds per million steps of all other tasks."""
+"""The same of all other tasks."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
-"""Worlds, steps per chunk, chunks, and seconds per million steps in the deterministic mode, which makes a GPU's results
-reproducible bit for bit."""
+"""The same in the deterministic mode."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
     "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
@@ -161,7 +154,6 @@ class Faults:
     part: str = "faults"
 
     def state(self, work: Path, chunk: int) -> Path:
-        """Return the path of the file with the state from which a chunk starts."""
         where = f"{self.engine}-{self.device.partition(':')[0]}"
         run = f"{file_name(self.task)}-{where}-{self.nworld}-{self.steps}-{self.seed}"
         return work / f"{run}{'-same-bits' if self.compared else ''}-{chunk}.pt"
@@ -169,8 +161,6 @@ class Faults:
 
 @dataclasses.dataclass(frozen=True)
 class Random:
-    """A task under random actions."""
-
     task: str
     steps: int
     nworld: int
@@ -182,8 +172,6 @@ class Random:
 
 @dataclasses.dataclass(frozen=True)
 class Memory:
-    """Environments that are made and deleted."""
-
     task: str
     made: int
     nworld: int
@@ -194,8 +182,6 @@ class Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Kills:
-    """A training run that is killed and resumed."""
-
     task: str
     words: str
     kills: int
@@ -254,8 +240,8 @@ def measure(case: Any, options: Options) -> dict[str, Any]:
 
 
 def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
-    """Write a variant of a task. The variant has one action more than the task, and this action requests a fault.
-    Return the variant, and the range of the other actions."""
+    """Write a variant of a task, whose additional action requests a fault; return it, and the range of the other
+    actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
     own = TaskSource(parent, task)
     functions, nact = own.functions, plain.action.shape[1]
@@ -266,7 +252,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
-    # if a module has several tasks, the names of functions and structs may differ from the usual ones
+    # in a module with several tasks, functions and structs may have other names
     names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
@@ -348,7 +334,7 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step two environments of a task for a chunk: one with injected faults, and one without faults."""
+    """Step two environments for a chunk, one with faults and one without."""
     torch.set_num_threads(1)
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
@@ -431,7 +417,6 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
 
 
 def step_randomly(case: Random, options: Options) -> dict[str, Any]:
-    """Step a task under random actions."""
     torch.set_num_threads(1)
     try:
         env = lw.make(case.task, nworld=case.nworld, engine=case.engine, device=case.device, seed=case.seed,
@@ -468,13 +453,12 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 
 def slope(samples: Sequence[Sequence[int]], column: int) -> float:
-    """Return the growth of the memory per step, or per environment. The first sample is ignored."""
+    """Return the growth of memory per step or per environment, without the first sample."""
     points = np.array(samples[1:], dtype=float)
     return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
 
 
 def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
-    """Make, step and delete environments."""
     samples = []
     for number in range(1, case.made + 1):
         env = lw.make(case.task, nworld=case.nworld, engine=case.engine, device=case.device, nthread=options.threads)
@@ -491,10 +475,7 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
-    """Train once without interruption and once with kills, and compare the results.
-
-    Every kill waits until the training has made progress.
-    """
+    """Train once without interruption and once with kills, each after some progress, and compare the results."""
     straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)
@@ -528,7 +509,7 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics.csv, but not the columns with measured times."""
+    """Return the rows of a run's metrics.csv without measured times."""
     path = folder / "metrics.csv"
     rows = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
     measured = ("seconds", "samples_per_second")

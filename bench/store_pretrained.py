@@ -24,7 +24,6 @@ FEW, FIRST = 4, 60  # number of worlds and of steps in which a stored policy is 
 
 
 def store(folder: Path, which: str) -> Path:
-    """Store the policy of a run, and return the folder."""
     run = Run.open(folder)
     algorithm = run.config["algorithm"]
     out = FOLDER / file_name(run.task_name)

@@ -7,7 +7,6 @@ Six parts. ``sampling``: many worlds on all threads, relative to native C, which
 substeps on all threads. ``suite``: tasks of dm_control's suite with equal numbers of worlds, relative to dm_control.
 ``single``: one world on one thread, relative to Gymnasium. ``cores``: the part ``sampling`` on 1, 2, 4, ... cores.
 ``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare engine (kept.py).
-The module contestants.py defines what counts as a sample, and runs each contestant.
 """
 
 import dataclasses
@@ -34,7 +33,6 @@ SHORT_TASKS = ("half_cheetah", "humanoid")
 SUITE = (
     "dm/cartpole_swingup", "dm/cheetah_run", "dm/walker_walk", "dm/quadruped_walk", "dm/humanoid_walk",
 )  # fmt: skip
-"""Tasks of the part "suite"."""
 SUITE_WORLDS = (2, 16, 128)
 SCALED = ("humanoid",)
 """Default tasks of the parts "cores" and "worlds"."""
@@ -46,12 +44,10 @@ PARTS = {
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
-"""Contestants of each part. The Warp engine runs only on a GPU, unless --contestants names it."""
+"""Contestants of each part. By default, the Warp engine runs only on a GPU."""
 UNITS = {"sampling": "native", "suite": "dm_control", "single": "gymnasium", "cores": "native"}
-"""The reference contestant of each part."""
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
-"""Maximum number of worlds of the Warp engine on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,9 +77,7 @@ class Case:
     device: str
     seconds: float
     warm: int
-    """Number of steps before the clock starts."""
     policy: str | None = None
-    """Folder of the run whose policy acts; None for random actions."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -101,7 +95,6 @@ def cases(options: Options) -> list[Case]:
         return 1 if part == "single" else own or contestants.worlds(name, cores, options.device)
 
     def sizes(part: str, name: str) -> list[tuple[int, int]]:
-        """Return the numbers of worlds and threads."""
         if part == "cores":
             doubled = [1 << k for k in range(threads.bit_length()) if 1 << k < threads]
             return [(size(part, name, cores), cores) for cores in (*doubled, threads)]
@@ -150,8 +143,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Group the rows of a part by the given entries of their cases; sort the groups by task (in the order of TASKS),
-    then by size."""
+    """Group the rows of a part by entries of their cases; sort the groups by task, then by size."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     order = {task: place for place, task in enumerate(TASKS)}
     mine = [row for row in rows if row.case["part"] == part]
@@ -167,7 +159,7 @@ def rates(rows: Sequence[Row], contestant: str) -> list[float]:
 
 
 def peers(rows: Sequence[Row]) -> str:
-    """Return the versions of the other libraries in the part "suite", in parentheses."""
+    """Return the versions of the part "suite", in parentheses."""
     found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
     return f" ({'; '.join(sorted(found))})" * bool(found)
 
@@ -215,7 +207,6 @@ def kept_line(row: Row) -> list[str]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw the step rates of the part ``sampling``, relative to native C, as points on a logarithmic axis."""
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
     names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]

@@ -1,7 +1,7 @@
 """Run programs of other libraries, in separate virtual environments if they need other package versions.
 
-``peers/NAME/requirements.txt`` pins the packages that a library needs. The library's virtual environment is made at
-first use in ``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``), one per set of requirements and Python version.
+``peers/NAME/requirements.txt`` pins the packages of a library. Its virtual environment is made at first use in
+``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``).
 """
 
 import fcntl
@@ -23,12 +23,7 @@ FOLDER = experiment.FOLDER / "peers"
 
 
 def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
-    """Run a worker that reads a JSON object from stdin, and prints a JSON object as its last line.
-
-    Raises:
-        experiment.Skipped: A package of the worker is missing.
-        RuntimeError: The worker failed.
-    """
+    """Run a worker that reads a JSON object from stdin, and prints a JSON object as its last line."""
     # the other virtual environment must not import packages of this one
     hidden = () if python == Path(sys.executable) else ("PYTHONPATH", "PYTHONHOME")
     env = {name: value for name, value in os.environ.items() if name not in hidden}
@@ -43,8 +38,7 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make the virtual environment of a library if it does not exist; return the path of its Python, and an error
-    message, which is empty after success."""
+    """Make the virtual environment of a library if it does not exist; return its Python, and an error message or ""."""
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")
@@ -57,7 +51,7 @@ def _made(name: str) -> tuple[Path, str]:
             return python, ""
         print(f"making a virtual environment for {name}: {folder}", flush=True)
         shutil.rmtree(folder, ignore_errors=True)
-        # this process's pip installs into the new environment, because installing pip there would take seconds
+        # installing pip into the new environment would take seconds
         pip = [sys.executable, "-m", "pip", "--python", str(python), "--disable-pip-version-check", "--retries", "1"]
         for command in (
             [sys.executable, "-m", "venv", "--without-pip", str(folder)],
@@ -68,16 +62,12 @@ def _made(name: str) -> tuple[Path, str]:
                 shutil.rmtree(folder, ignore_errors=True)
                 said = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()] or ["no message"]
                 return python, f"{name} cannot be installed: {said[-1].strip()}"
-        complete.touch()  # this file is written last, because the program may be killed during the installation
+        complete.touch()  # written last, because the program may be killed during the installation
     return python, ""
 
 
 def python_of(name: str) -> Path:
-    """Return the path of the Python in a library's virtual environment. Make the environment if it does not exist.
-
-    Raises:
-        experiment.Skipped: The environment cannot be made, for example without a network.
-    """
+    """Return the Python of a library's virtual environment, which is made if it does not exist."""
     python, reason = _made(name)
     if reason:
         raise experiment.Skipped(reason)

@@ -1,11 +1,9 @@
 """Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
 
-compare.py runs this program once per checkout, and puts the checkout first on the path. The first answer lists the
-checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of a function in PARTS as
-JSON), and each line on stdout is an answer. The arrays of a unit are written in the order of their computation, to the
-file given as the program's argument.
-
-The program uses only public names of the package: the two checkouts may differ in everything else.
+The first answer lists the checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of
+a function in PARTS as JSON), and each line on stdout is an answer. The arrays of a unit are written to the file given
+as the program's argument. The program uses only public names of the package: the checkouts may differ in everything
+else.
 """
 
 import contextlib
@@ -31,11 +29,11 @@ torch.set_num_threads(1)  # the order of a sum depends on the number of threads
 torch.manual_seed(0)
 
 LEARNERS = ("NPG", "PPO")
-"""Public names of the learners; a learner is compared if both checkouts have it."""
+"""A learner is compared if both checkouts have it."""
 
 
 class MissingModel(Exception):  # noqa: N818
-    """The model of a task needs an optional dependency that is not installed."""
+    """A task's model needs an optional dependency that is not installed."""
 
 
 class Numbers:
@@ -44,16 +42,16 @@ class Numbers:
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
         self.equal: list[tuple[str, str]] = []
-        """Pairs of name prefixes, for example of the runs with and without an interruption. Two arrays whose names
-        differ only in the prefixes of a pair must be equal."""
+        """Pairs of name prefixes, such as those of the runs with and without an interruption, whose arrays must be
+        equal."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:
-        """Add an array, a number, a string, or every leaf of a mapping, a dataclass or a list.
+        """Add an array, a number, a string, or every leaf of a mapping, a dataclass or a list; omit None.
 
         Args:
             name: Name of the value; the names of leaves are appended to it.
-            value: The value. None is omitted.
+            value: The value.
             axes: Names of the leading axes.
             along: Name of an additional leading axis, along which the values of several calls are stacked.
         """
@@ -82,11 +80,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """Make an environment on an engine; on a GPU, the environment is deterministic.
-
-    Raises:
-        MissingModel: The task needs an optional dependency that is not installed.
-    """
+    """Make an environment, which is deterministic on a GPU."""
     import lyceum_warp as lw
 
     try:
@@ -101,7 +95,7 @@ def placed(engine: str, device: str) -> dict[str, Any]:
 
 
 def draw_actions(env: Any, task: str, steps: int) -> torch.Tensor:
-    """Draw actions, (steps, nworld, nact); about a quarter of the numbers exceed their bounds."""
+    """Draw actions, (steps, nworld, nact), of which about a quarter exceed their bounds."""
     space = env.action_space
     unit = np.random.default_rng(zlib.crc32(task.encode())).uniform(-1.3, 1.3, (steps, env.nworld, space.size))
     low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
@@ -111,12 +105,11 @@ def draw_actions(env: Any, task: str, steps: int) -> torch.Tensor:
 
 
 def split(env: Any, state: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Split states into their parts, by name."""
     return {name: state[..., part] for name, part in env.state_space.parts.items()}
 
 
 def observed(env: Any) -> dict[str, Any]:
-    """Return the state, the observations, the action and all results of a step, but not the fields of the physics."""
+    """Return the state, the observations, the action and all results of a step."""
     names = ("reward", "eval", "terminated", "truncated", "done", "done_reason", "success", "episode_step", "time")
     return {
         "state": split(env, env.get_state()),
@@ -130,7 +123,6 @@ def observed(env: Any) -> dict[str, Any]:
 
 
 def constants(model: Any) -> Iterator[tuple[str, Any]]:
-    """Yield the arrays of a compiled model, by MuJoCo's names."""
     for name in dir(model):
         if name.startswith("_") or name == "paths":
             continue
@@ -144,7 +136,7 @@ def constants(model: Any) -> Iterator[tuple[str, Any]]:
 
 
 def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an iteration's numbers, but not its measured times; None becomes nan."""
+    """Return an iteration's numbers without measured times; None becomes nan."""
     return {
         name: without_clocks(value) if isinstance(value, Mapping) else np.nan if value is None else value
         for name, value in row.items()
@@ -224,22 +216,20 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "plants": ("MPPI", {"plants": 3}),
     "control": ("MPPI", {}),
 }
-"""Planners by name: the class and its settings."""
 
 PLAN = (
     "actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights", "adapted_noise",
 )  # fmt: skip
-"""Buffers of a planner; a missing buffer is reported."""
+"""Buffers of a planner."""
 
 TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
 )  # fmt: skip
-"""The fields of a trajectory to compare; fields with measured times are left out."""
+"""Fields of a trajectory without measured times."""
 
 
 def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
-    """Compute several plans with each planner along a controlled episode."""
     import lyceum_warp as lw
 
     for variant in variants:
@@ -263,7 +253,7 @@ def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Se
 
 
 def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
-    """Run iterations of a learner; the results also contain its final networks."""
+    """Run iterations of a learner, and add its final networks."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)
@@ -283,7 +273,7 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
     flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
     quiet = ["--no-video", "--no-plot"]
-    make(task, engine, device)  # this call raises MissingModel if the model is not installed
+    make(task, engine, device)  # raises MissingModel if the model is not installed
     with tempfile.TemporaryDirectory(dir=".") as folder, contextlib.chdir(folder):
         command("train", task, "--iterations", str(iterations), "--out", "whole", *flags, *quiet)
         command("train", task, "--iterations", str(iterations // 2), "--out", "resumed", *flags, *quiet)
@@ -299,11 +289,6 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
 
 
 def command(*words: str) -> None:
-    """Run the checkout's ``lyceum-warp``.
-
-    Raises:
-        RuntimeError: The command failed.
-    """
     program = [sys.executable, "-P", "-m", "lyceum_warp.cli", *words]
     done = subprocess.run(program, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -319,7 +304,6 @@ PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": c
 
 
 def contents() -> dict[str, Any]:
-    """Return the tasks and learners of the checkout."""
     import lyceum_warp as lw
 
     return {
@@ -330,13 +314,12 @@ def contents() -> dict[str, Any]:
 
 
 def failure(error: Exception) -> dict[str, Any]:
-    """Describe an exception in the form that compare.py reports."""
     text = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return {"text": text, "trace": traceback.format_exc(), "missing": isinstance(error, MissingModel)}
 
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Compute a unit, and write its arrays, including those before a failure."""
+    """Compute a unit, and write its arrays, even those before a failure."""
     numbers, answer = Numbers(), {}
     try:
         PARTS[unit.pop("part")](numbers, **unit)

@@ -1,8 +1,7 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-Gymnasium contains all tasks of the comparison except cartpole and herb_reach, and dm_control contains cartpole and its
-own suite. This file defines the missing tasks in NumPy, as a user of these libraries would. This file runs in the other
-libraries' virtual environments, and does not import lyceum_warp.
+It defines the tasks that these libraries lack in NumPy, as their users would. The file runs in the other libraries'
+virtual environments, and does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -31,7 +30,6 @@ GYMNASIUM = {
     "cartpole": "LyceumCartpole-v0",
     "herb_reach": "LyceumHerbReach-v0",
 }
-"""Gymnasium's names of the tasks."""
 
 JUDGE_NEW_STATE = {"humanoid_standup", "reacher", "pusher", "inverted_pendulum", "inverted_double_pendulum"}
 """Tasks whose reward and termination depend only on the state at the end of the step."""
@@ -128,8 +126,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return suite.load(domain, name, task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """A dm_control task with the observations, rewards and terminations of a Gymnasium environment, on dm_control's
-        model and data."""
+        """A dm_control task with the observations, rewards and terminations of a Gymnasium environment."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
@@ -161,8 +158,7 @@ def dm_control_env(task: str, seed: int) -> Any:
             return 0.0 if ends and not self.env.is_healthy else None
 
     class FromStep(FromGymnasium):
-        """A task that computes observation and reward from the new state. The task calls Gymnasium's step function with
-        the physics disabled."""
+        """A task that computes observation and reward by Gymnasium's step function, with the physics disabled."""
 
         def __init__(self, env: Any, physics: Any) -> None:
             super().__init__(env, physics)

@@ -1,8 +1,7 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
 The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
-are uniform within their bounds and drawn before the clock starts. If the library supports it, the last step of an
-episode also resets the environment.
+are uniform within their bounds and drawn before the clock starts.
 """
 
 import json
@@ -17,8 +16,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Number of actions to draw before the clock starts, summed over steps and environments; at least 16 steps are
-drawn."""
+"""Number of actions that are drawn before the clock starts, but for at least 16 steps."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
@@ -38,17 +36,14 @@ ENVPOOL = {
     "dm/walker_walk": "WalkerWalk-v1",
     "dm/humanoid_walk": "HumanoidWalk-v1",
 }
-"""EnvPool's names of the tasks."""
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions (steps, envs, nact) for several steps; the caller repeats them."""
+    """Draw actions, (steps, envs, nact), which the caller repeats."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
 class Gymnasium:
-    """A vector environment of Gymnasium, or a single environment."""
-
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
         from python_tasks import GYMNASIUM
@@ -82,7 +77,7 @@ class DmControl:
     """dm_control's environments in persistent subprocesses, or one environment in this process.
 
     The authors of dm_control recommend subprocesses (github.com/google-deepmind/dm_control/issues/94). Each process
-    steps its share of the environments and gets one message per step; actions and results are in shared memory.
+    gets one message per step; actions and results are in shared memory.
     """
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
@@ -124,14 +119,11 @@ class DmControl:
 
 
 def shared(context: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Make an array that forked processes share."""
     memory = context.RawArray("d", int(np.prod(shape)))
     return np.frombuffer(memory).reshape(shape)
 
 
 class Share:
-    """The environments of one process."""
-
     def __init__(self, task: str, seeds: list[int], actions: Any, results: Any) -> None:
         from python_tasks import dm_control_env
 
@@ -160,7 +152,7 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool's environments; all of them step together."""
+    """EnvPool's environments, which all step together."""
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool
@@ -175,9 +167,9 @@ class EnvPool:
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Return the fraction of environment steps that are transitions, measured over 200 additional steps.
+        """Return the fraction of steps that are transitions, measured over 200 additional steps.
 
-        The step after the end of an episode ignores its action and returns the first observation of the next episode.
+        The step after the end of an episode ignores its action, and returns the next episode's first observation.
         """
         first = [np.mean(self.step(t % len(self.actions)) == 0) for t in range(200)]
         return 1.0 - float(np.mean(first))
@@ -201,15 +193,9 @@ PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoc
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
-    """Return the number of steps and the seconds that they took.
+    """Return the number of steps and the seconds that they took, after ``warm`` steps.
 
-    Args:
-        step: Function that takes a step. The function's argument counts from 0 to ``period`` - 1 and selects the
-            actions.
-        period: Number of steps after which the actions repeat.
-        warm: Number of steps before the clock starts.
-        seconds: Duration of the measurement.
-        wait: Function that waits for the end of asynchronous steps.
+    ``step`` gets the index of the actions, from 0 to ``period`` - 1. ``wait`` waits for the end of asynchronous steps.
     """
     for t in range(warm):
         step(t % period)
@@ -223,7 +209,7 @@ def timed(
             count += 1
         wait()
         now = time.perf_counter()
-        if now - began < 0.01:  # read the clock only every few steps, because reading it takes time
+        if now - began < 0.01:  # reading the clock takes time
             block *= 2
     return count, now - start
 
