@@ -1,7 +1,7 @@
 """Configure the site that ``make docs`` builds from the pages in docs/, CONTRIBUTING.md, CHANGELOG.md and bench/.
 
 The source folder is the repository's root, so relative links lead to the same file in the repository and on the site.
-The build replaces comments ``<!-- KIND: words -->`` by generated text. ``PLACES`` lists the kinds of comments.
+The build replaces comments ``<!-- KIND: words -->``, whose kinds are in ``PLACES``, by generated text.
 """
 
 import logging

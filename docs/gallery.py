@@ -1,8 +1,8 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-If FOLDER contains a run of a task, the run's policy controls the task. MPPI controls tasks without a run. By default,
-FOLDER contains the pretrained policies. The program writes a moving picture of each task, its command and its result
-into docs/images/gallery/, and then the page gallery.md. Without the argument TASK, the program draws all tasks.
+The policy of a run in FOLDER (by default a pretrained policy) controls its task, and MPPI controls other tasks. The
+program writes pictures and results into docs/images/gallery/, and then the page gallery.md. By default, it draws all
+tasks.
 """
 
 import argparse
@@ -41,13 +41,13 @@ class Show:
     """Settings for the picture of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Planner settings, and options of the planner's worlds, that override the task's suggestions."""
+    """Settings of the planner and options of its worlds."""
     params: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Task parameters that apply only in the planner's worlds."""
+    """Task parameters of the planner's worlds."""
     replan_every: int = 1
-    """Number of steps from one MPPI plan to the next."""
+    """Steps from one plan to the next."""
     seconds: float = 4.0
-    """Simulated seconds in the picture, or fewer if the episode ends earlier."""
+    """Maximum simulated seconds of the picture."""
     start: float = 0.0
     """Simulated seconds before the picture begins."""
     seed: int = 0
@@ -147,7 +147,7 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""The settings of tasks for which the defaults of Show do not suffice."""
+"""Settings of tasks that need other ones than the defaults."""
 
 # there is no policy for these tasks, and a planner lets the robots fall soon
 for _name in ("g1_full_velocity", "g1_rough_velocity"):
@@ -200,7 +200,7 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 
 def written(flags: dict[str, Any]) -> str:
-    """Format flags for a command line, each preceded by a space."""
+    """Format flags, each preceded by a space."""
     words = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")
@@ -220,7 +220,7 @@ def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
 
 @torch.no_grad()
 def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
-    """Return an episode's states under a policy. A robot that follows commands walks straight ahead, without pushes."""
+    """Return an episode's states under a policy, without pushes."""
     env.rand_reset(seed=show.seed)
     state = env.get_state()
     parts = env.state_space.split(state)
@@ -250,7 +250,7 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
 
 
 def save(images: list[Image.Image], path: Path) -> None:
-    """Write a moving picture in the best quality that the size limit allows."""
+    """Write a moving picture in the best quality within the size limit."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for quality in (80, 65, 50, 35, 20):
         file = io.BytesIO()

@@ -1,7 +1,6 @@
 """Generate the site's reference from the package: public names, and tables of tasks.
 
-``names`` and ``tasks`` return MyST Markdown for conf.py. Every public name and every task must be on one page, which
-tests/test_docs.py checks.
+Every public name and every task must be on one page, which tests/test_docs.py checks.
 """
 
 import ast
@@ -32,7 +31,7 @@ ALIASES = {
     "quat": ("class", "A quaternion in MuJoCo's order w, x, y, z: ``wp.vec4``."),
     "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
 }
-"""Public names of the package that refer to Warp objects, with their kinds and descriptions."""
+"""Public names that refer to Warp objects, with their kinds and descriptions."""
 
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
@@ -47,16 +46,12 @@ SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=Fal
 
 
 def names(words: str) -> str:
-    """Return the documentation of public names of the package.
-
-    Args:
-        words: Names, separated by spaces.
-    """
+    """Return the documentation of public names, separated by spaces."""
     return "\n".join(["```{eval-rst}", *(line for name in words.split() for line in entry(lw, name)), "```"])
 
 
 def modules(words: str) -> str:
-    """Return the documentation of public modules, such as ``lw.walkers``."""
+    """Return the documentation of modules such as ``lw.walkers``."""
     lines = ["```{eval-rst}"]
     for word in words.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
@@ -92,7 +87,7 @@ def is_public(cls: type) -> bool:
 
 
 def members(cls: type) -> list[str]:
-    """Return a class's public members with docstrings, including members inherited from private base classes."""
+    """Return a class's public members with docstrings, including those of private base classes."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
@@ -102,7 +97,7 @@ def members(cls: type) -> list[str]:
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Convert a docstring to reStructuredText, without the list of attributes, which are documented as members."""
+    """Convert a docstring to reStructuredText, without the attributes, which are documented as members."""
     if what == "class" and "Attributes:" in lines:
         del lines[lines.index("Attributes:") :]
     lines[:] = converted("\n".join(lines))
@@ -115,14 +110,14 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Shorten a signature: omit a dataclass's fields, which are documented as members, and shorten default objects."""
+    """Shorten a signature: omit a dataclass's fields, and shorten default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
 
 
 def warp_function(function: Any, name: str) -> list[str]:
-    """Return a Warp function's documentation: signatures with the types of all overloads, and the docstring."""
+    """Return a Warp function's documentation: signatures of all overloads, and the docstring."""
     found: dict[tuple[str, ...], dict[str, dict[str, None]]] = {}
     for overload in dict.fromkeys(each.func for each in (*function.user_overloads.values(),
                                                          *function.user_templates.values())):  # fmt: skip
@@ -156,11 +151,7 @@ def type_name(annotation: Any) -> str:
 
 
 def tasks(words: str) -> str:
-    """Return a section for each task: a description, observations, actions, parameters and metrics.
-
-    Args:
-        words: Names of tasks, separated by spaces.
-    """
+    """Return a section for each task; names are separated by spaces."""
     return "\n\n".join(map(task_section, words.split()))
 
 
@@ -195,7 +186,7 @@ def task_section(name: str) -> str:
 
 
 def facts(task: BoundTask) -> list[str]:
-    """Return a table of a task's step and episode lengths, physics and planner settings."""
+    """Return a table of a task's timing, physics and planner settings."""
     cls, seconds = task.task, task.timestep
     rows = [
         ("step", f"{seconds:g} s, {count(task.frame_skip, 'substep')} of {1000 * task.model.opt.timestep:g} ms"),
@@ -245,7 +236,7 @@ def metrics(task: BoundTask) -> list[str]:
 
 
 def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
-    """Return the parameters with their defaults, and their comments from the task's files."""
+    """Return the parameters, their defaults, and their comments in the task's files."""
     meanings = comments(task.task)
     rows = []
     for name in task.source.params.vars:
@@ -273,7 +264,7 @@ def spelled(default: Any, value: Any) -> str:
 
 
 def comments(task: type) -> dict[str, str]:
-    """Return the comments behind the fields of ``Params`` in the files of a task and of its base classes."""
+    """Return the comments behind the fields of ``Params``, including those of base classes."""
     found: dict[str, str] = {}
     for cls in reversed(task.__mro__[:-1]):
         lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
