@@ -37,9 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
 PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
-"""Packages whose versions --out stores."""
 LINES = 12
-"""Maximum number of printed differences per unit."""
 
 Part = Literal["env", "plans", "learners", "commands"]
 PARTS: tuple[Part, ...] = ("env", "plans", "learners", "commands")
@@ -123,7 +121,6 @@ class Difference:
 
 
 def digest(array: np.ndarray) -> str:
-    """Hash an array's type, shape and bits."""
     head = f"{array.dtype.str} {array.shape} ".encode()
     return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
 
@@ -161,7 +158,6 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
 def differences(
     unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
 ) -> Iterator[Difference]:
-    """Yield the differences in the order in which the arrays were computed."""
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
         whole = f"{unit}/{name}"
@@ -219,7 +215,6 @@ class Side:
             )  # fmt: skip
 
     def contents(self) -> dict[str, Any]:
-        """Return the checkout's tasks and learners, or a failure."""
         found = self.answer()
         if "file" in found and not Path(found["file"]).is_relative_to(self.root):
             text = f"imports {found['file']} instead of {self.root}"
@@ -302,7 +297,6 @@ class Report:
     ignored: int = 0
 
     def kept(self, name: str) -> bool:
-        """Return whether a name is compared, and count excluded names."""
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False

@@ -1,7 +1,7 @@
 """Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
 A sample is one environment step whose observation and reward the caller has received. All contestants use the same
-model, substeps and bounds of uniformly random actions, and each its best number of worlds per thread.
+model, substeps and random actions, and each its best number of worlds per thread.
 """
 
 import importlib.util

@@ -3,8 +3,8 @@
     lyceum-warp bench equivalence --device cuda
 
 The area under a learning curve is the run's mean return over all iterations. Two one-sided t tests (TOST) at the level
-0.05 compare the areas of 20 seeds on each engine. They are equivalent if the 90 % interval of the difference of the
-means (Welch) lies within one standard deviation between seeds. This margin was chosen before the first run.
+0.05 compare the areas of 20 seeds on each engine. The margin, one standard deviation between seeds, was chosen before
+the first run.
 """
 
 import dataclasses
@@ -75,8 +75,8 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
 
 
 def equivalence(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
-    """Return the difference of the means (b minus a), its 90 % interval, the margin, and the verdict: "equivalent",
-    "different" (the interval lies outside the margin) or "not shown" (neither)."""
+    """Compare means by Welch's 90 % interval of their difference (b minus a), and a margin of one standard
+    deviation."""
     parts = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
     spread = sum(parts)
     freedom = spread**2 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1)) if spread else 1.0

@@ -81,7 +81,6 @@ class Row:
     case: dict[str, Any]
     result: dict[str, Any]
     provenance: dict[str, Any]
-    """Machine, versions, commit and date."""
     seconds: float
     """Wall-clock time of the measurement, including setup."""
 
@@ -128,7 +127,6 @@ class Experiment:
 
 
 def load(name: str) -> Experiment:
-    """Import an experiment by name."""
     choose((name,), NAMES, what="experiment")
     return importlib.import_module(name).EXPERIMENT
 
@@ -157,7 +155,6 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    """Return the results files of the given experiments, or of all experiments with results, by name."""
     found = {name: results / f"{name}.jsonl" for name in choose(names, NAMES, what="experiment")}
     if not names:
         found = {name: path for name, path in found.items() if path.exists()}
@@ -197,7 +194,6 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    """Return a row's hardware; only numbers from equal hardware are compared."""
     return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
 
 
@@ -350,7 +346,6 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    """Yield each case with its duration and the result or the exception."""
     if not experiment.apart and options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
@@ -403,7 +398,6 @@ def _interrupt_after_parent() -> None:
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
-    """Return disjoint sets of cores, one per job."""
     usable = sorted(os.sched_getaffinity(0))
     each = threads or len(usable) // max(1, jobs)
     if jobs < 1 or each < 1 or jobs * each > len(usable):

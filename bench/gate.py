@@ -6,8 +6,8 @@
 The mean policy controls the robot on the C engine under the task's exact physics.
 
 A Unitree G1 must pass nanoG1's gate (kingjulio8238/nanoG1, eval.py): six commands of 20 s, each from four initial
-states, and the gait of 2,000 steps at 0.5 m/s, without noise and pushes. nanoG1's actions are in units of 0.25 rad, so
-the action change is the change of a servo's target, divided by 0.25 rad.
+states, and the gait of 2,000 steps at 0.5 m/s, without noise and pushes. The action change is measured in nanoG1's
+unit: 0.25 rad of a servo's target.
 
 Any other robot is tested in 100 episodes of 20 s with noise: ten commands from ten initial states, once without and
 once with pushes.
@@ -65,7 +65,6 @@ BESIDE = {
     "pushed_falls": "falls with pushes", "pushed_velocity_error": "velocity error with pushes, m/s",
     "pushed_yaw_rate_error": "yaw rate error with pushes, rad/s",
 }  # fmt: skip
-"""Descriptions of measured numbers without a limit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +86,6 @@ class Case:
     gate: str
     run: str
     policy: str
-    """Hash of the policy's file."""
     starts: int
     steps: int
 
@@ -113,12 +111,9 @@ class Steps:
     """Results of every step in every world."""
 
     velocity_error: torch.Tensor
-    """(steps, nworld), m/s."""
     yaw_rate_error: torch.Tensor
-    """(steps, nworld), rad/s."""
     fell: torch.Tensor
     action: torch.Tensor
-    """(steps, nworld, nact)."""
     velocity: torch.Tensor
     """``qvel`` after the step, (steps, nworld, nv)."""
 
@@ -149,7 +144,6 @@ def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
-    """Return parameters that turn off noise, pushes and differences between robots, except for friction."""
     slide, spin, roll = env.model.geom_friction[env.task.params["foot_geoms"][0]].tolist()
     return dict.fromkeys(NOISES, 0.0) | {
         "encoder_bias": 0.0, "trunk_offset": [0.0, 0.0, 0.0], "push_seconds": [NEVER, NEVER],
@@ -158,7 +152,6 @@ def calm(env: lw.Env) -> dict[str, Any]:
 
 
 def home(env: lw.Env) -> torch.Tensor:
-    """Return the task's fixed initial state without pushes."""
     env.reset()
     state = env.get_state()
     env.state_space.split(state)["push_timer"][:] = NEVER

@@ -105,7 +105,7 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
 
 
 def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **place: Any) -> dict[str, Any]:
-    """Return the median step times of an environment and of its bare engine; ``policy`` is the folder of a run."""
+    """Return the median step times of an environment and of its bare engine."""
     env = lw.make(task, nworld=nworld, **place)
     actions = contestants.actions(env, seed=0)
     acting = None if policy is None else lw.load(policy, device=env.obs.device)

@@ -64,7 +64,6 @@ class Case:
     threads: int
     seconds: float
     repeat: int
-    """Number of the repeat, and seed of the first episode."""
 
 
 def cases(options: Options) -> list[Case]:
@@ -91,7 +90,6 @@ def cases(options: Options) -> list[Case]:
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    """Return the given names that the task defines, or the task's default physics."""
     found = find_task(task)
     if names:
         return [name for name in names if name == "exact" or name in found.physics]
@@ -111,7 +109,6 @@ def estimate(case: Case) -> float:
 
 @torch.no_grad()
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Run episodes in real time for the seconds of the case."""
     if case.task.startswith("adroit"):
         installed("gymnasium_robotics", "gymnasium-robotics")
     torch.set_num_threads(1)

@@ -4,9 +4,8 @@
     lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
 
 The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean return
-is taken over the last 100 episodes, without each world's first episode, which starts at a random step. If iterations
-are too short for whole episodes, it is taken over 16 separate episodes of the stochastic policy. On go1_velocity, a
-robot that stands still also reaches high returns, so the program also measures tracking errors and falls.
+is taken over the last 100 episodes, or over 16 separate episodes if iterations are short. On go1_velocity, a robot that
+stands still also reaches high returns, so the program also measures tracking errors and falls.
 """
 
 import collections
@@ -116,7 +115,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @torch.no_grad()
 def walk(case: Case, policy: lw.GaussianPolicy) -> dict[str, float]:
-    """Return the mean tracking errors and falls of a mean policy in new worlds."""
     nworld, steps = WALKED
     env = lw.make(case.task, nworld=min(nworld, case.nworld), seed=1000, device=case.device)
     sums = torch.zeros(3, dtype=torch.float64, device=env.obs.device)

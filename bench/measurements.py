@@ -11,7 +11,6 @@ from typing import Any
 from lyceum_warp.support.versions import versions
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""Measurements are compared only if these entries are equal."""
 
 _QUERY = {
     "driver": "driver_version",

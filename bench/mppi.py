@@ -30,7 +30,6 @@ from lyceum_warp.controllers.control_report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,
             "arm_hand_pickup": 300}  # fmt: skip
-"""Steps of an episode, by task."""
 PAPER = ("reach", "adroit_pen")
 PLANS = ("reach", "half_cheetah", "adroit_pen")
 TASKS = ("reach", "half_cheetah", "adroit_pen", "herb_reach", "panda_lift", "aloha_lift", "arm_hand_pickup")
@@ -65,18 +64,14 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A block of episodes, or a series of plans."""
-
     part: str
     task: str
     contestant: str
     repeat: int
-    """Number of the repeat or of the set of seeds."""
     first: int
     count: int
     steps: int
     seconds: float
-    """Seconds spent on timing plans, apart from the episodes."""
     threads: int
 
 
@@ -130,7 +125,6 @@ def planner(task: str, contestant: str, threads: int, device: str, plants: int =
 
 @functools.cache
 def python_planner(task: str, threads: int) -> Any:
-    """Make the Python planner with one process per thread."""
     return python_mppi.PythonMPPI(task, planner(task, "mppi", threads, "cpu"), threads)
 
 
@@ -198,7 +192,6 @@ def episodes_together(
 
 @functools.cache
 def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
-    """Return the states of an episode, (steps, state_size)."""
     return lw.control(plant(task, steps), planner(task, "mppi", threads, "cpu"), seed=seed).states[:-1]
 
 

@@ -77,14 +77,13 @@ PPO: dict[str, dict[str, Any]] = {
         "clip_range": 0.1, "n_epochs": 20, "gae_lambda": 0.95, "max_grad_norm": 1.0, "vf_coef": 0.871923,
     },
 }  # fmt: skip
-"""Settings of stable-baselines3's PPO, with one environment and normalised observations and rewards, from
-https://github.com/DLR-RM/rl-baselines3-zoo (hyperparams/ppo.yml; for TRPO hyperparams/trpo.yml)."""
+"""From https://github.com/DLR-RM/rl-baselines3-zoo (hyperparams/ppo.yml), with one environment."""
 
 _TRPO = {"batch_size": 128, "n_steps": 1024, "gamma": 0.99, "gae_lambda": 0.95, "sub_sampling_factor": 1,
          "cg_max_steps": 25, "cg_damping": 0.1, "n_critic_updates": 20, "learning_rate": 1e-3}  # fmt: skip
 
 TRPO = {"swimmer": _TRPO | {"gamma": 0.9999}, "hopper": _TRPO, "walker2d": _TRPO}
-"""Settings of sb3-contrib's TRPO, with two environments and normalised observations and rewards."""
+"""From hyperparams/trpo.yml, with two environments."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +115,6 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs: compared contestants are adjacent, and runs on a GPU come last."""
     short, cuda = options.short, options.device.startswith("cuda")
     contestants = choose(options.contestants, ON_CPU + ON_GPU, ON_CPU + (ON_GPU if cuda else ()), what="contestant")
     for name in contestants:
@@ -144,12 +142,9 @@ def estimate(case: Case) -> float:
 # evaluations
 
 Act = Callable[[np.ndarray], np.ndarray]
-"""A function that maps observations (n, nobs) to actions (n, nact)."""
 
 
 class Judge:
-    """Evaluate policies in Gymnasium, always from the same initial states."""
-
     def __init__(self, task: str, episodes: int) -> None:
         self.envs = [gymnasium.make(TASKS[task], disable_env_checker=True) for _ in range(episodes)]
 
@@ -168,8 +163,6 @@ class Judge:
 
 
 class Curve:
-    """Collect the learning curve of a run, whose clock stops during evaluations."""
-
     def __init__(self, case: Case) -> None:
         self.case, self.judge = case, Judge(case.task, 2 if case.short else EPISODES)
         self.points: list[tuple[int, float, float]] = []
@@ -187,7 +180,6 @@ class Curve:
         return samples >= (self.case.samples or math.inf) or self.seconds() >= self.case.limit
 
     def due(self, samples: int) -> bool:
-        """Return whether one of the evenly spaced evaluations is due."""
         return self.ended(samples) or self._evaluations(samples) >= self._next
 
     def _evaluations(self, samples: int) -> float:
@@ -208,7 +200,6 @@ class Curve:
 
 
 def mean_action(policy: torch.nn.Module) -> Act:
-    """Return a function that computes the mean actions of a copy of a policy."""
     now = copy.deepcopy(policy).cpu()
 
     @torch.no_grad()
@@ -292,8 +283,6 @@ def stable_baselines3(case: Case, options: Options, curve: Curve) -> dict[str, A
         return algorithm("MlpPolicy", envs, seed=case.seed, device="cpu", **words), envs
 
     class Watch(BaseCallback):
-        """A callback that evaluates the policy between two updates."""
-
         def _on_step(self) -> bool:
             return curve.seconds() < case.limit
 
@@ -340,7 +329,6 @@ def runs(rows: Sequence[Row]) -> dict[str, dict[str, list[Row]]]:
 
 
 def values_at(row: Row, samples: Sequence[float]) -> np.ndarray:
-    """Interpolate a curve's returns at given numbers of samples; nan beyond its end."""
     x, _, y = zip(*row.result["curve"], strict=True)
     return np.interp(samples, x, y, left=np.nan, right=np.nan)
 

@@ -2,10 +2,9 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds, for a task and a setting, the rank correlations that ``lyceum-warp tune
---planning`` measures, and three returns of the same episodes. The planner uses the task's physics for R_exact and the
-setting's physics for R_setting; R_none is measured without a planner. The loss is (R_exact - R_setting) / (R_exact -
-R_none). Episodes do not run in real time, so the load of the machine does not matter.
+Each line of results/rank-loss.jsonl holds the rank correlations of ``lyceum-warp tune --planning`` and three returns.
+The loss is (R_exact - R_setting) / (R_exact - R_none): the return under the task's physics, under the setting's, and
+without a planner. Episodes do not run in real time, so the load of the machine does not matter.
 """
 
 import dataclasses
@@ -64,7 +63,6 @@ STUDIES = {
 
 
 def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> np.ndarray:
-    """Return the returns of one episode per plant, (plants,), with a planner that uses the given physics."""
     env = lw.make(task, nworld=study.plants, autoreset=False)
     env.rand_reset(1000)
     plan = lw.MPPI(task, plants=study.plants, seed=1000, physics=physics, **study.words)

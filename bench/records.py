@@ -74,11 +74,9 @@ class Case:
     cache: str
     device: str
     flags: str
-    """Flags that not all runs have in common."""
 
 
 def cases(options: Options) -> list[Case]:
-    """List the runs of tasks that have flags for the device."""
     kind = options.device.partition(":")[0]
     tasks = choose(options.tasks, RECORDS, ("hopper",) if options.short else (), what="task")
     for task in options.tasks:
@@ -92,7 +90,6 @@ def cases(options: Options) -> list[Case]:
 
 
 def command(case: Case, folder: Path, device: str) -> list[str]:
-    """Return the command that starts a run, or continues it if there is a checkpoint."""
     train = [sys.executable, "-m", "lyceum_warp.cli", "train"]
     if (folder / "checkpoint.pt").exists():
         return [*train, "--resume", str(folder), *COMMON]
@@ -127,7 +124,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
-    """Return the command's environment variables, which select a kernel cache."""
     if case.cache == "warm":
         if not folder.exists():
             with tempfile.TemporaryDirectory() as spare:
@@ -169,7 +165,6 @@ def timed(
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    """Make a table with a line for each combination of task, cache and flags."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))

@@ -4,11 +4,10 @@
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average: an invalid
-state, an excessive velocity or a non-finite action. For a NaN reward, a NaN observation or a negative mass, the program
-writes a variant of the task (``VARIANT``) with an additional action. Every fault must be reported in its world and
-step, and no other fault may be reported. A second environment without faults must give bitwise equal numbers for each
-world until its first fault. Every fourth world gets no faults.
+Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. Some kinds
+of faults are requested by an additional action in a variant of the task (``VARIANT``). Every fault must be reported in
+its world and step, and no other fault may be reported. A second environment without faults must give bitwise equal
+numbers for each world until its first fault. Every fourth world gets no faults.
 
 A run is divided into chunks. Each chunk continues from the states that the chunk before it wrote into the folder
 ``--work``.
@@ -140,8 +139,6 @@ class Options(experiment.Options):
 
 @dataclasses.dataclass(frozen=True)
 class Faults:
-    """One chunk of a task's run."""
-
     task: str
     chunk: int
     steps: int
@@ -334,7 +331,6 @@ def tally(
 
 
 def inject(case: Faults, options: Options) -> dict[str, Any]:
-    """Step two environments for a chunk, one with faults and one without."""
     torch.set_num_threads(1)
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
@@ -453,7 +449,6 @@ def memory(device: torch.device) -> tuple[int, int]:
 
 
 def slope(samples: Sequence[Sequence[int]], column: int) -> float:
-    """Return the growth of memory per step or per environment, without the first sample."""
     points = np.array(samples[1:], dtype=float)
     return float(np.polyfit(points[:, 0], points[:, column], 1)[0])
 
@@ -509,7 +504,6 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
 
 
 def table(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics.csv without measured times."""
     path = folder / "metrics.csv"
     rows = csv.DictReader(path.read_text().splitlines()) if path.exists() else ()
     measured = ("seconds", "samples_per_second")

@@ -1,7 +1,6 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
-Each run is stored in lyceum_warp/pretrained/TASK: its settings, the policy's weights in float16, and the return of the
-stored policy.
+lyceum_warp/pretrained/TASK then has the run's settings, the policy's weights in float16, and its return.
 """
 
 import argparse

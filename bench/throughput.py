@@ -3,10 +3,10 @@
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
-Six parts. ``sampling``: many worlds on all threads, relative to native C, which is ``mujoco.rollout`` with the same
-substeps on all threads. ``suite``: tasks of dm_control's suite with equal numbers of worlds, relative to dm_control.
-``single``: one world on one thread, relative to Gymnasium. ``cores``: the part ``sampling`` on 1, 2, 4, ... cores.
-``worlds``: lyceum_warp with 1 to 131,072 worlds. ``kept``: an environment compared with its bare engine (kept.py).
+Six parts. ``sampling``: many worlds on all threads, relative to native C (``mujoco.rollout``). ``suite``: tasks of
+dm_control's suite with equal numbers of worlds, relative to dm_control. ``single``: one world on one thread, relative
+to Gymnasium. ``cores``: the part ``sampling`` on 1, 2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds.
+``kept``: an environment compared with its bare engine (kept.py).
 """
 
 import dataclasses
@@ -35,7 +35,6 @@ SUITE = (
 )  # fmt: skip
 SUITE_WORLDS = (2, 16, 128)
 SCALED = ("humanoid",)
-"""Default tasks of the parts "cores" and "worlds"."""
 PARTS = {
     "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
     "suite": ("dm_control", "c", "envpool"),
@@ -143,7 +142,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], list[Row]]:
-    """Group the rows of a part by entries of their cases; sort the groups by task, then by size."""
     found: dict[tuple[Any, ...], list[Row]] = {}
     order = {task: place for place, task in enumerate(TASKS)}
     mine = [row for row in rows if row.case["part"] == part]
@@ -159,7 +157,6 @@ def rates(rows: Sequence[Row], contestant: str) -> list[float]:
 
 
 def peers(rows: Sequence[Row]) -> str:
-    """Return the versions of the part "suite", in parentheses."""
     found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
     return f" ({'; '.join(sorted(found))})" * bool(found)
 

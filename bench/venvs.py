@@ -67,7 +67,6 @@ def _made(name: str) -> tuple[Path, str]:
 
 
 def python_of(name: str) -> Path:
-    """Return the Python of a library's virtual environment, which is made if it does not exist."""
     python, reason = _made(name)
     if reason:
         raise experiment.Skipped(reason)

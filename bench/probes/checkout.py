@@ -109,7 +109,6 @@ def split(env: Any, state: torch.Tensor) -> dict[str, torch.Tensor]:
 
 
 def observed(env: Any) -> dict[str, Any]:
-    """Return the state, the observations, the action and all results of a step."""
     names = ("reward", "eval", "terminated", "truncated", "done", "done_reason", "success", "episode_step", "time")
     return {
         "state": split(env, env.get_state()),
@@ -220,13 +219,11 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
 PLAN = (
     "actions", "nominal", "knot_actions", "standard_noise", "sampled", "returns", "weights", "adapted_noise",
 )  # fmt: skip
-"""Buffers of a planner."""
 
 TRAJECTORY = (
     "states", "obs", "actions", "rewards", "evals", "success", "plan_of", "plan_steps", "plan_failed", "plan_effective",
     "done_reason",
 )  # fmt: skip
-"""Fields of a trajectory without measured times."""
 
 
 def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Sequence[str]) -> None:
@@ -253,7 +250,6 @@ def plans(numbers: Numbers, *, task: str, engine: str, device: str, variants: Se
 
 
 def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: str, iterations: int) -> None:
-    """Run iterations of a learner, and add its final networks."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)
@@ -268,7 +264,6 @@ def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: 
 
 
 def commands(numbers: Numbers, *, task: str, engine: str, device: str, iterations: int) -> None:
-    """Train with the command line, once without and once with an interruption."""
     where = placed(engine, device)
     flags = ["--engine", engine, "--device", where["device"], *(["--deterministic"] if where["deterministic"] else [])]
     flags += ["--samples", "1024", "--nworld", "4", "--seed", "7", "--mean-every", "2", "--mean-episodes", "2"]
@@ -297,7 +292,6 @@ def command(*words: str) -> None:
 
 
 PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": commands}
-"""The parts of the comparison, by their names in --parts."""
 
 
 # the functions below exchange messages with compare.py

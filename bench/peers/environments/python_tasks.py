@@ -1,7 +1,6 @@
 """Define tasks for Gymnasium and dm_control with the formulas and models of lyceum_warp's tasks.
 
-It defines the tasks that these libraries lack in NumPy, as their users would. The file runs in the other libraries'
-virtual environments, and does not import lyceum_warp.
+The file runs in the other libraries' virtual environments, and does not import lyceum_warp.
 """
 
 from pathlib import Path
@@ -111,7 +110,6 @@ POSITIONS = {
     "humanoid": lambda env: mass_center(env.model, env.data)[0],
     "ant": lambda env: env.data.body("torso").xpos[0],
 }
-"""Index of the coordinate whose velocity is rewarded; by default the first."""
 
 
 def dm_control_env(task: str, seed: int) -> Any:
@@ -126,8 +124,6 @@ def dm_control_env(task: str, seed: int) -> Any:
             return suite.load(domain, name, task_kwargs={"random": seed})
 
     class FromGymnasium(control.Task):
-        """A dm_control task with the observations, rewards and terminations of a Gymnasium environment."""
-
         def __init__(self, env: Any, physics: Any) -> None:
             self.env, self.position = env, POSITIONS.get(task, lambda env: env.data.qpos[0])
             env.model, env.data = physics.model.ptr, physics.data.ptr

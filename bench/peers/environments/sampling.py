@@ -39,7 +39,6 @@ ENVPOOL = {
 
 
 def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
-    """Draw actions, (steps, envs, nact), which the caller repeats."""
     return np.random.default_rng(seed).uniform(low, high, (max(16, KEPT_ACTIONS // envs), envs, *low.shape))
 
 
@@ -152,8 +151,6 @@ class Share:
 
 
 class EnvPool:
-    """EnvPool's environments, which all step together."""
-
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import envpool
 
