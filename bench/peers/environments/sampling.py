@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 KEPT_ACTIONS = 4096
-"""Number of actions that are drawn before the clock starts, but for at least 16 steps."""
+"""Number of actions that are drawn before the clock starts."""
 
 ENVPOOL = {
     "hopper": "Hopper-v5",
