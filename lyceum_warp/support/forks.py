@@ -1,4 +1,4 @@
-"""Make environments raise an error in forked children, where they would wait for the parent's threads for ever."""
+"""Make environments raise an error in forked children, where they would wait for the parent's threads forever."""
 
 import os
 import weakref
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # its destructor would wait for ever
+            _kept.append(getattr(thing, name))  # its destructor would wait forever
             setattr(thing, name, LeftInParent())
 
 
