@@ -297,6 +297,6 @@ def _check_equal(run: Run, learner: Learner) -> None:
         for name, value in before.items():
             if value != after.get(name):
                 raise ValueError(
-                    f"the run in {run.folder} has {name} {value}, not {after.get(name)}, and a run keeps its "
+                    f"{run.folder / 'config.json'} has {name} {value}, not {after.get(name)}, and a run keeps its "
                     f"settings: omit {name}, or start a new run in another folder"
                 )

@@ -112,4 +112,4 @@ def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> 
     share = config.min_restarts
     if share is None:
         share = 0.5 if horizon > _LONG_EPISODE * steps else 0.0
-    return min(nworld, round(share * nworld * steps / horizon))
+    return round(min(nworld, share * nworld * steps / horizon))

@@ -1,5 +1,6 @@
 """Check values that users pass."""
 
+import contextlib
 import math
 import numbers
 from collections.abc import Iterable, Sequence
@@ -83,8 +84,9 @@ def described(value: Any) -> str:
 def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """Convert a finite number of any type to a float within bounds."""
     if not isinstance(value, bool) and isinstance(value, numbers.Real):
-        number = float(value)
-        if math.isfinite(number) and low <= number <= high:
-            return number
+        with contextlib.suppress(OverflowError):  # float(10**400)
+            number = float(value)
+            if math.isfinite(number) and low <= number <= high:
+                return number
     bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
     raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")

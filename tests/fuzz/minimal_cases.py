@@ -69,6 +69,9 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "config.json of another device": ("config.json", "eval", _json(device="x")),
     "config.json with a text for a number": ("config.json", "resume", _json(keep_every="x")),
     "config.json with a seed of 2^63": ("config.json", "from", _json(seed=2**63)),
+    "config.json with min_restarts of 10^30": (
+        "config.json", "resume", lambda data: data.replace(b'"min_restarts": null', b'"min_restarts": 1' + 30 * b"0")
+    ),
     "metrics.csv with a word for a number": ("metrics.csv", "resume", lambda data: data.replace(b"\n1,", b"\none,", 1)),
     "metrics.csv that is not UTF-8": ("metrics.csv", "resume", lambda data: data + b"\xff"),
     "policy.pt whose shape is a text": ("policy.pt", "load", _policy(shape="x")),

@@ -23,7 +23,14 @@ def test_error_of_an_invalid_whole_number_names_the_bounds(value: Any) -> None:
 def test_finite_number_within_its_bounds_is_converted_to_float() -> None:
     for value in (1, 1.0, np.float32(1)):
         assert type(finite_number("gamma", value, low=0, high=1)) is float
-    for wrong, bounds in ((2, {"low": 0, "high": 1}), (-1, {"low": 0}), (float("nan"), {}), ("a", {}), (True, {})):
+    for wrong, bounds in (
+        (2, {"low": 0, "high": 1}),
+        (-1, {"low": 0}),
+        (float("nan"), {}),
+        (10**400, {}),
+        ("a", {}),
+        (True, {}),
+    ):
         with pytest.raises(ValueError, match="gamma must be a finite number"):
             finite_number("gamma", wrong, **bounds)
 
