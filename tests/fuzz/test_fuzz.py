@@ -5,50 +5,43 @@ The message of a failure names the case and the command that repeats it.
 
 import functools
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import pytest
 from guarded import Outcome, attacks, replay
 from minimal_cases import COMMANDS, FILES, KEYWORDS
 
-FEW = {
-    "file_attacks.py": {
-        "config.json": 1, "kept config.json": 1, "metrics.csv": 1, "policy.pt": 1, "best.pt": 1,
-        "checkpoint.pt": 1, "previous.pt": 1, "episode.npz": 1, "kept model": 1, "kept table": 1, "model.xml": 1,
-        "table.npy": 1,
-    },
-    "keyword_attacks.py": {
-        "EnvOptions": 15, "PhysicsOptions": 15, "MPPIConfig": 15, "NPGConfig": 15, "make": 4, "MPPI": 4, "CEM": 2,
-        "NPG": 3, "evaluate": 3, "train": 3, "control": 3, "control_async": 2, "Rollout": 3, "OpenLoop": 3, "load": 6,
-        "load_value": 6, "GaussianPolicy": 20, "ValueFunction": 20,
-    },
-    "command_attacks.py": {
-        "tasks": 1, "new": 1, "check": 1, "train": 1, "train --resume good": 1, "train --from good": 1, "eval": 1,
-        "export": 1, "plan": 1, "view": 1, "bench": 1,
-    },
+KINDS = {
+    "file_attacks.py": (
+        "config.json", "kept config.json", "metrics.csv", "policy.pt", "best.pt", "checkpoint.pt", "previous.pt",
+        "episode.npz", "kept model", "kept table", "model.xml", "table.npy",
+    ),
+    "keyword_attacks.py": (
+        "EnvOptions", "PhysicsOptions", "MPPIConfig", "NPGConfig", "make", "MPPI", "CEM", "NPG", "evaluate", "train",
+        "control", "control_async", "Rollout", "OpenLoop", "load", "load_value", "GaussianPolicy", "ValueFunction",
+    ),
+    "command_attacks.py": (
+        "tasks", "new", "check", "train", "train --resume good", "train --from good", "eval", "export", "plan", "view",
+        "bench",
+    ),
 }  # fmt: skip
-"""Number of cases of each kind, by attack program."""
-_MANY = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
-MANY = {program: dict.fromkeys(FEW[program], count) for program, count in _MANY.items()}
-"""Number of cases for ``make test-all``, by attack program."""
+"""Kinds of random cases, by attack program."""
+COUNTS = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
+"""Number of random cases of each kind, by attack program."""
 MINIMAL: dict[str, Mapping[str, Any]] = {
     "file_attacks.py": FILES, "keyword_attacks.py": KEYWORDS, "command_attacks.py": COMMANDS,
 }  # fmt: skip
 
 
-def each(names: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+def each(names: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
     """Pair each program with each of the program's names."""
     return [(program, name) for program in names for name in names[program]]
 
 
-def cases(counts: Mapping[str, int], first: int) -> list[str]:
-    return [f"{kind} {seed}" for kind, count in counts.items() for seed in range(first, first + count)]
-
-
 @pytest.fixture(scope="module")
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return ``outcomes(program, many)``, which runs many random cases, or a few random cases and all minimal cases.
+    """Return ``outcomes(program, random)``, which runs random cases or all minimal cases.
 
     The folder of the cases has the same path in every run of the tests.
     """
@@ -56,30 +49,27 @@ def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFacto
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")
 
     @functools.cache
-    def run(program: str, many: bool) -> dict[str, Outcome]:
+    def run(program: str, random: bool) -> dict[str, Outcome]:
         folder = parent / program.removesuffix(".py")
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
-        chosen = cases(MANY[program], 1000) if many else [*cases(FEW[program], 0), *MINIMAL[program]]
-        return attacks(program, chosen, folder)
+        cases = [f"{kind} {seed}" for kind in KINDS[program] for seed in range(COUNTS[program])]
+        return attacks(program, cases if random else [*MINIMAL[program]], folder)
 
     return run
 
 
-# command lines take longest
-@pytest.mark.quick(*(f"{program}-{kind}-few" for program, kind in each(FEW) if program != "command_attacks.py"))
-@pytest.mark.parametrize("many", [False, True], ids=["few", "many"])
-@pytest.mark.parametrize(("program", "kind"), each(FEW))
-def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str, many: bool) -> None:
-    count = (MANY if many else FEW)[program][kind]
-    found = {case: o for case, o in outcomes(program, many).items() if case.rpartition(" ")[0] == kind}
-    assert len(found) == count
+@pytest.mark.long
+@pytest.mark.parametrize(("program", "kind"), each(KINDS))
+def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str) -> None:
+    found = {case: o for case, o in outcomes(program, True).items() if case.rpartition(" ")[0] == kind}
+    assert len(found) == COUNTS[program]
     bad = [
         f"{outcome.problem}\n    {replay(program, case)}\n{outcome.trace}"
         for case, outcome in found.items()
         if outcome.problem
     ]
-    assert not bad, "\n".join([f"{len(bad)} of {count} cases", *bad])
+    assert not bad, "\n".join([f"{len(bad)} of {len(found)} cases", *bad])
 
 
 @pytest.mark.quick("file_attacks.py", "keyword_attacks.py")
