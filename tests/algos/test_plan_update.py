@@ -78,8 +78,12 @@ def compare(one: lw.Planner, other: lw.Planner, calls: int = 4) -> None:
             torch.testing.assert_close(torch.as_tensor(value), torch.as_tensor(other.summary[name]))
 
 
+@pytest.mark.quick("plants-warp", "knots-mujoco", "without graphs-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}])
+@pytest.mark.parametrize(
+    "more", [{}, {"knots": 3}, {"plants": 2, "iterations": 2}, {"graphs": False}],
+    ids=["default", "knots", "plants", "without graphs"],
+)  # fmt: skip
 def test_cem_written_in_torch_gives_the_same_plans_as_the_class_cem(more: dict[str, Any], engine: str) -> None:
     smoothing = lw.MPPIConfig(knots=more.get("knots")).noise_smoothing
     own = lw.Planner(engine=engine, update=TorchCEM(3, 0.05, smoothing), **POINT, **more)

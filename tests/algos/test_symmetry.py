@@ -117,6 +117,7 @@ def test_task_without_a_mirror_function_raises_an_error(shared_env: SharedEnv) -
         lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))
 
 
+@pytest.mark.quick("exact", "augment")
 @pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
 def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env, tmp_path: Path) -> None:
     config = lw.SACConfig(

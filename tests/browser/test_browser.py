@@ -456,6 +456,7 @@ def test_output_of_a_notebook_cell_shows_the_page_in_a_frame(context: BrowserCon
     shown.close()
 
 
+@pytest.mark.long
 def test_pages_of_other_sites_cannot_reach_the_viewer(viewer: Viewer, context: BrowserContext) -> None:
     own = context.new_page()
     own.goto(viewer.window.address)

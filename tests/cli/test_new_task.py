@@ -64,6 +64,7 @@ def new(name: str, xml: str) -> Path:
     return Path(f"{name}.py")
 
 
+@pytest.mark.quick("warp")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_new_task_passes_check_task_on_both_engines(engine: str, folder: Path) -> None:
     file = new("everything", RICH)

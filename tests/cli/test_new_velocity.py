@@ -146,7 +146,7 @@ def test_option_feet_without_the_template_prints_an_error(folder: Path, capsys: 
     assert "--feet and --joints have no effect without --template velocity" in capsys.readouterr().err
 
 
-@pytest.mark.quick("spot_velocity")
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["spot_velocity", "g1_velocity"])
 def test_new_velocity_accepts_robots_of_menagerie(task: str, folder: Path) -> None:
     model = {"g1_velocity": "unitree_g1/scene_mjx.xml", "spot_velocity": "boston_dynamics_spot/scene.xml"}[task]

@@ -102,9 +102,7 @@ def sensing(model: str) -> type[lw.Task]:
     return type("Sensing", (Sensing,), {"model": spec, "obs": obs, **own})
 
 
-@pytest.mark.quick(
-    "flex-warp", "flex-mujoco", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco"
-)
+@pytest.mark.quick("flex-warp", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco")
 @pytest.mark.parametrize("engine", OPTIONS)
 @pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
 def test_task_with_an_arbitrary_model_passes_check_task(model: str, engine: str) -> None:
@@ -121,7 +119,7 @@ def test_task_with_sensors_passes_check_task(model: str, engine: str) -> None:
 # these models use plugins and other features that MuJoCo Warp lacks
 
 
-@pytest.mark.quick("'mjTRN_SO3'] not supported", "Actuator plugins not supported")
+@pytest.mark.quick("Actuator plugins not supported")
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
 def test_task_that_only_the_mujoco_engine_supports_passes_check_task(model: str) -> None:
     check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)

@@ -50,8 +50,7 @@ def options(task: str, engine: str) -> dict[str, int]:
 
 # these cases cover contacts, events, randomized dynamics, tasks without contacts, and tasks for planners
 @pytest.mark.quick(
-    "mujoco-half_cheetah", "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach",
-    "warp-go1_velocity", "warp-half_cheetah", "warp-point_mass",
+    "mujoco-go1_velocity", "mujoco-cartpole_swingup", "mujoco-reach", "warp-half_cheetah", "warp-point_mass",
 )  # fmt: skip
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
 def test_task_passes_all_checks_of_check_task(task: str, engine: str) -> None:

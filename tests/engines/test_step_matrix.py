@@ -149,6 +149,7 @@ LADEN = table.PLAIN | {
 }  # fmt: skip
 
 
+@pytest.mark.quick("com", "tendon", "transmission", "com velocity", "energy", "acceleration")
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_step_reuses_fields_that_are_already_computed(asked: str, device: wp.Device) -> None:
     """A step computes only those stages of the physics that a field needs and that are not computed yet."""

@@ -208,7 +208,7 @@ def test_every_gymnasium_id_of_a_task_is_registered() -> None:
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
+def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
     """Some random actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
@@ -217,13 +217,13 @@ def test_a_thousand_steps_equal_those_of_gymnasium(task: str) -> None:
     assert np.array_equal(pair.ours.action_space.high, pair.theirs.action_space.high)
     horizon = OWN[IDS[task]].max_episode_steps
     assert find_task(task).horizon == horizon
-    steps = pair.run(1000, min(horizon, 200))
+    steps = pair.run(500, min(horizon, 200))
     obs_error, reward_error = max(step.obs_error for step in steps), max(step.reward_error for step in steps)
     ends = sum(step.gym_terminated for step in steps)
     # pytest -rP shows this line
     print(f"{task}: error of observations {obs_error:.1e} and rewards {reward_error:.1e}, {ends} terminations")
     check(steps)
-    assert ends >= 10 if has(task, "terminated") else ends == 0
+    assert ends >= 5 if has(task, "terminated") else ends == 0
     for step in steps:
         if (value := evaluation(step.info)) is not None:
             assert abs(step.eval - value) <= 1e-5 * max(1.0, abs(value))
@@ -514,8 +514,11 @@ def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> No
             assert isinstance(value, bool) == isinstance(default, bool), name
 
 
-# the humanoids' parameters are similar to the ant's
-@pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if "humanoid" not in task))
+DIFFERENT = [task for task in TASKS if task != "walker2d" and not task.startswith("humanoid")]
+"""Tasks without those whose parameters are similar to the hopper's or to the ant's."""
+
+
+@pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if task in DIFFERENT))
 @pytest.mark.parametrize(
     ("task", "name", "variant"), [(task, name, value) for task, name, values in PARAMETERS for value in values]
 )
@@ -559,6 +562,7 @@ def halve_timestep(root: ET.Element) -> None:
     option.set("timestep", str(float(option.get("timestep", "0.002")) / 2))
 
 
+@pytest.mark.quick("ant", "hopper")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_changed_model_file_has_the_same_effect_as_in_gymnasium(task: str, tmp_path: Path) -> None:
     """The option ``model`` accepts a modified copy of the file, as Gymnasium's ``xml_file`` does."""

@@ -232,7 +232,7 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
     return make
 
 
-@pytest.mark.quick("adroit_pen", "adroit_hammer")
+@pytest.mark.quick("adroit_pen")
 def test_results_under_random_actions_equal_gymnasium_robotics(make_pair: MakePair) -> None:
     """Run five episodes of 200 steps from random initial states; a quarter of the actions are out of range."""
     pair = make_pair()
@@ -270,6 +270,7 @@ def test_unchanged_gymnasium_robotics_environment_agrees_until_contacts_differ(m
     assert checked >= 50
 
 
+@pytest.mark.quick("dense")
 @pytest.mark.parametrize("reward_type", ["dense", "sparse"])
 def test_bonuses_and_success_equal_gymnasium_robotics(make_pair: MakePair, task: str, reward_type: str) -> None:
     pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")

@@ -98,6 +98,7 @@ def test_randomized_world_continues_identically_in_another_environment(engine: s
         assert torch.equal(other.reward, first.reward)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_randomized_masses_do_not_accumulate_over_resets(engine: str) -> None:
     env = lw.make(Drawn, nworld=4, engine=engine)
@@ -128,6 +129,7 @@ def test_randomizing_one_world_does_not_change_other_worlds(engine: str) -> None
     assert not torch.equal(env.get_state()[mask], still.get_state()[mask])
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> None:
     env = lw.make("hopper", nworld=3, engine=engine, dynamics=["body_mass", "geom_friction"], horizon=0)
@@ -170,7 +172,7 @@ def test_getters_use_the_model_fields_in_the_given_state() -> None:
     assert torch.equal(obs[:, 4], mass(env, after).float())
 
 
-@pytest.mark.quick("cost-128-mujoco", "noise-256-mujoco", "noise-256-warp")
+@pytest.mark.quick("cost-128-mujoco", "noise-256-warp")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
 def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
@@ -229,6 +231,7 @@ def test_startup_does_not_randomize_lasting_memory_in_a_planner_state() -> None:
     assert plan.state_of()[columns].tolist() == [0.0]
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_model_fields_that_events_change_are_nominal_after_a_reset(engine: str) -> None:
     env = lw.make(Full, nworld=4, engine=engine, horizon=0)
@@ -240,7 +243,7 @@ def test_model_fields_that_events_change_are_nominal_after_a_reset(engine: str) 
     assert (damping == np.float32(0.2)).all()
 
 
-@pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco", "DrawnWithControl-warp")
+@pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
 def test_a_rollout_uses_the_model_in_the_state_or_the_nominal_model(task: type[lw.Task], engine: str) -> None:
@@ -367,6 +370,7 @@ PASSIVE = """<mujoco><worldbody><geom type="plane" size="3 3 .1"/>
 <body name="ball" pos="0 0 1"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_control_can_push_a_model_without_actuators(engine: str, tmp_path: Path) -> None:
     (tmp_path / "ball.xml").write_text(PASSIVE)

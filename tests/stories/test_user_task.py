@@ -209,7 +209,7 @@ def test_user_task_passes_check_task(module: ModuleType, engine: str) -> None:
     check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
-@pytest.mark.quick("mujoco")
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ENGINES)
 def test_user_task_with_scaled_actions_and_rk4_passes_check_task(module: ModuleType, path: Path, engine: str) -> None:
     spec = mujoco.MjSpec.from_string(module.XML)
@@ -274,6 +274,7 @@ def test_acceleration_sensors_belong_to_the_last_substep(module: ModuleType, eng
         np.testing.assert_allclose(env.field("sensordata", "shock")[w], data.sensor("shock").data, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.quick("warp")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_additional_acceleration_field_is_part_of_the_state(module: ModuleType, engine: str) -> None:
     plain, env = (lw.make("follow_target", engine=engine, nworld=2, fields=fields) for fields in ((), ["qacc"]))
@@ -290,6 +291,7 @@ def test_additional_acceleration_field_is_part_of_the_state(module: ModuleType, 
     torch.testing.assert_close(env.get_obs(state), env.obs, rtol=0, atol=0)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_controls_are_computed_by_the_task_or_scaled_to_their_ranges(
     module: ModuleType, path: Path, engine: str
@@ -326,6 +328,7 @@ def test_task_memory_changes_in_every_step_and_is_cleared_by_a_reset(module: Mod
     assert (env.obs[:, 16:19] == 0).all()
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_set_params_takes_effect_in_the_next_step(module: ModuleType, engine: str) -> None:
     env, other = (lw.make("follow_target", engine=engine, nworld=2, seed=1, cost=cost) for cost in (0.0, 2.0))

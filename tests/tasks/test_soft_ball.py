@@ -31,6 +31,7 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
         env.step(torch.tensor([action]).expand_as(env.action).contiguous())
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_gripper_squeezes_the_ball_and_lifts_it_to_the_target(shared_env: SharedEnv, engine: str) -> None:
     """The fingers compress the ball by millimetres, and the ball bulges upwards."""

@@ -65,6 +65,7 @@ def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
     return model
 
 
+@pytest.mark.quick("go1_velocity", "g1_velocity")
 @pytest.mark.parametrize("task", ROBOTS)
 def test_mirrored_states_and_actions_give_mirrored_next_states(task: str) -> None:
     made = bound(task)
