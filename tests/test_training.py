@@ -200,7 +200,7 @@ class SlowToSave(lw.NPG):
         self.saves += 1
         if self.saves == self.signal_in_save:
             os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(0.5)
+        time.sleep(0.2)
         return super().state_dict()
 
 

@@ -176,7 +176,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 def test_resumed_run_uses_the_replay_buffer_in_its_folder(tmp_path: Path) -> None:
     """The buffer holds 20 steps of 4 worlds, and an iteration has 12 steps."""
     runs = []
-    for name, parts in (("whole", (6,)), ("parts", (1, 2, 3, 5, 6))):
+    for name, parts in (("whole", (6,)), ("parts", (1, 3, 6))):
         for i, iterations in enumerate(parts):
             sac = made(lw.make(Metered, nworld=4, horizon=10))
             runs.append(lw.train(sac, tmp_path / name, iterations=iterations, resume=i > 0, save_every=1))

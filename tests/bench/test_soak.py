@@ -33,14 +33,14 @@ def run(out: Path, *words: str) -> list[dict[str, Any]]:
 def test_every_injected_fault_is_found_and_counted(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    results = run(tmp_path / "soak.jsonl", *FAULTS, "--steps", "9600", "--work", str(work))
+    results = run(tmp_path / "soak.jsonl", *FAULTS, "--steps", "4800", "--work", str(work))
     assert len(results) == 2
     for result in results:
-        assert result["found"] == result["injected"] and min(result["injected"].values()) > 3
+        assert result["found"] == result["injected"] and min(result["injected"].values()) > 1
         assert result["counts_agree"] and result["other"] == {} and result["not_finite"] == 0
-        assert result["compared"] > 16 * 600 / 4 - 1 and result["different"] == 0
+        assert result["compared"] > 16 * 300 / 4 - 1 and result["different"] == 0
         assert len(result["memory"]) == soak.SAMPLES
-    assert re.search(r"\| point_mass, cpu \| 16 \| 1.92e\+04 \|", capsys.readouterr().out)
+    assert re.search(r"\| point_mass, cpu \| 16 \| 9,?600 \|", capsys.readouterr().out)
 
 
 def test_variant_of_a_task_in_a_module_with_several_tasks_uses_the_right_structs(tmp_path: Path) -> None:
@@ -53,6 +53,7 @@ def test_variant_of_a_task_in_a_module_with_several_tasks_uses_the_right_structs
     )
 
 
+@pytest.mark.long
 def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
     for name, steps in (("two", "4800"), ("one", "9600")):
         run(tmp_path / f"{name}.jsonl", *FAULTS, "--steps", steps, "--work", str(work))
@@ -62,6 +63,7 @@ def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path
     assert all(torch.equal(end, ends[1][name]) for name, end in ends[0].items())
 
 
+@pytest.mark.long
 def test_soak_run_continues_on_another_machine_with_the_state_folder(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -76,6 +78,7 @@ def test_soak_run_continues_on_another_machine_with_the_state_folder(
     assert "skipped: there is no " in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_missed_faults_and_faults_that_spread_are_reported(
     work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -296,7 +296,7 @@ def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found:
 
 
 def test_check_task_accepts_reads_within_a_table() -> None:
-    check_task(Follow, steps=12)
+    check_task(Follow, steps=12, checks=[check_bounds])
 
 
 # parameters computed from the model

@@ -46,8 +46,10 @@ def test_writes_out_of_range_raise_an_error_before_they_damage_the_heap() -> Non
     cases, messages = [], []
     for name, (number, size, row, declared) in ROWS.items():
         function, into, of = name.split()[0], row and f" into {row}", row and f" of {row}"
-        far = [] if cases else [(size + 999, f"{size + 1000} numbers{into}")]
-        for index, text in ((size, f"{size + 1} numbers{into}"), (-size - 1, f"at index {-size - 1}{of}"), *far):
+        ends = [(size, f"{size + 1} numbers{into}"), (-size - 1, f"at index {-size - 1}{of}")]
+        # the first function also writes far beyond its array, and the others write beyond one of their ends
+        tried = ends[number % 2 :][:1] if cases else [*ends, (size + 999, f"{size + 1000} numbers{into}")]
+        for index, text in tried:
             cases.append(f"{number} {index}")
             messages.append(f"{function} of the task 'out_of_range' writes {text}, but {declared}")
     run = subprocess.run(

@@ -92,11 +92,10 @@ def test_search_word_without_matching_tasks_prints_a_one_line_error(capsys: pyte
 def test_a_task_with_a_missing_extra_is_listed_without_its_sizes(
     without_the_hand: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["tasks"]) == 0
+    assert cli.main(["tasks", "[hand]"]) == 0
     out, error = capsys.readouterr()
     assert error == ""
     found = rows(out)
-    assert sorted(found) == task_names()
     assert found["adroit_pen"] == ["45", "-", "5", "-", "200", "gymnasium-robotics", "[hand]"]
     lines = out.splitlines()
     row = next(i for i, line in enumerate(lines) if line.startswith("adroit_pen"))

@@ -245,7 +245,7 @@ def test_option_deterministic_has_no_effect_on_the_cpu() -> None:
 
 
 def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
-    env = lw.make("humanoid", engine="warp", nworld=4)
+    env = lw.make("hopper", engine="warp", nworld=4)
     engine = env.engine
     assert isinstance(engine, WarpEngine)
     assert engine.naconmax == 4 * engine.nconmax + engine.spare == engine.d.naconmax and engine.spare >= 256
@@ -259,7 +259,7 @@ def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.
     runs = []
     for partial in (True, False):
         monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
-        env = lw.make("humanoid", engine="warp", nworld=3, horizon=5, seed=1)
+        env = lw.make("half_cheetah", engine="warp", nworld=3, horizon=5, seed=1, frame_skip=2)
         state = env.get_state()
         state[1, env.state_space.parts["step"]] = 3
         env.set_state(state)

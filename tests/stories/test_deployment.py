@@ -81,19 +81,14 @@ def test_control_loop_in_the_documentation_equals_the_environment(
     assert moved > 0.3 and not env.done.any()
 
 
-def test_control_loop_in_the_documentation_walks_for_the_given_time(page: dict[str, Any], tmp_path: Path) -> None:
+def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
+    """The program in the documentation walks for the given time with these names."""
     env = lw.make("go1_velocity")
-    file = lw.export_policy(walking_policy(env), tmp_path / "policy.onnx", env=env)
-    model = copy.copy(env.model)
-    robot, data = page["Policy"](str(file), model), mujoco.MjData(model)
+    policy, model = walking_policy(env), copy.copy(env.model)
+    robot = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), model)
+    data, meta = mujoco.MjData(model), robot.meta
     page["walk"](robot, model, data, np.zeros(3), 0.5)
     assert data.time == pytest.approx(0.5)
-
-
-def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
-    env = lw.make("go1_velocity")
-    policy = walking_policy(env)
-    meta = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), env.model).meta
     joints = [f"{leg}_{joint}" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
     assert meta["task"] == "go1_velocity" and meta["joints"] == meta["actuators"] == joints
     assert (meta["timestep"], meta["substep"], meta["base"]) == (0.02, 0.005, "trunk")

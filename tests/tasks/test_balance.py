@@ -7,6 +7,8 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
+from lyceum_warp.binding.bound_task import task_spec
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.tasks.balance.humanoid_balance import JOINTS
 
 
@@ -68,7 +70,7 @@ def test_robot_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv
 
 
 def test_upper_body_of_the_g1_is_rigid_in_the_pose_of_the_keyframe(shared_env: SharedEnv) -> None:
-    env, full = shared_env("g1_stand", nworld=1), shared_env("g1_velocity", nworld=1).model
+    env, full = shared_env("g1_stand", nworld=1), task_spec(find_task("g1_velocity")).compile()
     data = {}
     for model, qpos in ((env.model, env.field("qpos")[0].numpy()), (full, full.key("knees_bent").qpos)):
         data[model] = mujoco.MjData(model)

@@ -163,8 +163,9 @@ def command_of(env: lw.Env) -> torch.Tensor:
 
 
 def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **NOISELESS, push_seconds=NEVER)
-    action = torch.zeros(NWORLD, 12)
+    nworld = 24
+    env = shared_env("go1_velocity", nworld=nworld, autoreset=False, **NOISELESS, push_seconds=NEVER)
+    action = torch.zeros(nworld, 12)
     changes, before = 0, command_of(env)
     for _ in range(300):
         env.step(action)
@@ -175,7 +176,7 @@ def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None
         torch.testing.assert_close(command[~due, 4], before[~due, 4] - DT, atol=1e-6, rtol=0)
         assert (command[due, 4] >= 3).all() and (command[due, 4] <= 8).all()
         changes, before = changes + int(due.sum()), command
-    assert 0.4 * NWORLD < changes < 0.8 * NWORLD  # the steps take 6 s, and commands change every 3 to 8 s
+    assert 0.3 * nworld < changes < 0.9 * nworld  # the steps take 6 s, and commands change every 3 to 8 s
 
 
 def test_target_headings_determine_the_commanded_yaw_rate(shared_env: SharedEnv) -> None:
@@ -262,6 +263,7 @@ def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
     assert np.array_equal(again, bias)
 
 
+@pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: SharedEnv, engine: str) -> None:
     n = 1000 if engine == "mujoco" else 4
@@ -300,18 +302,3 @@ def test_actions_move_the_servo_targets_away_from_the_default_pose(shared_env: S
     np.testing.assert_allclose(env.field("ctrl").numpy(), HOME + scale * action.numpy() - bias, atol=2e-4)
     assert not np.isfinite(env.action_space.high).any()
     assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
-
-
-def test_both_engines_agree_on_go1_velocity_after_a_step(shared_env: SharedEnv) -> None:
-    """Compare observations, memory and rewards from states along random steps."""
-    mine, theirs = (shared_env("go1_velocity", engine=engine, nworld=4, **STILL) for engine in ("mujoco", "warp"))
-    for action in random_steps(mine, 12):
-        theirs.set_state(mine.get_state())
-        mine.step(action)
-        theirs.step(action)
-        torch.testing.assert_close(mine.reward, theirs.reward, rtol=1e-3, atol=1e-4)
-        going = ~mine.done
-        torch.testing.assert_close(mine.obs[going], theirs.obs[going], rtol=1e-3, atol=2e-3)
-        states = [env.state_space.split(env.get_state()) for env in (mine, theirs)]
-        for name in mine.task.memory["memory"]:
-            torch.testing.assert_close(*(parts[name][going] for parts in states), rtol=1e-5, atol=1e-5)

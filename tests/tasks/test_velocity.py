@@ -45,8 +45,8 @@ def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
 def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
     n = len(env.task.params["feet"])
     touched = 0
-    for _ in range(5):
-        random_steps(env, 6, 1.0)
+    for _ in range(3):
+        random_steps(env, 8, 1.0)
         critic = env.obs_spaces["critic"].split(env.obs_groups["critic"])
         for world in range(NWORLD):
             data, touching = feet(env, world)
@@ -54,7 +54,7 @@ def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.E
             np.testing.assert_allclose(critic["foot_height"][world], heights, atol=2e-6)
             np.testing.assert_array_equal(critic["foot_contact"][world] > 0, touching)
             touched += sum(touching)
-    assert 0.1 < touched / (5 * NWORLD * n) < 0.99
+    assert 0.1 < touched / (3 * NWORLD * n) < 0.99
 
 
 @pytest.mark.quick("g1_velocity")
