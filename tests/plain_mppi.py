@@ -4,7 +4,6 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 
@@ -177,23 +176,3 @@ class Plain:
             rewards[t], ended[t] = env.reward.numpy(), env.terminated.numpy()
         self.ended = ended
         return rewards, ended, np.zeros(env.nworld) if self.value is None else self.value(env.obs).numpy()
-
-
-class PlainReach(Plain):
-    """A planner that computes the physics and the reward of the reach task with MuJoCo and NumPy."""
-
-    def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        model = self.env.model
-        data = mujoco.MjData(model)
-        spec = mujoco.mjtState.mjSTATE_INTEGRATION.value
-        rewards = np.zeros(self.sampled.shape[:2])
-        for k in range(rewards.shape[1]):
-            mujoco.mj_setState(model, data, state[: mujoco.mj_stateSize(model, spec)].numpy(), spec)
-            for t in range(len(rewards)):
-                data.ctrl[:] = self.sampled[t, k]
-                for _ in range(2):
-                    mujoco.mj_step(model, data)
-                mujoco.mj_kinematics(model, data)
-                error = data.site("finger").xpos - data.mocap_pos[0]
-                rewards[t, k] = -np.abs(error).sum() - 5 * np.sqrt((error**2).sum())
-        return rewards, np.zeros_like(rewards), np.zeros(rewards.shape[1])

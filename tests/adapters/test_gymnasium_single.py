@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator
-from typing import Any
 
 import gymnasium
 import numpy as np
@@ -93,19 +92,6 @@ def test_make_with_max_episode_steps_truncates_episodes(hopper: gymnasium.Env) -
     envs.reset(seed=0)
     ends = [envs.step(np.zeros((2, 3), dtype=np.float32))[3].all() for _ in range(2)]
     assert ends == [False, True]
-
-
-@pytest.mark.parametrize(
-    "action, message",
-    [
-        (np.zeros(2, dtype=np.float32), r"float32 array of shape \(3,\), not a float32 array of shape \(2,\)"),
-        (np.zeros(3, dtype=int), r"float32 array of shape \(3,\), not a int64 array of shape \(3,\)"),
-    ],
-)
-def test_action_of_wrong_shape_raises_an_error(action: Any, message: str, hopper: gymnasium.Env) -> None:
-    hopper.reset(seed=0)
-    with pytest.raises(ValueError, match=message):
-        hopper.unwrapped.step(action)
 
 
 def test_step_before_a_reset_raises_an_error() -> None:

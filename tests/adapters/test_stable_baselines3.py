@@ -172,12 +172,6 @@ def test_rendered_image_shows_all_worlds() -> None:
         env.close()
 
 
-def test_actions_of_wrong_shape_or_type_raise_an_error(hopper: StableBaselines3VecEnv) -> None:
-    hopper.reset()
-    with pytest.raises(ValueError, match=r"float32 array of shape \(4, 3\), not a int64 array of shape \(4, 3\)"):
-        hopper.step(np.zeros((N, 3), dtype=int))
-
-
 def test_step_before_a_reset_and_unknown_options_raise_errors(full: StableBaselines3VecEnv) -> None:
     env = StableBaselines3VecEnv(full.env)
     with pytest.raises(RuntimeError, match="there was no reset before this step: call reset"):

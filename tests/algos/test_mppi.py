@@ -13,7 +13,7 @@ import pytest
 import torch
 import warp as wp
 from coin_tasks import TossedAfter, TossedAfterWithControl, TossedBefore
-from plain_mppi import Plain, PlainReach
+from plain_mppi import Plain
 from rail_task import Picky, rail
 from varied_task import Params as VariedParams
 from varied_task import Varied
@@ -107,18 +107,14 @@ LIKE_OTHERS = ("negative", "mppi_without_plan", "without_plan", "cem_of_one", "z
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES if case not in LIKE_OTHERS), "cubic_cem-warp")
 @pytest.mark.parametrize("case, engine", [*((case, "mujoco") for case in CASES), *((case, "warp") for case in ON_WARP)])
 def test_plans_equal_those_of_a_plain_implementation(case: str, engine: str) -> None:
-    check_against(Plain, engine, **CASES[case])
+    check_against(engine, **CASES[case])
 
 
-def test_plans_for_the_task_reach_equal_plans_computed_with_mujoco_and_numpy_alone() -> None:
-    check_against(PlainReach, "mujoco", **REACH)
-
-
-def check_against(kind: type[Plain], engine: str, task: str, iterations: int = 1, **settings: Any) -> None:
+def check_against(engine: str, task: str, iterations: int = 1, **settings: Any) -> None:
     if callable(settings.get("model")):
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
-    plain = kind(task, engine=engine, count=len(plan.knot_actions), **settings)
+    plain = Plain(task, engine=engine, count=len(plan.knot_actions), **settings)
     # random numbers depend on the seed and the number of previous draws, so a second planner can draw the same noise
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
@@ -251,6 +247,7 @@ def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
     assert torch.isfinite(plan.model_returns[:, 0]).all()
 
 
+@pytest.mark.quick("reward-mujoco", "physics-warp", "value-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("how", ["reward", "physics", "value"])
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
@@ -353,7 +350,7 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
     end = torch.zeros(2) if isinstance(fill, str) else torch.tensor(fill).expand(2)
     assert torch.equal(plan.actions, end.expand(H, 2)), "the plan at first"
     plan(plan.state_of())
-    for shift in (None, 0, 1, 3, H, H + 5):
+    for shift in (None, 0, 1, 3, H, 2**31 - 1):
         old = plan.actions.clone()
         plan(plan.state_of(), **({} if shift is None else {"shift": shift}))
         steps = 1 if shift is None else shift
@@ -373,16 +370,8 @@ def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> N
         plan(plan.state_of(), shift=shift)
         remaining = 12 - shift
         torch.testing.assert_close(plan.nominal[:remaining], old[shift:], atol=1e-6, rtol=0)
-    plan(plan.state_of(), shift=100)
+    plan(plan.state_of(), shift=2**31 - 1)
     assert (plan.nominal == plan.nominal[0]).all(), "the last knot fills the plan"
-
-
-def test_shift_beyond_the_horizon_replaces_all_actions_by_the_fill_action() -> None:
-    for knots in (None, 4):
-        plan = MPPI("point_mass", horizon=8, samples=4, knots=knots, fill=0.25)
-        plan(plan.state_of())
-        plan(plan.state_of(), shift=2**31 - 1)
-        assert (plan.nominal == 0.25).all()
 
 
 @wp.func
@@ -459,8 +448,7 @@ def test_invalid_value_function_raises_an_error_when_the_planner_is_made(value: 
 
 
 @pytest.mark.quick(
-    "torch-mujoco", "cem with knots-warp", "warp-mujoco", "mppi with knots-mujoco", "cem-mujoco",
-    "predictive sampling-mujoco",
+    "torch-mujoco", "cem with knots-warp", "warp-mujoco", "mppi with knots-mujoco", "predictive sampling-mujoco",
 )  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("words", [
@@ -516,7 +504,7 @@ def test_hopper_hops_without_falling() -> None:
     assert evals[-1] > 0.1 and rewards.sum() > 140, (evals[-1], rewards.sum())
 
 
-def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
+def earned(task: type[lw.Task], runs: int = 8) -> tuple[float, float]:
     """Return the mean return over runs of 100 steps, and its standard error if actions are independent of coins.
 
     Plant and planner have equal seeds. A reward is the product of action and coin. If action and coin are independent,
@@ -541,7 +529,7 @@ def earned(task: type[lw.Task], runs: int = 20) -> tuple[float, float]:
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
 def test_planner_cannot_exploit_noise_drawn_after_the_action(task: type[lw.Task]) -> None:
     mean, deviation = earned(task)
-    assert 0.5 < deviation < 2.3, "the planner should act"
+    assert 0.8 < deviation < 3.6, "the planner should act"
     assert abs(mean) < 3 * deviation
 
 
@@ -550,6 +538,7 @@ def test_planner_exploits_noise_drawn_before_the_action() -> None:
     assert mean > 80
 
 
+@pytest.mark.quick("TossedAfter-warp", "TossedAfterWithControl-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [TossedAfter, TossedAfterWithControl])
 def test_random_events_differ_between_samples_and_iterations(task: type[lw.Task], engine: str) -> None:

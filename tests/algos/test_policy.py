@@ -26,11 +26,3 @@ def test_samples_have_the_mean_and_the_standard_deviation_of_the_policy(policy: 
     policy.sample(obs, torch.randn(20_000, 2, generator=generator), out=out)
     torch.testing.assert_close(out.mean(0), policy(obs[0]), atol=0.03, rtol=0)
     torch.testing.assert_close(out.std(0), policy.log_std.exp(), atol=0.03, rtol=0)
-
-
-@pytest.mark.parametrize("hidden", [8, (8, 0), "wide"])
-def test_invalid_hidden_layers_raise_an_error(hidden: object) -> None:
-    # type: ignore[arg-type]
-    for module in (lambda: lw.GaussianPolicy(3, 1, hidden), lambda: lw.ValueFunction(3, hidden)):
-        with pytest.raises(ValueError, match=r"hidden must be the widths of the hidden layers, as in \(64, 64\), not "):
-            module()

@@ -42,12 +42,6 @@ def fill_any(row: Any, x: float):
     row[0] = x
 
 
-@wp.func
-def fill_both(s: World, p: Params):
-    fill(s.qpos, p.gain)
-    s.qvel[0] = 1.0
-
-
 # each field of this struct is named after the expression that writes it
 
 
