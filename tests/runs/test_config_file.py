@@ -35,12 +35,6 @@ def test_error_of_an_entry_with_a_wrong_type_names_the_file(
         Run.open(tmp_path)
 
 
-def test_configuration_with_too_many_nested_levels_raises_an_error(tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text("[" * 100_000)
-    with pytest.raises(ValueError, match="is not the configuration of a run"):
-        Run.open(tmp_path)
-
-
 @pytest.mark.parametrize("command", ["eval", "resume"])
 def test_error_of_an_invalid_setting_names_the_file(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -51,14 +45,3 @@ def test_error_of_an_invalid_setting_names_the_file(
                  "resume": ["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]}  # fmt: skip
     assert cli.main(arguments[command]) == 2
     refused(capsys, "'x'", f"with the settings in {run.folder / 'config.json'}")
-
-
-def test_damaged_metrics_table_raises_an_error_before_anything_is_written(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=2)
-    run.metrics.write_text(run.metrics.read_text().replace("\n1,", "\none,"))
-    before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    assert cli.main(["train", "--resume", str(run.folder), "--iterations", "3", *QUIET]) == 2
-    refused(capsys, f"{run.metrics} is not a table of metrics: line 2")
-    assert before == {path: path.read_bytes() for path in run.folder.iterdir()}

@@ -217,21 +217,6 @@ def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: py
         shutil.rmtree(folder / "moved")
 
 
-def test_edited_model_is_reported_and_the_copy_of_the_run_is_used(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = trained(folder)
-    before = returns(capsys, str(out))
-    (folder / "mine" / "robot" / "parts" / "block.xml").write_text(
-        PART.replace('type="slide"', 'type="slide" damping="9"')
-    )
-    capsys.readouterr()
-    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
-    refused(capsys, "the model of the task 'slide' has changed since the run began: the run's own copy is used")
-    assert returns(capsys, str(out)) == before
-    assert returns(capsys, str(out), "--task", str(folder / "mine" / "slide.py")) != before
-
-
 @pytest.mark.parametrize("moved", [False, True])
 def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]

@@ -148,10 +148,3 @@ def test_physics_stay_in_double_precision_if_an_event_writes_memory() -> None:
     for _ in range(1000):
         env.step()
     assert env.get_state()[0, time].item() == pytest.approx(10.0, abs=1e-9)
-
-
-def test_bytes_per_world_include_randomized_model_fields() -> None:
-    drawn, plain = lw.make("hopper", dynamics=["body_mass", "geom_friction"]), lw.make("hopper")
-    state = 8 * (drawn.state_space.shape[0] - plain.state_space.shape[0])
-    assert state == 8 * 20  # a number in the state takes eight bytes
-    assert drawn.bytes_per_world > plain.bytes_per_world + state

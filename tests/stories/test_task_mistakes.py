@@ -112,12 +112,6 @@ def test_corrected_task_file_is_reloaded_and_old_environments_keep_their_task(ta
         assert torch.equal(env.obs, 2.0 * x + 1.0 if env is new else x)
 
 
-def test_error_of_a_misspelt_keyword_suggests_the_correct_one() -> None:
-    for word, meant in (("num_envs", "nworld"), ("ctrl_cost_wieght", "ctrl_cost_weight"), ("horzion", "horizon")):
-        with pytest.raises(ValueError, match=f"the task 'hopper' has no parameter '{word}': did you mean {meant}"):
-            lw.make("hopper", **{word: 4})
-
-
 def test_error_of_a_replaced_buffer_explains_how_to_write_into_it() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(
