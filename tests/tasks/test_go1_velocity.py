@@ -1,6 +1,6 @@
-"""Test the formulas, contact timers, commands, pushes, randomization and curriculum of the go1_velocity task.
+"""Test the contact timers, commands, pushes, randomization and curriculum of the go1_velocity task.
 
-The tests in tests/oracles/test_mjlab.py compare the task with mjlab's.
+The tests in tests/oracles/test_mjlab.py compare observations, rewards and terminations with mjlab's.
 """
 
 import itertools
@@ -11,7 +11,7 @@ import pytest
 import torch
 from checks import check_uniform
 from conftest import SharedEnv
-from go1_formulas import DT, GO1, HOME, LEGS, NEVER, NOISELESS, STILL, SUBSTEP, State, expected_terms, random_steps
+from go1_states import DT, GO1, HOME, LEGS, NEVER, NOISELESS, STILL, SUBSTEP, State, random_steps
 
 import lyceum_warp as lw
 
@@ -24,25 +24,6 @@ def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
     for action in actions:
         env.step(action)
     return actions[-1]
-
-
-def observation(s: State, bias: np.ndarray | float) -> np.ndarray:
-    joints = s.qpos[:, 7:] + bias - HOME
-    return np.hstack([s.imu_velocity, s.gyro, s.gravity, joints, s.qvel[:, 6:], s.last_action, s.command()])
-
-
-def test_observations_equal_their_formulas(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", nworld=NWORLD, **STILL)
-    assert (env.obs.shape[1], env.obs_groups["critic"].shape[1]) == (48, 72)
-    for _ in range(4):
-        roll_out(env, 9)
-        s = State(env)
-        logarithm = np.sign(s.force) * np.log1p(np.abs(s.force))
-        feet = np.hstack([s.height, s.air_time, s.touching, logarithm.reshape(-1, 12)])
-        np.testing.assert_allclose(env.obs.numpy(), observation(s, s.bias), rtol=1e-5, atol=1e-5)
-        critic = np.hstack([observation(s, 0.0), feet])
-        np.testing.assert_allclose(env.obs_groups["critic"].numpy(), critic, rtol=1e-5, atol=1e-5)
-        assert s.heading_controlled.any() and s.standing.any() and 0.1 < s.touching.mean() < 0.9
 
 
 def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
@@ -65,28 +46,6 @@ def test_policy_observations_have_uniform_noise_and_critic_observations_have_non
     assert not noise[:, 33:].any()
     sizes = np.repeat([0.5, 0.2, 0.05, 0.01, 1.5], [3, 3, 3, 12, 12])
     check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
-
-
-def test_every_reward_term_equals_its_formula(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", nworld=NWORLD, autoreset=False, **STILL)
-    seen = dict.fromkeys(env.metrics, 0)
-    for action in random_steps(env, 24, 1.6):
-        s0 = State(env)
-        env.step(action)
-        s1 = State(env)
-        terms = {name: DT * term for name, term in expected_terms(s0, action.numpy(), s1, env.model).items()}
-        for name, term in terms.items():
-            atol = 1e-6 if name != "soft_landing" else 1e-9
-            np.testing.assert_allclose(env.metrics[name].numpy(), term, rtol=2e-4, atol=atol, err_msg=name)
-            seen[name] += int((np.abs(term) > 10 * atol).sum())
-        np.testing.assert_allclose(env.reward.numpy(), sum(terms.values()), rtol=1e-4, atol=5e-6)
-        error = s0.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]])
-        slip = np.linalg.norm(error[:, :2], axis=1)
-        np.testing.assert_allclose(env.metrics["velocity_error"].numpy(), slip, atol=1e-5)
-        np.testing.assert_allclose(env.metrics["yaw_rate_error"].numpy(), np.abs(error[:, 2]), atol=1e-5)
-        now = np.linalg.norm((s1.command() - np.hstack([s1.v[:, :2], s1.w[:, 2:]]))[:, :2], axis=1)
-        np.testing.assert_allclose(env.eval.numpy(), now, atol=1e-5)
-    assert min(seen[name] for name in terms) > 20
 
 
 def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
@@ -179,24 +138,6 @@ def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None
     assert 0.3 * nworld < changes < 0.9 * nworld  # the steps take 6 s, and commands change every 3 to 8 s
 
 
-def test_target_headings_determine_the_commanded_yaw_rate(shared_env: SharedEnv) -> None:
-    """The robot turns in the shorter direction, and not faster than the maximum yaw rate."""
-    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
-    state = env.get_state()
-    parts = env.state_space.split(state)
-    parts["qpos"][:, 3:7] = torch.tensor([np.cos(1.5), 0.0, 0.0, np.sin(1.5)])  # a heading of 3 rad
-    parts["drawn_velocity"][:] = torch.tensor([0.5, 0.2, 0.3])
-    parts["heading_target"][:, 0] = torch.tensor([-3.0, 2.8, 0.0, -3.0])
-    parts["heading_controlled"][:, 0] = torch.tensor([1.0, 1.0, 1.0, 0.0])
-    parts["standing"][:] = 0.0
-    env.set_state(state)
-    yaw = [0.5 * (2 * np.pi - 6.0), -0.1, -0.5, 0.3]
-    np.testing.assert_allclose(env.obs[:, 45:].numpy(), np.stack([[0.5] * 4, [0.2] * 4, yaw], axis=1), atol=1e-5)
-    parts["standing"][:] = 1.0
-    env.set_state(state)
-    assert not env.obs[:, 45:].any()
-
-
 def test_curriculum_widens_the_command_ranges_at_each_stage() -> None:
     env = lw.make("go1_velocity", nworld=1000, **NOISELESS)
     for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):
@@ -280,25 +221,4 @@ def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: Sh
     env.reset()
     wanted = np.hstack([[0, 0, 0.278, 1, 0, 0, 0], HOME])
     np.testing.assert_allclose(env.field("qpos").numpy(), np.tile(wanted, (n, 1)), atol=1e-6)
-
-
-def test_an_episode_ends_when_the_trunk_tilts_by_more_than_seventy_degrees(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", nworld=4)
-    state = env.get_state()
-    tilt = np.radians([69.9, 70.1, 69.9, 70.1]) / 2
-    parts = env.state_space.split(state)
-    parts["qpos"][:, 3:7] = 0.0
-    parts["qpos"][:, 3] = torch.from_numpy(np.cos(tilt))
-    parts["qpos"][torch.arange(4), torch.tensor([4, 4, 5, 5])] = torch.from_numpy(np.sin(tilt))
-    assert env.get_terminated(state).tolist() == [False, True, False, True]
-
-
-def test_actions_move_the_servo_targets_away_from_the_default_pose(shared_env: SharedEnv) -> None:
-    """Actions are not clipped; the servos' force limits bound their effect."""
-    env = shared_env("go1_velocity", nworld=NWORLD)
-    bias, action = State(env).bias, 10 * random_steps(env, 1)[0]
-    env.step(action)
-    scale = np.tile([0.372753, 0.372753, 0.248502], 4)
-    np.testing.assert_allclose(env.field("ctrl").numpy(), HOME + scale * action.numpy() - bias, atol=2e-4)
-    assert not np.isfinite(env.action_space.high).any()
-    assert env.model.actuator_forcerange[:3, 1].tolist() == [23.7, 23.7, 35.55]
+    torch.testing.assert_close(env.eval, env.obs[:, 45:47].norm(dim=1))  # the robots do not move yet
