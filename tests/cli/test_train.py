@@ -145,17 +145,19 @@ def physics(env: lw.Env) -> tuple[int, int, int, bool]:
     return opt.integrator, opt.iterations, opt.ls_iterations, env.options.physics.deterministic
 
 
-def test_resumed_run_uses_its_saved_physics(
+def test_resumed_run_uses_its_saved_physics_and_environment_options(
     tmp_path: Path, made_envs: list[lw.Env], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(policy_videos, "write_video", lambda env, states, path, **options: path)
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
+    options += ["--horizon", "32", "--nthread", "2"]
     # the task's default integrator is RK4
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
-    assert Run.open(out).config["physics"] == given
+    config = Run.open(out).config
+    assert (config["physics"], config["options"]) == (given, {"horizon": 32, "nthread": 2})
     resume = ["train", "--resume", str(out), *QUIET, "--no-transfer", "--iterations"]
     assert cli.main([*resume, "2"]) == 0
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
@@ -163,11 +165,16 @@ def test_resumed_run_uses_its_saved_physics(
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
     # 1 world for videos, 2 for training and eval, 32 for the final evaluation
     assert {env.nworld for env in made_envs} == {1, 2, 32}
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
+    made_envs.clear()
+    assert cli.main(["eval", str(out), "--episodes", "2", "--horizon", "16", "--nthread", "1"]) == 0
+    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(16, 1)}
     capsys.readouterr()
     for other, words in [
         (["--integrator", "rk4"], "has integrator euler, not rk4"),
         (["--solver", "iterations=8"], "has solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
         (["--no-deterministic"], "has deterministic True, not False"),
+        (["--horizon", "16"], "has horizon 32, not 16"),
     ]:
         assert cli.main([*resume, "4", *other]) == 2
         refused(capsys, words, "a run keeps its settings")
@@ -198,25 +205,6 @@ def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
     change(config)
     (folder / "config.json").write_text(json.dumps(config))
     return ["train", "--resume", str(folder), "--iterations", "5", *QUIET]
-
-
-def test_resumed_run_uses_its_saved_environment_options(
-    tmp_path: Path, made_envs: list[lw.Env], capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    assert train(out, "--iterations", "1", "--horizon", "32", "--nthread", "2") == 0
-    config = Run.open(out).config
-    assert (config["options"], config["params"]) == ({"horizon": 32, "nthread": 2}, {})
-    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
-    assert cli.main([*resume, "2"]) == 0
-    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
-    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
-    made_envs.clear()
-    assert cli.main(["eval", str(out), "--episodes", "2", "--horizon", "16", "--nthread", "1"]) == 0
-    assert {(env.horizon, env.options.nthread) for env in made_envs} == {(16, 1)}
-    capsys.readouterr()
-    assert cli.main([*resume, "3", "--horizon", "16"]) == 2
-    refused(capsys, "has horizon 32, not 16")
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -16,51 +16,8 @@ from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import run_env, task_copy
 
-SOURCE = """
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-@wp.struct
-class World:
-    qpos: Row[float]
-    qvel: Row[float]
-
-@wp.struct
-class Params:
-    dt: float
-    goal: wp.array[float] = [0.1, 0.2]
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-    obs[1] = s.qvel[0]
-
-@wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return -wp.abs(s1.qpos[0] - p.goal[0])
-
-@wp.func
-def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    s.qpos[0] = lw.uniform(rng, -1.0, 1.0)
-
-class Slide(lw.Task):
-    model, horizon, obs = "robot/scene.xml", 20, {"x": 1, "v": 1}
-"""
-SCENE = """
-<mujoco>
-  <compiler meshdir="../meshes"/>
-  <include file="parts/block.xml"/>
-  <asset><mesh name="block" file="block.obj"/></asset>
-  <actuator><motor joint="x" ctrlrange="-1 1"/></actuator>
-</mujoco>
-"""
-PART = """
-<mujocoinclude>
-  <worldbody><body><joint name="x" type="slide" axis="1 0 0"/><geom type="mesh" mesh="block"/></body></worldbody>
-</mujocoinclude>
-"""
-BLOCK = "v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+TASK = Path(__file__).parents[1] / "data" / "runs_0_1" / "task_file" / "task"
+SOURCE, SCENE, PART = ((TASK / name).read_text() for name in ("slide.py", "robot/scene.xml", "robot/parts/block.xml"))
 
 SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
 
@@ -71,10 +28,7 @@ def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
     shutil.rmtree(folder)
-    for name, text in {"mine/slide.py": SOURCE, "mine/robot/scene.xml": SCENE, "mine/robot/parts/block.xml": PART,
-                       "mine/meshes/block.obj": BLOCK}.items():  # fmt: skip
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text)
+    shutil.copytree(TASK, folder / "mine", ignore=shutil.ignore_patterns("tables", "__pycache__"))
     np.save(folder / "mine" / "goal.npy", np.array([0.3, 0.4]))
     return folder
 
