@@ -393,6 +393,7 @@ def test_gpu_learner_continues_after_loading_a_state() -> None:
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
+@pytest.mark.quick("1.0")
 @pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a KL limit of 1.0 shortens many steps
 def test_optimized_iterations_equal_iterations_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""

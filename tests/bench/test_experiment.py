@@ -181,6 +181,7 @@ def test_figures_and_tables_are_made_from_stored_results(
         plot.main(plot.Options((), tmp_path / "empty"))
 
 
+@pytest.mark.long
 def test_other_library_runs_in_a_separate_virtual_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

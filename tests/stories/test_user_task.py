@@ -206,7 +206,7 @@ def random_steps(env: lw.Env, n: int, seed: int = 0) -> None:
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_user_task_passes_check_task(module: ModuleType, engine: str) -> None:
-    check_task("follow_target", engine=engine, steps=100, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
+    check_task("follow_target", engine=engine, steps=40, frame_skip=2, gain=np.array([0.5, 1.0, 1.5, 2.0]))
 
 
 @pytest.mark.long

@@ -20,6 +20,7 @@ def episode(env: lw.Env) -> Trajectory:
     return control(env, towards, seed=3)
 
 
+@pytest.mark.quick("two episodes", "async")
 @pytest.mark.parametrize("case", ["one episode", "two episodes", "async", "one step"])
 def test_episodes_are_plotted_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
