@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from lyceum_warp import cli
-from lyceum_warp.tuning import search
+from lyceum_warp.tuning import judgement, search
 from lyceum_warp.tuning.trial import SHORT
 
 QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tolerance", "any"]
@@ -16,6 +16,7 @@ def test_tune_prints_a_table_and_flags_that_other_commands_accept(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
+    monkeypatch.setattr(judgement, "LEAST_GAIN", 0.0)  # measured speeds are random on a busy machine
     assert cli.main(["tune", "half_cheetah", *QUICK, "--out", str(tmp_path / "rows.jsonl")]) == 0
     out, err = capsys.readouterr()
     assert "half_cheetah: 8 worlds, mujoco engine on" in out and "the task as it is" in out
