@@ -1,11 +1,11 @@
-"""Test the shapes of terrains, contacts on both engines, height scans, and levels."""
+"""Test the shapes of terrains, contacts on both engines, and height scans."""
 
 import mujoco
 import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
-from terrain_task import KINDS, TERRAIN, OnTerrain
+from terrain_task import KINDS, OnTerrain
 
 import lyceum_warp as lw
 from lyceum_warp.terrain import height_table
@@ -195,28 +195,6 @@ def test_height_scan_of_a_state_is_equal_on_both_engines(shared_env: SharedEnv, 
     env = shared_env(OnTerrain, engine=engine, nworld=8)
     env.set_state(states)
     torch.testing.assert_close(env.obs[:, 4:], shared_env(OnTerrain, nworld=8).obs[:, 4:], rtol=0, atol=1e-6)
-
-
-def test_level_of_a_world_rises_after_walking_far_and_falls_after_standing(shared_env: SharedEnv) -> None:
-    env = shared_env(OnTerrain, nworld=48)
-
-    def episode(*speed: float) -> torch.Tensor:
-        for _ in range(OnTerrain.horizon):
-            env.action[:] = torch.tensor(speed)
-            env.step()
-        return memory("level")
-
-    def memory(name: str) -> torch.Tensor:
-        return env.state_space.split(env.get_state())[name][:, 0]
-
-    column = memory("column").int()
-    easy = (column == KINDS.index("flat")) | (column == KINDS.index("slope_up"))
-    assert easy.any() and not memory("level").any()
-    assert (episode(0.7, 0.0)[easy] == 1.0).all()
-    middle = torch.as_tensor(TERRAIN.origins)[1, column.long()]
-    assert ((env.obs[easy, :2].cpu() - middle[easy, :2]).abs() <= 0.5 + 1e-6).all()  # the centre of the next patch
-    assert (episode(-0.7, 0.0)[easy] == 2.0).all()
-    assert (episode(0.0, 0.0)[easy] == 1.0).all()
 
 
 @pytest.mark.quick("mujoco")

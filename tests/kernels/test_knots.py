@@ -36,17 +36,6 @@ def test_interpolated_actions_equal_the_plain_implementation_at_every_phase(
         np.testing.assert_allclose(found, grid.actions(values), atol=1e-5, err_msg=f"step {grid.now}")
 
 
-@pytest.mark.parametrize("spline, degree", [("zero", 0), ("linear", 1), ("cubic", 2)])
-def test_spline_through_points_of_a_polynomial_equals_the_polynomial(spline: str, degree: int) -> None:
-    """A cubic spline with slopes from central differences reproduces parabolas exactly."""
-    horizon, count = 12, 3
-    number = knots.knot_count(horizon, count, spline)
-    places = np.arange(number) - (spline == "cubic")
-    steps = np.arange(horizon) * count / horizon
-    found = interpolated((0.7 * places**degree)[:, None, None], horizon, count, spline)
-    np.testing.assert_allclose(found[:, 0, 0], 0.7 * steps**degree, atol=1e-5)
-
-
 def test_interpolated_actions_stay_within_the_bounds() -> None:
     values = np.array([0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None, None]
     free, bounded = (interpolated(values, 12, 4, "cubic", limit=limit) for limit in (np.inf, 1.0))

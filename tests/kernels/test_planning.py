@@ -1,10 +1,9 @@
-"""Compare planning noise and sample weights with their formulas, and check value functions in Warp."""
+"""Check planning noise, sample weights at extreme temperatures, and value functions in Warp."""
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
-from plain_mppi import smoothed
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, Row
@@ -64,48 +63,11 @@ def test_samples_have_distinct_random_keys_that_differ_from_those_of_the_plant()
     assert not np.isin(keys, np.concatenate(plants)).any()
 
 
-@pytest.mark.parametrize("betas", [(0.25, 0.8, 0.0), (1.0, 0.0, 0.0), (0.5, 0.3, 0.2)])
-def test_smoothed_noise_has_the_standard_deviation_of_the_formula(betas: tuple[float, float, float]) -> None:
-    """The default weights scale the standard deviation by 1, 1, 0.838, 0.716, ..."""
-    plan = MPPI("point_mass", horizon=12, samples=4000, noise=[0.02, 0.05], smoothing=betas)
-    plan(plan.state_of())
-    added = (plan.sampled - plan.nominal[:, None]).double().numpy()
-    answers = smoothed(np.eye(12), betas)  # impulse responses
-    spread = np.sqrt((answers**2).sum(1))[:, None] * [0.02, 0.05]
-    np.testing.assert_allclose(added.std(1), spread, rtol=0.05)
-    correlation = answers @ answers.T / np.sqrt(np.outer((answers**2).sum(1), (answers**2).sum(1)))
-    for i in range(2):
-        np.testing.assert_allclose(np.corrcoef(added[:, :, i]), correlation, atol=0.08)
-    assert betas != (0.25, 0.8, 0.0) or spread[2, 0] == pytest.approx(0.02 * np.sqrt(0.25**2 + 0.8**2))
-
-
-def test_noise_has_the_given_covariance() -> None:
-    wanted = 1e-3 * np.array([[1.0, -0.6], [-0.6, 0.5]])
-    plan = MPPI("point_mass", horizon=10, samples=4000, noise=wanted, smoothing=(1, 0, 0))
-    plan(plan.state_of())
-    added = (plan.sampled - plan.nominal[:, None]).double().numpy().reshape(-1, 2)
-    np.testing.assert_allclose(np.cov(added.T), wanted, atol=3e-5)
-
-
-def test_equal_noise_gives_equal_samples_as_a_number_a_vector_or_a_matrix() -> None:
-    plans = [MPPI("point_mass", horizon=10, noise=noise) for noise in (0.1, [0.1, 0.1], np.diag([0.01, 0.01]))]
-    for plan in plans:
-        plan(plan.state_of())
-        torch.testing.assert_close(plan.sampled, plans[0].sampled)
-
-
 def test_noise_of_a_sample_does_not_depend_on_the_number_of_samples() -> None:
     few, more = (MPPI("point_mass", horizon=6, samples=n, seed=2) for n in (8, 50))
     for _ in range(3):
         few(few.state_of()), more(more.state_of())
         assert torch.equal(few.standard_noise, more.standard_noise[:, :8])
-
-
-@pytest.mark.parametrize("temperature", [0.01, 1.0, 100.0])
-def test_sample_weights_are_positive_and_sum_to_one(temperature: float) -> None:
-    plan = MPPI("reach", temperature=temperature)
-    plan(first_state(0))
-    assert plan.weights.sum().item() == pytest.approx(1, abs=1e-5) and (plan.weights >= 0).all()
 
 
 @pytest.mark.parametrize("temperature", [1e-6, 1e-30])
@@ -124,13 +86,6 @@ def test_plan_with_high_temperature_is_the_mean_of_all_samples(temperature: floa
     plan(first_state(0))
     torch.testing.assert_close(plan.actions, plan.sampled.mean(1))
     assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
-
-
-def test_sample_weights_are_exponentials_of_returns_divided_by_the_temperature() -> None:
-    plan = MPPI("reach", temperature=3.0)
-    plan(first_state(0))
-    ratio = ((plan.returns[0] - plan.returns[1]) / 3.0).exp()
-    torch.testing.assert_close(plan.weights[0] / plan.weights[1], ratio, rtol=1e-4, atol=0)
 
 
 @wp.func

@@ -30,17 +30,6 @@ def test_only_the_listed_elements_are_scaled() -> None:
     np.testing.assert_allclose(ratio[:, [0, 2, 4]], 1.0, rtol=1e-6)
 
 
-def test_all_listed_geoms_get_the_same_random_friction() -> None:
-    ranges = {"sliding_friction": [0.3, 1.5], "spinning_friction": [1e-4, 2e-2], "rolling_friction": [1e-5, 5e-3]}
-    found = call("draw_friction", geom_friction=np.full((4, 3), 7.0), geoms=[3, 1], **ranges).after["geom_friction"]
-    assert (found[:, [0, 2]] == 7.0).all() and (found[:, 1] == found[:, 3]).all()
-    logs = np.log(found[:, 1])
-    columns = [centred(found[:, 1, 0], 0.3, 1.5), *(
-        centred(logs[:, i], *np.log(list(ranges.values())[i])) for i in (1, 2)
-    )]  # fmt: skip
-    check_uniform(np.stack(columns, axis=1))
-
-
 def test_randomized_mass_and_inertia_are_scaled_by_the_same_factor() -> None:
     mass, inertia = RNG.uniform(1.0, 2.0, (N, 4)), RNG.uniform(1.0, 2.0, (N, 4, 3))
     after = call("scale_mass", body_mass=mass, body_inertia=inertia, bodies=[1, 3], scale=[0.8, 1.2]).after
@@ -48,13 +37,6 @@ def test_randomized_mass_and_inertia_are_scaled_by_the_same_factor() -> None:
     check_uniform(centred(factor[:, [1, 3]], 0.8, 1.2))
     np.testing.assert_allclose(after["body_inertia"] / inertia, np.repeat(factor[..., None], 3, axis=2), rtol=1e-6)
     np.testing.assert_allclose(factor[:, [0, 2]], 1.0, rtol=1e-6)
-
-
-def test_shifted_centre_of_mass_stays_within_its_bounds() -> None:
-    ipos, offset = RNG.standard_normal((N, 3, 3)), np.array([0.1, 0.2, 0.3])
-    moved = call("shift_center_of_mass", body_ipos=ipos, body=1, offset=offset).after["body_ipos"] - ipos
-    check_uniform(np.stack([centred(moved[:, 1, i], -x, x) for i, x in enumerate(offset)], axis=1))
-    assert np.abs(moved[:, [0, 2]]).max() < 1e-6
 
 
 def test_randomized_gains_are_consistent_in_gainprm_and_biasprm() -> None:
