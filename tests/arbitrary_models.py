@@ -1,11 +1,11 @@
-"""Define XML models with every kind of element, and list the rules of ``check_task`` that depend on the model."""
+"""Define XML models with every kind of element."""
 
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# the rules that depend on the model; only these run for engines that are slow on the CPU and models that compile slowly
+# rules of check_task that depend on the model; slow engines and models run only these
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,
@@ -28,7 +28,6 @@ MESH = "-.1 -.1 -.1  .1 -.1 -.1  0 .1 -.1  0 0 .1"
 
 
 def text(world: str, rest: str = MOTOR, option: str = "") -> str:
-    """Return the XML of a model above a floor."""
     return (
         f'<mujoco model="made"><option timestep="0.005">{option}</option>'
         f'<worldbody><geom name="floor" type="plane" size="5 5 .1"/><site name="here" pos="0 0 2"/>{world}</worldbody>'
@@ -105,7 +104,6 @@ MOVING = {
     ),
     "sleep": text(BALL.format(z=0.1) + ARM, option='<flag sleep="enable"/>'),
 }
-"""Models for the rules that check the physics."""
 
 SENSING = {
     "position sensors": text(
@@ -136,7 +134,6 @@ SENSING = {
     ),
     "no sensors": text(ARM),
 }
-"""Models for the rules that check the sensors."""
 
 PLUGINS = {
     "SDF plugins need a registered distance function": text(

@@ -7,7 +7,6 @@ import lyceum_warp as lw
 
 
 def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, velocity: float) -> torch.Tensor:
-    """Put every world into a random state with qpos and qvel within the given bounds; return the states."""
     state = env.get_state()
     parts = env.state_space.split(state)
     for name, size in (("qpos", position), ("qvel", velocity)):
@@ -18,13 +17,11 @@ def put_at_random(env: lw.Env, rng: np.random.Generator, position: float, veloci
 
 
 def positions(env: lw.Env, state: torch.Tensor | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Return copies of qpos and qvel, of the worlds or of given states, in float64."""
     parts = env.state_space.split(env.get_state() if state is None else state)
     return parts["qpos"].numpy().copy(), parts["qvel"].numpy().copy()
 
 
 def check_formula(ours: torch.Tensor, formula: np.ndarray) -> None:
-    """Compare float32 results with a formula in float64."""
     np.testing.assert_allclose(ours.numpy(), formula, rtol=1e-6, atol=2e-6)
 
 

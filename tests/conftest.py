@@ -1,4 +1,4 @@
-"""Define fixtures for shared environments and task files, and skip GPU tests on machines without a GPU."""
+"""Define shared fixtures, and skip GPU tests on machines without a GPU."""
 
 import functools
 import gc
@@ -17,7 +17,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.support.warp_log import start_warp
 
-# one torch thread suffices for the tests' small batches; on a busy machine, several threads would wait for each other
+# several threads would only wait for each other on a busy machine
 torch.set_num_threads(1)
 
 SharedEnv = Callable[..., lw.Env]
@@ -26,8 +26,7 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Store the list of trusted runs in a temporary directory, for this process and its subprocesses. The user's list
-    stays unchanged."""
+    """Keep the user's list of trusted runs unchanged: tests and their subprocesses use a temporary directory."""
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
@@ -36,9 +35,9 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
-    """Cache the probed sizes of contact buffers between runs of the tests.
+    """Cache probed sizes of contact buffers between test runs, because a probe takes seconds.
 
-    A probe takes seconds for a large model. If the probe or the version of MuJoCo changes, the cache starts empty.
+    If the probe or MuJoCo's version changes, the cache starts empty.
     """
     sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
     if sizes is None or cache is None:
@@ -53,15 +52,14 @@ def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
-    """Make environments that the tests of a file share; equal arguments of ``lw.make`` give the same environment.
+    """Make environments that the tests of a file share, one for each set of ``lw.make`` arguments.
 
-    Every call resets the worlds with ``rand_reset(0)``, so a test may leave them in any state. A test that changes
-    parameters or attributes, or that needs many worlds, calls ``lw.make`` itself.
+    Every call resets the worlds. A test that changes parameters or attributes calls ``lw.make`` itself.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
     def get(task: str | type[lw.Task], *, engine: str = "mujoco", nworld: int = 1, **options: Any) -> lw.Env:
-        # the repr is hashable even if the value is a list or an array
+        # lists and arrays are not hashable, but their repr is
         key = (task, engine, nworld, *sorted((name, repr(value)) for name, value in options.items()))
         if key not in made:
             made[key] = lw.make(task, engine=engine, nworld=nworld, **options)
@@ -75,7 +73,7 @@ def shared_env() -> Iterator[SharedEnv]:
 
 @pytest.fixture(scope="session")
 def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> TaskFile:
-    """Write a task file with ``task_file("mine.py", source)``; its path is the same in every run of the tests."""
+    """Write a task file to the same path in every test run."""
     cache = getattr(pytestconfig, "cache", None)
     folder = cache.mkdir("tasks") if cache else tmp_path_factory.mktemp("tasks")
 
@@ -89,11 +87,9 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
 
 def settle() -> None:
-    """Exempt all live objects from garbage collection, because scanning a million objects of imports and kernels is
-    slow.
+    """Exempt all live objects from garbage collection, because scanning a million of them is slow.
 
-    Objects that are created later are collected and counted as usual. Do not call this function while an object that a
-    test must free is alive.
+    Do not call this while an object that a test must free is alive.
     """
     gc.collect()
     gc.freeze()
@@ -101,7 +97,7 @@ def settle() -> None:
 
 @pytest.fixture
 def freed() -> Iterator[None]:
-    """Collect garbage after the test, because environments contain reference cycles and may be large."""
+    """Collect garbage after the test, because environments contain reference cycles."""
     yield
     gc.collect()
 
@@ -113,7 +109,6 @@ def settled() -> None:
 
 @pytest.fixture
 def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
-    """Collect every environment that the test makes, in order."""
     made: list[lw.Env] = []
     init = lw.Env.__init__
 
@@ -127,8 +122,6 @@ def made_envs(monkeypatch: pytest.MonkeyPatch) -> list[lw.Env]:
 
 @pytest.hookimpl(tryfirst=True)  # this hook must run before pytest deselects tests by marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """If a test has the mark ``quick``, mark as ``long`` every case that is not listed in this mark. Skip tests if
-    their GPU or models are missing."""
     _mark_long(items)
     for item in items:
         if (missing := _missing_model(_task(item))) is not None:
@@ -143,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark cases as ``long`` if the mark ``quick`` of their test contains neither their id nor a part of it."""
+    """Mark as ``long`` all cases that the test's mark ``quick`` does not name."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:
@@ -159,7 +152,6 @@ def _mark_long(items: list[pytest.Item]) -> None:
 
 
 def _task(item: pytest.Item) -> str | None:
-    """Return the name of the task that parametrizes a test."""
     callspec = getattr(item, "callspec", None)
     task = callspec.params.get("task", callspec.params.get("engines")) if callspec else None
     return task if isinstance(task, str) else None
@@ -167,7 +159,6 @@ def _task(item: pytest.Item) -> str | None:
 
 @functools.cache
 def _missing_model(task: str | None) -> str | None:
-    """Return why a task's model is missing and how to install it, or None if it is installed."""
     if task is None:
         return None
     try:

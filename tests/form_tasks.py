@@ -1,4 +1,4 @@
-"""Define tasks with pushes and randomized dynamics on small models, for which both engines agree up to rounding."""
+"""Define tasks on small models for which both engines agree up to rounding."""
 
 import mujoco
 import warp as wp
@@ -67,7 +67,7 @@ def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
 
 
 class Pushed(lw.Task):
-    """A task whose ``control`` writes inputs: forces on a body and on a joint, and the pose of a mocap body."""
+    """``control`` writes forces on a body and a joint, and the pose of a mocap body."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -136,7 +136,7 @@ def draw_puck(s: PuckWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Drawn(lw.Task):
-    """A puck on the floor; mass and friction are randomized at every reset, and gravity once per world."""
+    """A puck with random mass and friction in each episode, and random gravity in each world."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(PUCK))
     frame_skip = 3
@@ -154,8 +154,6 @@ def observe_gravity(s: PuckWorld, p: PuckParams, obs: Row[float]):
 
 
 class Weighed(Drawn):
-    """``Drawn`` with an observation of gravity, which is randomized once per world."""
-
     obs = {"x": 1, "gravity": 1}
     World = PuckWorld
     Params = PuckParams
@@ -185,8 +183,7 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """A task in which the puck starts further away as the number ``practice`` grows. This number is in lasting memory,
-    and the task observes it."""
+    """The puck starts further away as ``practice``, a number in lasting memory, grows."""
 
     model = Drawn.model
     frame_skip = 3
@@ -203,7 +200,7 @@ def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Gifted(Practiced):
-    """``Practiced`` with a random initial value of ``practice`` in each world. All worlds share the model."""
+    """Like ``Practiced``, but ``practice`` starts at a random value in each world."""
 
     World = PracticedWorld
     Params = PuckParams

@@ -1,4 +1,4 @@
-"""Define a task that uses every feature of tasks: a puck on the floor, and a movable paddle."""
+"""Define a task that uses every feature: a puck on the floor, and a movable paddle."""
 
 from typing import Any
 
@@ -177,8 +177,7 @@ def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uin
 
 
 class Full(lw.Task):
-    """A task with every function and attribute; episodes begin at a keyframe, and invalid initial states are
-    replaced by new random states."""
+    """Episodes begin at a keyframe. Invalid initial states are replaced by new random states."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(XML))
     frame_skip = 3
@@ -191,6 +190,6 @@ class Full(lw.Task):
 
 
 class Settled(Full):
-    """``Full`` with settling: the puck starts above the floor and falls before the episode begins."""
+    """The puck falls to the floor before the episode begins."""
 
     settle = 4

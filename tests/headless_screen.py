@@ -28,7 +28,6 @@ ROBOT = """
 
 
 def robot() -> mujoco.MjModel:
-    """Return a falling ball and a goal that a mouse can place."""
     return mujoco.MjModel.from_xml_string(ROBOT)
 
 
@@ -75,7 +74,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel in a separate viewer without a window. The screen stores the messages that the panel sends."""
+    """A panel without a window. It stores the messages that the panel sends."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -107,12 +106,10 @@ class Bench:
         return given
 
     def show(self, status: Status) -> None:
-        """Draw a frame with the given status, and discard earlier messages."""
         self.draw(frame_of(self.model, self.data, status))
         self.sent.clear()
 
     def draw(self, frame: Frame | None = None) -> list[Reply]:
-        """Draw one frame, and return the panel's messages."""
         self.given, before = frame, len(self.sent)
         imgui.NewFrame()
         self.viewer.dispatch(messages.UpdateEvent())

@@ -1,5 +1,3 @@
-"""Replace the window process by an object that collects frames and sends a test's commands."""
-
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -11,13 +9,7 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
-    """A window that collects frames without showing them.
-
-    Args:
-        script: Function that is called after each frame with the frame and its number; returns commands, or None to
-            close the window.
-        seconds: Time limit of the test.
-    """
+    """A window that collects frames. ``script`` gets a frame and its number; it returns commands, or None to close."""
 
     wants_frame = True
     error: str | None = None
@@ -51,8 +43,7 @@ class MemoryWindow:
 
 
 def run(session: Session, *script: Iterable[Command] | Callable[[Frame], bool]) -> MemoryWindow:
-    """Run a session, and send the script's commands, one entry per frame; an entry may also be a condition to wait
-    for."""
+    """Run a session with a script of one entry per frame: commands, or a condition to wait for."""
     entries = list(script)
 
     def after(frame: Frame, number: int) -> Iterable[Command] | None:

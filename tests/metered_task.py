@@ -1,4 +1,4 @@
-"""Define a task with metrics and observation groups: a ball on a rail. An episode ends if the ball leaves the rail."""
+"""Define a task with metrics and observation groups: a ball that must stay on a rail."""
 
 import warp as wp
 from rail_task import rail

@@ -11,7 +11,7 @@ import lyceum_warp as lw
 
 
 def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
-    """Smooth noise over time, (horizon, ...); from the third step on, each step is mixed with the previous two."""
+    """Smooth noise over time, (horizon, ...). From the third step on, each step is mixed with the previous two."""
     result = noise.copy()
     for t in range(2, len(noise)):
         result[t] = betas[0] * noise[t] + betas[1] * result[t - 1] + betas[2] * result[t - 2]
@@ -19,7 +19,7 @@ def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
 
 
 def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
-    """Evaluate a cubic Hermite spline by its basis functions, with slopes from central differences."""
+    """Evaluate a cubic Hermite spline with slopes from central differences."""
     slopes = (right - before) / 2, (after - left) / 2
     basis = 2 * f**3 - 3 * f**2 + 1, f**3 - 2 * f**2 + f, -2 * f**3 + 3 * f**2, f**3 - f**2
     return basis[0] * left + basis[1] * slopes[0] + basis[2] * right + basis[3] * slopes[1]
@@ -103,7 +103,7 @@ class Plain:
             self.smoothing = (1.0, 0.0, 0.0)
         self.knots = np.tile(np.clip(self.fill, self.low, self.high), (count or horizon, 1))
         self.deviation = np.tile(np.diag(self.factor), (len(self.knots), 1))
-        # compute the standard deviation of smoothed independent noise from the impulse response
+        # the standard deviation of smoothed independent noise, from the impulse response
         self.spread = np.sqrt((smoothed(np.eye(len(self.knots)), self.smoothing) ** 2).sum(1))[:, None]
 
     @property
@@ -164,7 +164,6 @@ class Plain:
         return result
 
     def roll_out(self, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rewards and terminations of each step, and the values of the states after the last step."""
         env = self.env
         states = state.repeat(env.nworld, 1)
         for name, rows in self.fields.items():

@@ -1,4 +1,4 @@
-"""Define a task for tests of the planner: a ball on a rail. The reward is NaN for actions above a limit."""
+"""Define a task for planner tests: a ball on a rail. The reward is NaN for actions above a limit."""
 
 import mujoco
 import warp as wp

@@ -1,4 +1,4 @@
-"""Define a task that reads a motion from a table in its parameters: a ball on a rail follows the motion."""
+"""Define a task that reads a motion from an array parameter: a ball on a rail follows the motion."""
 
 import warp as wp
 from rail_task import rail

@@ -1,4 +1,4 @@
-"""Call functions of ``lyceum_warp.terms`` in many worlds at once, for their tests."""
+"""Call functions of ``lyceum_warp.terms`` in many worlds at once."""
 
 import dataclasses
 from typing import Any
@@ -11,11 +11,10 @@ from lyceum_warp.binding.sources import is_row, overloads, run_source
 
 N = 256
 MODULE = wp.Module("term_calls", None)
-"""A Warp module for all kernels, so that Warp compiles them together."""
+"""One Warp module for all kernels, so that Warp compiles them together."""
 
 
 def kernel_of(function: wp.Function, number: int) -> wp.Kernel:
-    """Make a kernel that calls a function in every world; the kernel's arrays have a leading axis of worlds."""
     kinds = {
         argument: wp.array(dtype=kind.dtype, ndim=2) if is_row(kind) else wp.array(dtype=kind, ndim=1)
         for argument, kind in function.input_types.items()
@@ -35,7 +34,6 @@ KERNELS = {
     name: [(each, kernel_of(each, i)) for i, each in enumerate(overloads(getattr(terms, name)))]
     for name in terms.__all__
 }
-"""Overloads of each function, by name; each has a kernel."""
 
 
 @dataclasses.dataclass
@@ -47,9 +45,9 @@ class Call:
 
 
 def call(name: str, overload: int = 0, **values: Any) -> Call:
-    """Call a function in N worlds; an argument is one value for all worlds, or has one entry per world.
+    """Call a function in N worlds. An argument is one value for all worlds, or one entry per world.
 
-    Each world has its own stream ``rng``. If several overloads accept the arguments, ``overload`` selects one.
+    Each world has its own ``rng``. If several overloads accept the arguments, ``overload`` selects one.
     """
     matching = [
         (function, kernel) for function, kernel in KERNELS[name] if {*function.input_types} - {"rng"} == {*values}

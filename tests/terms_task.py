@@ -1,4 +1,4 @@
-"""Define a task for tests of terms: a ball on a rail with rewards for its speed and its position."""
+"""Define a task with terms: a ball on a rail with rewards for its speed and its position."""
 
 from typing import Any
 
@@ -101,6 +101,4 @@ class Terms(lw.Task):
 
 
 class Ordered(Terms):
-    """``Terms`` with different weights."""
-
     rewards = Terms.rewards | {"near": 3.0}

@@ -1,5 +1,4 @@
-"""Define a variant of a task in another file: it adds a parameter, a field, memory and a term, and replaces a
-helper."""
+"""Define a variant of a task in another file. It adds a parameter, field, memory and term, and replaces a helper."""
 
 import terms_task as parent
 import warp as wp

@@ -1,4 +1,4 @@
-"""Define a task on rough ground: a ball with velocity servos, a height scan, and levels that depend on the distance."""
+"""Define a task on rough ground: a ball with velocity servos, a height scan, and terrain levels."""
 
 import mujoco
 import warp as wp

@@ -1,4 +1,4 @@
-"""Run the commands and the Python blocks of pages, and check links and file names in documents."""
+"""Run the commands and Python blocks of pages, and check links and file names."""
 
 import dataclasses
 import json
@@ -24,8 +24,7 @@ from lyceum_warp.viz.video import NoVideoError, check_video
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
-"""Pages with commands. The code blocks of a page run in order in one folder; a block with a title is written to a file
-with this name."""
+"""Pages with commands. Their blocks run in order in one folder; a titled block is written to a file of this name."""
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 
@@ -34,7 +33,7 @@ def name_of(path: Path) -> str:
 
 
 def python_of(page: Path) -> str:
-    """Return a page's Python code with its original line numbers, so that a traceback points into the page."""
+    """Return a page's Python code with its line numbers, so that a traceback points into the page."""
     lines, language = [], None
     for line in page.read_text().splitlines():
         if line.startswith("```"):
@@ -46,7 +45,6 @@ def python_of(page: Path) -> str:
 
 
 PROGRAMS = [page for page in PAGES if page not in WALKTHROUGHS and python_of(page).strip()]
-"""Pages that contain Python but no commands."""
 
 
 # other tests cover the program of terrain.md
@@ -64,7 +62,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_errors_in_warp_for_python_md_give_the_messages_on_the_page(number: int, task_file: TaskFile) -> None:
+def test_mistakes_in_warp_for_python_give_the_printed_messages(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1
@@ -86,16 +84,10 @@ QUICK = {
     "tune": ["--nworld", "8", "--episodes", "4"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
-"""Options that are added to a page's commands to make them quick."""
 
 
 class Walkthrough:
-    """Run the blocks of a page one after another.
-
-    Args:
-        folder: An empty folder, which becomes the working directory.
-        quick: Whether to add the options of QUICK, and to omit slow checks on the Warp engine.
-    """
+    """Run a page's blocks in an empty folder. ``quick`` adds the options of QUICK, and omits slow checks on Warp."""
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, *, quick: bool) -> None:
         self.folder, self.monkeypatch, self.quick = folder, monkeypatch, quick
@@ -116,7 +108,7 @@ class Walkthrough:
 
     def command(self, words: list[str]) -> None:
         match words:
-            case ["git", "clone", address]:  # make a checkout with one robot, and replace its model
+            case ["git", "clone", address]:
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
                 robot.write_text(lw.gymnasium_model("ant.xml").spec().to_xml())
@@ -136,8 +128,6 @@ class Walkthrough:
 
 @pytest.fixture(autouse=True)
 def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Replace windows by in-memory windows that close after two frames."""
-
     def opened(*words: object, **options: object) -> MemoryWindow:
         return MemoryWindow(lambda frame, number: [] if number < 1 else None)
 
@@ -146,13 +136,12 @@ def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def short_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Limit tune's speed measurements to milliseconds."""
     monkeypatch.setattr(search, "SHORT", dataclasses.replace(search.SHORT, repeats=2, block_seconds=0.005, steps=40))
 
 
 @pytest.fixture
 def empty_folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return an empty folder that has the same path in every run, so that Warp reuses compiled kernels."""
+    """Return an empty folder at a constant path, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("walkthrough")) if cache else tmp_path / "walkthrough"
     shutil.rmtree(folder, ignore_errors=True)
@@ -232,7 +221,6 @@ def test_notebooks_are_stored_without_output() -> None:
 
 
 def test_gallery_is_up_to_date_and_its_pictures_are_small() -> None:
-    """The program ``python docs/gallery.py`` draws the pictures and writes the page."""
     page, folder = ROOT / "docs" / "gallery.md", ROOT / "docs" / "images" / "gallery"
     results = json.loads((folder / "results.json").read_text())
     assert runpy.run_path(str(ROOT / "docs" / "gallery.py"))["page"](results) == page.read_text()
@@ -242,13 +230,11 @@ def test_gallery_is_up_to_date_and_its_pictures_are_small() -> None:
 
 
 def test_generated_map_of_the_package_is_up_to_date() -> None:
-    """The program ``python docs/rooms.py`` writes the map of docs/architecture.md from the docstrings of modules."""
     page = (ROOT / "docs" / "architecture.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "rooms.py"))["written"](page) == page
 
 
 def test_tables_of_terms_are_up_to_date() -> None:
-    """The program ``python docs/terms_table.py`` writes the tables from the docstrings."""
     page = (ROOT / "docs" / "terms.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
 

@@ -1,5 +1,3 @@
-"""Test fields, parameters, replicas and errors of environments, and environments in other processes."""
-
 import copy
 import gc
 import multiprocessing
@@ -74,7 +72,7 @@ def test_an_environment_in_a_forked_child_raises_an_error() -> None:
     assert not hangs and child.exitcode == 0
     assert len(messages) == 6
     assert all("made before the process was forked" in text and "'spawn'" in text for text in messages)
-    env.step()  # the parent's environment still works
+    env.step()
 
 
 def _make_another(connection: Connection) -> None:

@@ -18,8 +18,6 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture):
-    """Run an example in an empty folder, as in ``run("train.py", "--nworld", "4")``; return its lines."""
-
     def lines(name: str, *args: str) -> list[str]:
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(sys, "argv", [name, *args])
@@ -30,14 +28,13 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureF
 
 
 def numbers(pattern: str, lines: list[str]) -> list[float]:
-    """Return the number that a pattern captures in each matching line."""
     return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
 
 
 def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 6  # one number for each of five iterations, and one for the mean policy
+    assert len(returns) == 6  # one for each of five iterations, and one for the mean policy
     assert returns[-1] > 2 * returns[0] > 0
     assert lines[-1] == "saved in policy.pt: 5126 parameters"
     assert (tmp_path / "policy.pt").is_file()
@@ -47,14 +44,13 @@ def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> Non
 def test_example_own_policy_improves_its_policy(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 9  # one number for each of eight iterations, and one for the mean policy
+    assert len(returns) == 9  # one for each of eight iterations, and one for the mean policy
     assert returns[-1] > max(returns[:3]) + 50
     assert lines[-1].endswith("370 parameters")
 
 
 @pytest.mark.long
 def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
-    """The run has a folder, resumes bit for bit, and can be evaluated and exported."""
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
     assert max(once) == 200.0 > 1.5 * once[0]  # the robot gets a reward in every step
     run("random_search.py", "--out", "twice", "--iterations", "3")
@@ -64,14 +60,13 @@ def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path)
     assert cli.main(["eval", "twice", "--which", "best", "--episodes", "4"]) == 0
     assert cli.main(["export", "twice", "--to", "policy.pt2"]) == 0
     assert torch.export.load("policy.pt2").module()(torch.zeros(3, 4)).shape == (3, 1)
-    # the learner's class is defined in a script
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2
 
 
-@pytest.mark.long  # the tests of SAC and of random_search.py already cover the components of TD3
+@pytest.mark.long  # tests of SAC and of random_search.py already cover the components of TD3
 def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
-    assert ended[0] > 50 > 25 > ended[-1]  # the last policy keeps the pole up for longer than the first
+    assert ended[0] > 50 > 25 > ended[-1]
     run("td3.py", "--out", "twice", "--iterations", "2")
     lines = run("td3.py", "--out", "twice", "--iterations", "4", "--resume")
     assert numbers(r"return ([\d.]+)", lines)[0] > 10.0
@@ -87,7 +82,7 @@ def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
 
 @pytest.mark.long
 def test_example_own_task_passes_check_task_and_runs() -> None:
-    # this runs in a subprocess, because the task is registered and its module is __main__
+    # in a subprocess, because the task is registered and its module is __main__
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)

@@ -1,8 +1,6 @@
-"""Check that a fault affects only its world, and that errors for wrong arguments name the value and the fix.
+"""Test faults that need particular models.
 
-The conformance suite covers NaN, infinite and out-of-range states and actions for every task and engine. The faults in
-this file need particular models, and both engines can produce every kind of fault. Only the Warp engine has a contact
-buffer that worlds share, so only its contact overflows affect other worlds.
+The conformance suite covers non-finite and out-of-range states and actions.
 """
 
 import gc
@@ -32,14 +30,14 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """Lay a hopper on the floor, where it has five contacts; a standing hopper has none."""
+    """A hopper on the floor has five contacts, and a standing hopper has none."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a fault and one without a fault; all other worlds must be bitwise equal."""
+    """Step an environment with a fault and one without. All other worlds must be bitwise equal."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -61,10 +59,9 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 
 
 def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
-    """With less and less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts.
+    """With less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts.
 
-    The memory sizes of the three faults depend on the MuJoCo version, so the test tries many sizes; all faults must be
-    reported.
+    The sizes depend on the MuJoCo version, so the test tries many.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
@@ -88,8 +85,8 @@ def test_constraint_overflow_of_the_warp_engine_causes_a_fault_in_one_world() ->
     assert env.fault_counts.pop("constraint_overflow") == sum(env.fault_counts.values()) == 1
 
 
-def test_contact_overflow_of_the_warp_engine_causes_a_fault_in_every_world_that_loses_contacts() -> None:
-    """All worlds share one contact buffer, and every world whose contacts exceed it has a fault."""
+def test_contact_overflow_on_warp_is_a_fault_in_every_world_that_loses_contacts() -> None:
+    """All worlds share one contact buffer."""
     env = hopper("warp", nconmax=1, njmax=64)
     lay_down(env, BAD)
     before = env.obs.clone()
@@ -131,7 +128,7 @@ def test_overflow_of_a_contact_sensor_in_the_warp_engine_is_an_engine_warning() 
 def test_faults_print_and_log_nothing_over_150_steps(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """A NaN in one world every five steps does not affect the other worlds or the console."""
+    """A world gets a NaN every five steps."""
     monkeypatch.chdir(tmp_path)
     env, clean = (lw.make("hopper", engine=engine, nworld=N) for _ in range(2))
     start, only = env.state_space.parts["qvel"].start, torch.arange(N) == BAD
@@ -142,7 +139,7 @@ def test_faults_print_and_log_nothing_over_150_steps(
             state = env.get_state()
             state[BAD, start + i % 6] = (np.nan, np.inf, 1e200, -1e15)[i % 4]
             env.set_state(state, only, check=False)
-            assert torch.isfinite(env.obs).all() and not env.done[BAD]  # the next step detects the fault
+            assert torch.isfinite(env.obs).all() and not env.done[BAD]
             assert Done.NAN in step_both(env, clean, 5)  # the state may also cause other faults
     assert env.fault_counts["nan"] == 30
     assert sum(clean.fault_counts.values()) == 0

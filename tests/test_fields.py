@@ -1,5 +1,3 @@
-"""Test the types, stages and named elements of the simulator's fields."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -101,7 +99,7 @@ def test_field_that_needs_a_sensor_raises_an_error_without_one(name: str, model:
         ("mocap_pos", "target", slice(0, 1)),
     ],
 )
-def test_name_of_an_element_is_converted_to_its_indices_in_a_field(
+def test_name_of_an_element_gives_its_indices_in_a_field(
     name: str, element: str, where: slice, model: mujoco.MjModel
 ) -> None:
     assert elements(model, name, element) == where

@@ -54,8 +54,6 @@ def test_registering_an_unknown_task_raises_an_error(tmp_path: Path) -> None:
 
 def test_make_raises_an_error_if_the_package_of_the_model_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     class Missing(Full):
-        """A task with a model from a package that is not installed."""
-
         model = lw.package_model("package_that_is_missing", "arm.xml", install="lyceum-warp[arm]")
 
     id = register(Missing)

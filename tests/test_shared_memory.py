@@ -1,5 +1,3 @@
-"""Test memory that all worlds share: its sums over worlds, its updates and its copies."""
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -92,7 +90,6 @@ def env() -> Iterator[lw.Env]:
 
 
 def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Take random steps; return the angles before resets (count, nworld) and whether episodes ended."""
     generator = torch.Generator().manual_seed(3)
     angles, ended = [], []
     for _ in range(count):
@@ -109,7 +106,7 @@ def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -
     for _ in range(2):
         before = env.shared["falls"].clone()
         angles, ended = steps(env, 30)
-        assert torch.equal(env.shared["falls"], before)  # steps change only the sums, not yet the shared memory
+        assert torch.equal(env.shared["falls"], before)
         env.update_shared()
         falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
         assert falls.sum() > 5

@@ -1,5 +1,3 @@
-"""Test the shapes of terrains, contacts on both engines, and height scans."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -15,13 +13,12 @@ from lyceum_warp.testing import check_task
 
 
 def patch(kind: str, *, level: int = 0, levels: int = 1, **options: object) -> np.ndarray:
-    """Make the heights of one 8 m patch, with a point every 0.1 m."""
+    """Make the heights of an 8 m patch, with a point every 0.1 m."""
     terrain = lw.Terrain({kind: 1}, levels=levels, border=0.0, **options)
     return terrain.heights[80 * level : 80 * level + 81]
 
 
 def row_of(kind: str, **options: object) -> np.ndarray:
-    """Return a patch's heights along x, from its centre to its edge, (41,)."""
     return patch(kind, **options)[40, 40:]
 
 
@@ -67,7 +64,7 @@ def test_equal_seeds_give_equal_fields_and_a_new_column_does_not_change_others()
     np.testing.assert_array_equal(lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights, field)
     assert (lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=4).heights != field).any()
     more = lw.Terrain({"rough": 1, "steps": 1, "flat": 2}, levels=3, seed=3, scale={"rough": 0.12, "steps": 0.3})
-    # with one more level and 1.5 times the height, the first two levels are the same as before
+    # the first two levels do not change with one more level and 1.5 times the height
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 
@@ -133,7 +130,6 @@ def test_terrain_replaces_the_plane_and_has_its_name_and_friction() -> None:
     np.testing.assert_allclose(model.geom("floor").friction, [0.3, 0.01, 0.001])
     table = height_table(model, "terrain")
     assert table[1:, 1:].max() == pytest.approx(0.5) and table[1:, 1:].min() == pytest.approx(0.5 - 1.2)
-    # the corner of a patch is at the plane's position
     assert (table[0, 1:].min(), table[1:, 0].max()) == pytest.approx((1 - 4, 2 + 12))
     spec.worldbody.add_geom(name="one", type=plane, size=[1, 1, 1])
     spec.worldbody.add_geom(name="two", type=plane, size=[1, 1, 1])
@@ -180,12 +176,11 @@ def test_ball_rests_on_every_kind_of_patch_at_the_height_in_the_table(shared_env
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
-    # the tolerance is the ball's radius, because MuJoCo Warp drops a contact of a ball between two walls
+    # the tolerance is the ball's radius: MuJoCo Warp drops a contact of a ball between two walls
     np.testing.assert_allclose(nearest, 0.05, atol=2e-3 if engine == "mujoco" else 5e-3)
     assert np.median(abs(nearest - 0.05)) < 5e-4
     assert np.ptp(obs[:, 2]) > 0.4
-    # the distance that the engine's rangefinder measures downwards; for x = 16 m and a slope of 5, float32 is exact to
-    # 2e-5 m
+    # the engine's rangefinder measures the distance downwards; at x = 16 m and a slope of 5, float32 is exact to 2e-5 m
     np.testing.assert_allclose(obs[:, 3], obs[:, 4 + 21 * 21 // 2], atol=5e-5)
 
 

@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Tests that compare numbers do not use this environment, because each algorithm advances its random streams."""
+    """Tests that compare numbers do not use this environment: each algorithm advances its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
@@ -44,7 +44,7 @@ def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Pat
 def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A message reports that the version of a package has changed."""
+    """A message reports that a package's version has changed."""
     folder = Path(shutil.copytree(six, tmp_path / "run"))
     run = Run.open(folder)
     run.amend(versions=run.config["versions"] | {"torch": "2.0"})
@@ -129,7 +129,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_best_policy_without_evaluations_is_the_one_whose_samples_had_the_highest_return(tmp_path: Path) -> None:
+def test_best_policy_without_evaluations_has_the_highest_sampled_return(tmp_path: Path) -> None:
     """In each iteration, the policy samples episodes before it is updated."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
@@ -190,7 +190,7 @@ def test_last_save_remains_after_an_interrupted_iteration(
 
 
 class SlowToSave(lw.NPG):
-    """A learner whose saves are so slow that only the first and the last state are saved."""
+    """A learner with slow saves: only its first and last state are saved."""
 
     saves = 0
     signal_in_save = 0
@@ -206,7 +206,7 @@ class SlowToSave(lw.NPG):
 
 @pytest.fixture
 def sigint() -> Iterator[None]:
-    """Install Python's default SIGINT handler, because child processes of a shell may ignore SIGINT."""
+    """Install Python's SIGINT handler, because child processes of a shell may ignore SIGINT."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -218,7 +218,7 @@ def interrupt_in_fifth(iteration: lw.Iteration) -> None:
 
 
 @pytest.mark.usefixtures("sigint")
-def test_all_finished_iterations_are_saved_after_a_signal_even_if_saves_are_slow(tmp_path: Path) -> None:
+def test_all_finished_iterations_are_saved_after_a_signal(tmp_path: Path) -> None:
     npg = SlowToSave(lw.make("point_mass", nworld=2), config=CONFIG)
     with pytest.raises(KeyboardInterrupt):
         lw.train(npg, tmp_path / "run", iterations=100, callback=interrupt_in_fifth)
@@ -291,8 +291,7 @@ def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_pat
 def test_training_from_another_run_starts_with_its_policy(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The new run has the old run's settings except for one parameter. The old run's policy collects the new run's
-    first samples."""
+    """Only one parameter differs between the runs. The old run's policy collects the new run's first samples."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
@@ -366,8 +365,7 @@ def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
 
 
 def test_run_folder_contains_the_result_of_the_transfer_test(env: lw.Env, tmp_path: Path) -> None:
-    """By default, the transfer test runs only if the physics are not exact, because compiling the other engine's
-    kernels may take minutes."""
+    """By default, the test runs only if physics are not exact, because compiling other kernels may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
     assert not run.transfer.exists()
     coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))

@@ -1,5 +1,3 @@
-"""Test kinematic tables of walking robots against MuJoCo, and the preparation of models for walking."""
-
 from types import SimpleNamespace
 
 import mujoco
@@ -40,8 +38,10 @@ XML = """
   <sensor><gyro site="ankle"/></sensor>
 </mujoco>
 """
-"""A robot with a leg of 3 joints and a leg of 1 joint. One body has two joints, which are not at the body's origin; one
-of these joints has the attribute ``ref``. Another body is fixed."""
+"""A robot with a leg of 3 joints and a leg of 1 joint.
+
+One body has two joints outside its origin, one of them with ``ref``. Another body is fixed.
+"""
 
 
 def made(shape: str = "box", feet: tuple[str, ...] = ("ankle", "peg_end")) -> tuple[mujoco.MjModel, SimpleNamespace]:
@@ -58,7 +58,6 @@ def rotated(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def last_joint(model: mujoco.MjModel, p: SimpleNamespace, data: mujoco.MjData, foot: int) -> list[np.ndarray]:
-    """Compute position and rotation of a foot's last joint from the tables."""
     qpos, axes, offsets = (table(model, p)[foot] for table in (walkers.leg_qpos, walkers.leg_axes, walkers.leg_offsets))
     x, turn = data.qpos[:3].copy(), data.qpos[3:7].copy()
     for at, axis, offset in zip(qpos, axes, offsets, strict=True):
@@ -202,7 +201,7 @@ def test_round_feet_have_the_lowest_height_and_the_friction_of_their_boxes() -> 
     assert (model.geom_friction[geoms] == model.geom_friction[box]).all() and (model.geom_priority[geoms] == 1).all()
     place = [walkers.spheres_of(model, data, geom) for geom in geoms]
     inside = (np.concatenate(place)[:, :3] - data.geom_xpos[box]) @ data.geom_xmat[box].reshape(3, 3)
-    # the ends of the capsules touch the sides and the bottom of the box with half-sizes 0.03, 0.04 and 0.02
+    # the capsules' ends touch the sides and the bottom of the box with half-sizes 0.03, 0.04 and 0.02
     np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
     assert (inside[:, 2] < 0.0).all()
     with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: use a smaller radius"):

@@ -1,5 +1,3 @@
-"""Test that the wheel contains all files that the package reads."""
-
 from pathlib import Path
 
 import pytest

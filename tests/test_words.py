@@ -1,7 +1,6 @@
 """Find words and phrases that CONTRIBUTING.md excludes, and name their replacements.
 
-The search covers code, comments, messages and names (an underscore counts as a space), the documents, and the files
-that build and test the package. A phrase may span two lines.
+The search covers code, names (an underscore counts as a space) and documents. A phrase may span two lines.
 """
 
 import bisect
@@ -54,7 +53,6 @@ SETTLED: dict[str, str] = {
     r"\bone's own\b": "of your own",
     r"\bby (itself|themselves)\b": "automatically, alone",
 }
-"""Case-insensitive regular expressions of phrases, and the phrases' replacements."""
 
 ALLOWED = (
     r"event\.record\(",  # torch's name
@@ -90,7 +88,6 @@ NAMES = [str(path.relative_to(ROOT)) for path in FILES if path.exists() and path
 
 
 def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
-    """Return each excluded phrase of a text as "line: 'phrase' (write: ...)"."""
     for pattern in exempt:
         text = re.sub(pattern, lambda found: re.sub(r"[^\n]", " ", found.group()), text, flags=re.MULTILINE)
     starts, flat = [], ""
@@ -99,8 +96,7 @@ def found_in(text: str, exempt: tuple[str, ...] = ()) -> list[str]:
         flat += re.sub(r"^\s*(#:?\s+)?", "", line).replace("_", " ") + " "
     found, lower = [], flat.lower()
     for pattern, replacement in SETTLED.items():
-        # this case-sensitive search, which does not start at a word boundary, is ten times as fast and excludes most
-        # texts
+        # this case-sensitive search without a word boundary is ten times as fast and excludes most texts
         if re.search(pattern.removeprefix(r"\b"), lower) is None:
             continue
         for match in re.finditer(pattern, flat, re.IGNORECASE):

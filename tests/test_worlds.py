@@ -1,5 +1,3 @@
-"""Test the phases of a step, of a reset, and of restoring a state."""
-
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,6 @@ class Held(PointMass):
 def outcomes_with_faults(
     engine: str, *, judging: int = 1, observing: int = 1
 ) -> tuple[list[torch.Tensor], dict[str, int]]:
-    """Return all buffers, and fault counts, after steps of ``Full`` with events and faults of several kinds."""
     env = lw.make(Full, nworld=4, engine=engine, seed=2)
     own, kept = env.worlds, []
     own._judging, own._observing = judging, observing
@@ -59,9 +56,9 @@ def outcomes_with_faults(
 def test_several_threads_per_world_give_the_same_results_as_one_thread(
     engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a GPU, the lanes of a warp divide the work for a world, and each observation group has separate threads.
+    """On a GPU, a warp's lanes divide the work of a world, and each observation group has separate threads.
 
-    On the CPU, the lanes of a warp and the threads of a world run one after another.
+    On the CPU, they run one after another.
     """
 
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
@@ -76,7 +73,7 @@ def test_several_threads_per_world_give_the_same_results_as_one_thread(
 
 
 def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three threads replay the launches before and after the C engine's calls, each for a part of the four worlds."""
+    """Three threads replay the launches around the C engine's calls, each for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
@@ -89,8 +86,7 @@ def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pyt
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
-    """Make two tasks whose success needs three steps and one step; the points move fast, and goals differ between
-    worlds."""
+    """Make two tasks whose success needs three steps and one step. Goals differ between worlds."""
     goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
     held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
     for env in (held, plain):
@@ -102,8 +98,7 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_success_steps_must_be_consecutive_within_an_episode(engine: str) -> None:
-    """The end of an episode or a fault restarts the count of success steps; all other results equal those of the plain
-    task."""
+    """The end of an episode or a fault restarts the count of success steps. All other results stay unchanged."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)
@@ -176,14 +171,14 @@ def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: s
     env = lw.make("hopper", nworld=2, engine=engine)
     action = torch.ones(2, 3)
     for _ in range(3):
-        env.step(action)  # the third step replays the graph
+        env.step(action)
     env.set_params(ctrl_cost_weight=[0.0, 1.0])
     env.reset()
     env.step(action)
     torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
 
 
-def test_random_numbers_depend_on_the_index_of_a_world_over_all_processes() -> None:
+def test_random_numbers_depend_on_the_world_index_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):
         env.rand_reset(7)

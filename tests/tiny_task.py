@@ -1,4 +1,4 @@
-"""Define the source of the shortest task, for tests that change a line of it."""
+"""Define the source of the shortest task, in which tests change a line."""
 
 from pathlib import Path
 
@@ -26,7 +26,6 @@ class Tiny(lw.Task):
 
 
 def changed(*changes: tuple[str, str]) -> str:
-    """Return the source after replacing the first occurrence of each given text."""
     source = TINY
     for old, new in changes:
         assert old in source, f"{old!r} is not in the text"
@@ -35,7 +34,6 @@ def changed(*changes: tuple[str, str]) -> str:
 
 
 def with_function(function: str) -> str:
-    """Add a Warp function to the source."""
     return changed(("class Tiny", f"@wp.func\n{function}\n\nclass Tiny"))
 
 

@@ -14,13 +14,12 @@ from lyceum_warp.controllers.trajectory import Trajectory
 
 
 def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
-    """Push the point of point_mass towards its target."""
     x, y, vx, vy, tx, ty = obs
     return torch.stack([2 * (tx - x) - vx, 2 * (ty - y) - vy]).clamp(-1, 1)
 
 
 class StepPlanner:
-    """A planner whose actions encode two numbers: the step at which the plan was made, and the index of the action.
+    """A planner whose actions encode the plan's step and the action's index.
 
     Both numbers are divided by 100; ``hundredths`` converts the actions back.
     """
@@ -50,8 +49,6 @@ def hundredths(values: torch.Tensor) -> list[int]:
 
 
 class SamplingPlanner:
-    """A planner that returns only zero actions, and reports the given number of failed samples for each plan."""
-
     def __init__(self, *failed: float) -> None:
         self.samples, self.failed, self.calls = 8, failed, 0
         self.actions = torch.zeros(4, 2)
@@ -84,7 +81,7 @@ class SimulatedClock:
 
 
 class SimulatedPlans:
-    """A planner on the simulated clock: each plan takes a fixed time and starts from the newest state."""
+    """A planner on the simulated clock. Each plan takes a fixed time and starts from the newest state."""
 
     def __init__(
         self, controller: Any, clock: SimulatedClock, seconds: float, first: tuple[torch.Tensor, torch.Tensor]
@@ -118,14 +115,9 @@ class SimulatedPlans:
 def simulated_run(
     env: lw.Env, *, seconds: float, steps: int, horizon: int = 8, busy: dict[int, float] | None = None
 ) -> Trajectory:
-    """Run the asynchronous loop on the simulated clock; the period is one second.
+    """Run the asynchronous loop on the simulated clock.
 
-    Args:
-        env: The plant.
-        seconds: Planning time.
-        steps: Number of steps.
-        horizon: Number of actions in a plan.
-        busy: Durations of steps in seconds, by step index.
+    Times are in seconds, and the period is one second. ``busy`` gives durations of steps by index.
     """
     env.rand_reset(0)
     clock = SimulatedClock()

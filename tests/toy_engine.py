@@ -1,4 +1,4 @@
-"""Define a third engine, which follows only the contract in ``engines/base.py`` and steps one world at a time."""
+"""Define a third engine, which follows only the contract in ``engines/base.py``."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -17,12 +17,12 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 
 class ToyEngine(Engine):
-    """An engine with states in float64 rows; a step loads each row into its world's MjData and saves it afterwards.
+    """An engine that steps one world at a time, with states in float64 rows.
 
     Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
 
-    Other code captures all launches between two engine calls in a graph, so ``reset``, ``commit``, ``find_faults`` and
-    ``get_state`` only launch Warp kernels.
+    Launches between engine calls become graphs, so ``reset``, ``commit``, ``find_faults`` and ``get_state`` only launch
+    Warp kernels.
     """
 
     name = "toy"

@@ -21,14 +21,13 @@ def train(out: Path, *options: str, task: str = "point_mass") -> int:
 
 
 def metrics(run: Path) -> list[dict[str, str]]:
-    """Return the rows of metrics.csv without measured times."""
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     return [{k: v for k, v in row.items() if "time" not in k and k != "samples_per_second"} for row in rows]
 
 
 def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
-    """Check that the command wrote one line to stderr, and that the line contains these words."""
+    """Check that the command wrote one line with these words to stderr."""
     lines = capsys.readouterr().err.splitlines()
     (error,) = [line for line in lines if not line.startswith(("compiling kernels ", "  "))]
     assert error.startswith("lyceum-warp: ")
@@ -37,8 +36,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
 
 
 def interrupted(argv: list[str]) -> int:
-    """Return the exit code of a command that receives SIGINT; fail the test if the command does not handle the
-    signal."""
+    """Return the exit code of a command that receives SIGINT, which it must handle."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return cli.main(argv)
@@ -61,5 +59,4 @@ def six_iterations(folder: Path) -> Path:
 
 
 def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:
-    """Return a policy's action for one observation."""
     return policy(torch.linspace(-1.0, 1.0, policy.nobs))

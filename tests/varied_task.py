@@ -1,4 +1,4 @@
-"""Define a task whose dynamics differ between worlds: a ball with an arm on a rail. Masses and length are random."""
+"""Define a task with random masses and lengths: a ball with an arm on a rail."""
 
 import mujoco
 import warp as wp

@@ -1,5 +1,3 @@
-"""Use one world as a dm_env environment, and run dm_env's own checks on it."""
-
 import unittest
 
 import numpy as np
@@ -17,13 +15,11 @@ from lyceum_warp.adapters.dm_env import DmEnvironment  # noqa: E402
 
 
 class TestOfDmEnv(test_utils.EnvironmentTestMixin, unittest.TestCase):
-    """Run dm_env's checks with actions that reach the end of several episodes."""
-
     def make_object_under_test(self) -> DmEnvironment:
         return DmEnvironment("hopper", horizon=6)
 
 
-def test_episode_has_the_step_types_discounts_and_values_that_dm_env_requires() -> None:
+def test_step_types_discounts_and_values_follow_dm_env() -> None:
     env, twin = DmEnvironment("hopper", seed=3, horizon=4), lw.make("hopper", seed=3, horizon=4, autoreset=False)
     action = np.array([0.5, -0.5, 1.0], np.float32)
     twin.rand_reset()

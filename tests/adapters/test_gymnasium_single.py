@@ -1,5 +1,3 @@
-"""Use one world as a Gymnasium environment, and run Gymnasium's checker on it."""
-
 import warnings
 from collections.abc import Iterator
 
@@ -25,7 +23,6 @@ def hopper() -> Iterator[gymnasium.Env]:
 
 @pytest.fixture(scope="module")
 def draws() -> bool:
-    """Return whether this machine can render."""
     try:
         env = GymnasiumEnv("hopper", render_mode="rgb_array", render_size=(64, 48))
         assert env.render().shape == (48, 64, 3)
@@ -36,7 +33,7 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""Gymnasium's checker warns about unbounded observations. Gymnasium's own robots cause the same warnings."""
+"""Gymnasium's own robots cause these warnings about unbounded observations."""
 
 
 def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:

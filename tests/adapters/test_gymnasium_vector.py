@@ -1,5 +1,3 @@
-"""Use many worlds as a Gymnasium vector environment; test autoreset modes, wrappers and errors."""
-
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,7 +20,7 @@ N = 4
 
 @pytest.fixture(scope="module")
 def made() -> Callable[..., lw.Env]:
-    """Return a function that makes two environments of ``Full`` (horizon 20), with and without automatic resets."""
+    """Return a function that makes environments of ``Full`` with and without automatic resets."""
     envs: dict[bool, lw.Env] = {}
 
     def get(*, autoreset: bool = True) -> lw.Env:
@@ -66,7 +64,6 @@ def as_array(value: Any) -> np.ndarray:
 
 
 def by_hand(env: lw.Env) -> list[dict[str, np.ndarray]]:
-    """Return an environment's buffers after each step of a fixed action sequence."""
     env.rand_reset(5)
     steps = []
     for action in actions():
@@ -132,7 +129,7 @@ def test_results_of_a_step_do_not_change_in_the_next_step(hopper: GymnasiumVecto
     assert not np.shares_memory(first[0], second[0])
 
 
-def test_step_does_not_copy_the_buffers_if_copies_are_disabled(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_step_returns_the_same_buffers_without_copies(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True, copy=False)
     obs, _ = envs.reset(seed=0)
     assert obs["policy"].data_ptr() == envs.env.obs.data_ptr()
@@ -257,7 +254,7 @@ OBSERVATION_WRAPPERS = {
     "DtypeObservation": lambda envs: wrappers.vector.DtypeObservation(envs, np.float64),
     "TransformObservation": lambda envs: wrappers.vector.TransformObservation(envs, lambda obs: np.clip(obs, -9, 9)),
 }
-"""Observation wrappers; Gymnasium does not allow them in the autoreset mode SAME_STEP."""
+"""Gymnasium does not allow these wrappers in the autoreset mode SAME_STEP."""
 
 OTHER_WRAPPERS = {
     "ClipAction": wrappers.vector.ClipAction,

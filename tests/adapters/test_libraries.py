@@ -1,5 +1,3 @@
-"""Test the errors of the adapters if a library is missing or has an unsupported version."""
-
 import importlib
 import sys
 from pathlib import Path
@@ -10,7 +8,6 @@ from lyceum_warp.adapters.libraries import check_library
 
 
 def install(folder: Path, package: str, version: str) -> None:
-    """Write metadata into a folder, as if a version of a package were installed in it."""
     info = folder / f"{package.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: {version}\n")

@@ -1,5 +1,3 @@
-"""Use an environment as rsl_rl's VecEnv, and train it with rsl_rl's own runner."""
-
 from pathlib import Path
 
 import pytest
@@ -18,7 +16,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
     return shared_env(Metered, nworld=4, horizon=10, far=1e3)
 
 
-def test_step_returns_all_observation_groups_and_does_not_copy_the_buffers(env: lw.Env) -> None:
+def test_step_returns_all_observation_groups_without_copies(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
     assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
@@ -48,7 +46,7 @@ def test_returned_observations_are_not_overwritten_by_the_next_step(env: lw.Env)
         assert all(torch.equal(obs[group], before[group]) for group in ("policy", "critic"))
 
 
-def test_assigned_episode_lengths_change_when_the_time_limit_is_reached(env: lw.Env) -> None:
+def test_setting_episode_lengths_moves_the_time_limit(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 9, 8, 3])
     *_, extras = worlds.step(torch.zeros(4, 1))
@@ -73,7 +71,6 @@ def test_fault_counts_as_a_time_out_but_termination_does_not(shared_env: SharedE
     worlds = RslRlVecEnv(env)
     worlds.episode_length_buf = torch.tensor([0, 0, 9, 9])
     state = env.get_state()
-    # both worlds leave the rail; the second world also reaches its time limit
     state[[0, 2], env.state_space.parts["qpos"].start] = 5.0
     env.set_state(state)
     action = torch.zeros(4, 1)

@@ -28,7 +28,7 @@ class Policy(GaussianMixin, Model):
 
 
 class Value(DeterministicMixin, Model):
-    """Estimate the value of the critic's observation (skrl calls this observation a state)."""
+    """skrl calls the critic's observation a state."""
 
     def __init__(self, **spaces: Any) -> None:
         Model.__init__(self, **spaces)
@@ -41,7 +41,7 @@ class Value(DeterministicMixin, Model):
 
 
 def wrapped(*, tensors: bool) -> Any:
-    """Wrap an environment for skrl; environments with torch tensors use skrl's wrapper for Isaac Lab."""
+    """skrl's wrapper for Isaac Lab accepts torch tensors."""
     if not tensors:
         return wrap_env(GymnasiumVectorEnv("hopper", N), verbose=False)
     env = GymnasiumVectorEnv(Full, N, torch=True, dict_obs=True)

@@ -1,5 +1,3 @@
-"""Use many worlds as a vector environment for the learners and wrappers of Stable-Baselines3, and check errors."""
-
 import warnings
 
 import gymnasium
@@ -78,7 +76,7 @@ def test_ppo_updates_its_policy_and_records_episode_statistics(hopper: StableBas
     assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
 
 
-def test_off_policy_learner_stores_final_observations_and_no_terminations_at_time_limits(
+def test_off_policy_learner_stores_final_observations(
     full: StableBaselines3VecEnv,
 ) -> None:
     model = SAC("MlpPolicy", full, learning_starts=40, batch_size=16, buffer_size=2000, seed=0, device="cpu")
@@ -144,7 +142,7 @@ def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
         ("reward", "the task 'hopper' has no parameter 'reward': "),
     ],
 )
-def test_setting_an_attribute_that_would_have_no_effect_raises_an_error(
+def test_setting_an_attribute_without_effect_raises_an_error(
     name: str, message: str, hopper: StableBaselines3VecEnv
 ) -> None:
     with pytest.raises(ValueError, match=message) as error:

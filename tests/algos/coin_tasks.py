@@ -1,4 +1,4 @@
-"""Define tasks for tests of the planner: the reward is the action times a fair coin (-1 or 1)."""
+"""Define tasks for planner tests. Their reward is the action times a fair coin (-1 or 1)."""
 
 import warp as wp
 from rail_task import rail
@@ -54,7 +54,7 @@ def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
 
 
 class TossedAfter(lw.Task):
-    """The reward's coin is tossed in ``advance``, after the action, so all actions are equally good."""
+    """Tosses the coin after the action, so all actions are equally good."""
 
     model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
     obs = {"coin": 1}
@@ -66,12 +66,12 @@ class TossedAfter(lw.Task):
 
 
 class TossedAfterWithControl(TossedAfter):
-    """``TossedAfter`` with a ``control`` function, so that the engine must run rollouts step by step."""
+    """The ``control`` function makes the engine run rollouts step by step."""
 
     control = copied
 
 
 class TossedBefore(TossedAfter):
-    """The reward's coin is tossed in the previous step and stored in the world's memory, so the planner can see it."""
+    """Tosses the coin one step before the action and stores it, so the planner can see it."""
 
     reward = paid_by_coin_before_action

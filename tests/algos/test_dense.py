@@ -1,5 +1,3 @@
-"""Compare hand-written forward and backward passes with torch's modules and autograd."""
-
 import pytest
 import torch
 from torch import nn
@@ -10,7 +8,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
 def perturbed(module: nn.Module) -> nn.Module:
-    """Perturb a module's weights, so that no element of a derivative is zero."""
+    """Perturb the weights: otherwise some derivatives are zero."""
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -31,7 +29,7 @@ def test_hand_written_derivatives_equal_autograd(activation: str, hidden: tuple[
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
-    for rows in (30, 7, 30):  # a batch with fewer rows uses only part of the buffers
+    for rows in (30, 7, 30):
         generator = torch.Generator().manual_seed(rows)
         obs, action, weight = (torch.randn(rows, n, generator=generator) for n in (5, 2, 1))
         torch.testing.assert_close(dense(obs), policy(obs).detach())
@@ -70,7 +68,7 @@ def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
 
 
 class Own(nn.Sequential):
-    """A user's network class, whose output may be any function of its input."""
+    """A user's network class."""
 
 
 def hooked(network: nn.Module) -> nn.Module:

@@ -1,5 +1,3 @@
-"""Train in several processes, and compare worlds, updates and resumed runs with a single process."""
-
 import csv
 import os
 import signal
@@ -17,9 +15,8 @@ from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.runs.folder import Run
 
-# these settings use every feature that might depend on the number of processes: unfinished episodes, a normaliser, a
-# subset of the samples for the Fisher information, a smaller last mini-batch, an evaluation, and restarts between
-# iterations
+# every feature that might depend on the number of processes: unfinished episodes, a normaliser, a subset of the samples
+# for the Fisher information, a smaller last mini-batch, an evaluation, and restarts
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
            "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip
@@ -29,7 +26,7 @@ QUIET = ["--no-video", "--no-plot"]
 def torchrun(
     *arguments: str, options: list[str], program: tuple[str, ...] = ("-m", "lyceum_warp.cli")
 ) -> subprocess.Popen[str]:
-    """Start ``torchrun`` with this Python on the loopback interface."""
+    """Start ``torchrun`` on the loopback interface."""
     command = [sys.executable, "-m", "torch.distributed.run", *options, *program, *arguments]
     environment = os.environ | {"GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
     return subprocess.Popen(
@@ -38,7 +35,6 @@ def torchrun(
 
 
 def ended(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str, str]]:
-    """Return the exit codes, stdouts and stderrs of processes."""
     try:
         outputs = [process.communicate(timeout=120) for process in processes]
     finally:
@@ -54,7 +50,6 @@ def free_port() -> int:
 
 
 def table(run: Path) -> list[dict[str, float]]:
-    """Return the metrics without measured times."""
     with (run / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     clocks = {name for name in rows[0] if "time" in name or name == "samples_per_second"}
@@ -80,7 +75,7 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
 
 @pytest.mark.long
 def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> None:
-    """Two torchrun commands represent two machines; a single process then continues their run."""
+    """Two torchrun commands stand for two machines. A single process then continues their run."""
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *OPTIONS, *QUIET]
     endpoint = f"--rdzv-endpoint=127.0.0.1:{free_port()}"
@@ -104,12 +99,14 @@ def test_two_machines_make_the_same_update_as_one_process(tmp_path: Path) -> Non
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings of PPO that cover unfinished episodes, normalisation, an adaptive learning rate, and an evaluation; the
-number of samples is not a multiple of the number of mini-batches."""
+"""These settings cover unfinished episodes, normalisation, an adaptive learning rate and an evaluation.
+
+The number of samples is not a multiple of the number of mini-batches.
+"""
 SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
        "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
        "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings of SAC that cover a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
+"""These settings cover a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
 
 
 @pytest.mark.quick("npg")
@@ -122,7 +119,7 @@ SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates",
 def test_two_processes_make_the_same_update_as_one_process(
     settings: list[str], tolerance: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """This process is rank 0; a single process then continues both runs, and loads the replay buffers of both ranks."""
+    """This process is rank 0. A single process then continues both runs with the replay buffers of both ranks."""
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *settings, *QUIET, "--iterations", "1", "--out"]
     with pytest.MonkeyPatch.context() as patched:
@@ -148,7 +145,7 @@ def test_two_processes_make_the_same_update_as_one_process(
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 @pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
 def test_gpu_two_processes_make_the_same_update_as_one_process(algorithm: str, tmp_path: Path) -> None:
-    """NCCL calls are captured in the graphs of the value fit and of PPO's epochs."""
+    """The graphs of the value fit and of PPO's epochs contain NCCL calls."""
     two, one = tmp_path / "two", tmp_path / "one"
     options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]
     arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
@@ -206,7 +203,7 @@ sys.exit(main())
 
 @pytest.mark.long
 def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """A signal during training ends all processes after the iteration; a signal before training leaves no files."""
+    """A signal during training ends all processes after the iteration. A signal before training leaves no files."""
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
@@ -224,8 +221,8 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_error_ends_all_processes_and_two_processes_resume_a_run_of_one_process(tmp_path: Path) -> None:
-    """The error is that the run's folder exists already, and only rank 0 checks this."""
+def test_error_in_one_process_ends_all_processes(tmp_path: Path) -> None:
+    """The error is an existing run folder, which only rank 0 checks. Two processes then resume that run."""
     launch = ["--standalone", "--nproc-per-node=2"]
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]

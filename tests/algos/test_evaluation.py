@@ -11,7 +11,6 @@ from lyceum_warp.algos.evaluation import evaluation_seed
 
 
 def test_evaluate_counts_the_same_number_of_episodes_in_every_world() -> None:
-    """Worlds with short episodes contribute no additional episodes, and the results equal those of a plain loop."""
     env = lw.make("hopper", nworld=4, horizon=60)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     counts: list[tuple[int, int]] = []

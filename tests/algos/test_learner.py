@@ -1,5 +1,3 @@
-"""Test a minimal subclass of the learner's base class: run folders, export and resumption."""
-
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,6 @@ from lyceum_warp.runs.folder import Run
 
 
 class Constant(nn.Module):
-    """A policy that is not Gaussian and cannot be called."""
-
     nobs, nact = 6, 2
 
     def __init__(self) -> None:
@@ -34,8 +30,6 @@ class DriftConfig:
 
 
 class Drift(lw.Learner):
-    """A learner that adds noise to a constant action, and reports only the required numbers."""
-
     algorithm = "drift"
 
     def __init__(self, env: lw.Env, *, seed: int = 0) -> None:

@@ -1,7 +1,6 @@
 """Compare MPPI with a plain implementation, and use it to control tasks.
 
-The planner computes in float32, and the plain implementation computes in float64, so rounding errors accumulate between
-them.
+The planner computes in float32, and the plain implementation in float64, so rounding errors accumulate.
 """
 
 from pathlib import Path
@@ -40,13 +39,10 @@ def weighed(s0: VariedWorld, action: Row[float], s1: VariedWorld, p: VariedParam
 
 
 class Weighed(Varied):
-    """A task whose reward depends on randomized masses and lengths."""
-
     reward = weighed
 
 
 def place(obs: torch.Tensor) -> torch.Tensor:
-    """Return a value function of point_mass that is low far from the target and at high speed."""
     return -2 * (obs[:, 0] - obs[:, 4]).abs() - 0.1 * obs[:, 2] * obs[:, 3]
 
 
@@ -56,7 +52,7 @@ def reached(seed: int) -> tuple[lw.Env, torch.Tensor]:
 
 
 def falling_hopper(plant: lw.Env) -> torch.Tensor:
-    """Put the hopper into a falling state; the step at which it falls depends on its actions."""
+    """The step at which the hopper falls depends on its actions."""
     plant.reset()
     state, parts = plant.get_state(), plant.state_space.parts
     state[:, parts["qpos"].start + 2], state[:, parts["qvel"].start + 2] = 0.15, 3.0
@@ -71,7 +67,6 @@ def heavy_arm() -> mujoco.MjSpec:
     return spec
 
 
-# these reward weights override the task's suggestions for planning
 HOPPER = dict(task="hopper", horizon=12, samples=24, temperature=0.5, noise=0.8, healthy_reward=1.0,
               forward_reward_weight=1.0, integrator="euler")  # fmt: skip
 POINT = dict(task="point_mass", horizon=9, samples=40, temperature=0.3)
@@ -99,9 +94,9 @@ CASES: dict[str, dict[str, Any]] = {
     "one_knot": POINT | dict(update="predictive_sampling", noise=0.4, knots=1, include_plan=True),
 }
 ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "linear", "cubic_cem")
-"""Cases that together run each kernel once on the Warp engine."""
+"""These cases run each kernel once on the Warp engine."""
 LIKE_OTHERS = ("negative", "mppi_without_plan", "without_plan", "cem_of_one", "zero", "knot_for_each_step", "one_knot")
-"""Cases that only ``make test-all`` runs."""
+"""Only ``make test-all`` runs these cases."""
 
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES if case not in LIKE_OTHERS), "cubic_cem-warp")
@@ -115,7 +110,7 @@ def check_against(engine: str, task: str, iterations: int = 1, **settings: Any) 
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
     plain = Plain(task, engine=engine, count=len(plan.knot_actions), **settings)
-    # random numbers depend on the seed and the number of previous draws, so a second planner can draw the same noise
+    # random numbers depend on the seed and the number of draws, so a second planner can draw the same noise
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
@@ -148,7 +143,7 @@ def check_against(engine: str, task: str, iterations: int = 1, **settings: Any) 
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.knots = plan.knot_actions.double().numpy()  # a low temperature would amplify rounding differences
+        plain.knots = plan.knot_actions.double().numpy()  # a low temperature would amplify rounding errors
         if plan.adapted_noise is not None:
             plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
@@ -164,7 +159,6 @@ def test_terminal_value_of_a_terminated_sample_is_zero() -> None:
 
 
 def numbers(plan: MPPI, state: torch.Tensor, calls: int = 4) -> list[torch.Tensor]:
-    """Return the actions and statistics of several consecutive plans."""
     result = []
     for _ in range(calls):
         result.append(plan(state))
@@ -253,7 +247,7 @@ def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # the motors are so strong that only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
+        # with these motors, only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -280,7 +274,7 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("update", ["mppi", "cem", "predictive_sampling"])
-def test_plan_is_shifted_in_time_but_keeps_its_actions_if_all_samples_fail(
+def test_plan_keeps_its_shifted_actions_if_all_samples_fail(
     update: str, engine: str, caplog: pytest.LogCaptureFixture
 ) -> None:  # fmt: skip
     plan = MPPI(Picky, engine=engine, horizon=5, samples=8, noise=0.1, limit=10.0, seed=3, update=update)
@@ -362,7 +356,7 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
 def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
-    """Remaining actions do not change, even if the shift is smaller than the distance between two knots."""
+    """The shift may be smaller than the distance between two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -462,7 +456,7 @@ def test_plans_with_and_without_graphs_are_equal(words: dict[str, Any], engine: 
 
 
 def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
-    """Control a plant until its episode ends or succeeds; return the plant, its rewards and its evaluations."""
+    """Control a plant until its episode ends or succeeds; return it with its rewards and evaluations."""
     plan = MPPI(task, seed=seed, **settings)
     plant = lw.make(task, autoreset=False, seed=seed)
     rewards, evals = [], []
@@ -498,7 +492,7 @@ def test_half_cheetah_runs() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With planner settings from other tasks, the robot falls after about 100 steps."""
+    """With other tasks' planner settings, the robot falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.1 and rewards.sum() > 140, (evals[-1], rewards.sum())
@@ -507,8 +501,8 @@ def test_hopper_hops_without_falling() -> None:
 def earned(task: type[lw.Task], runs: int = 8) -> tuple[float, float]:
     """Return the mean return over runs of 100 steps, and its standard error if actions are independent of coins.
 
-    Plant and planner have equal seeds. A reward is the product of action and coin. If action and coin are independent,
-    the variance of the return is therefore the sum of the squared actions.
+    A reward is the product of action and coin. If they are independent, the variance of the return is the sum of the
+    squared actions.
     """
     plan = MPPI(task, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant = lw.make(task, autoreset=False)

@@ -1,5 +1,3 @@
-"""Sort MPPI's keyword arguments into settings, options and parameters."""
-
 import dataclasses
 import json
 import types
@@ -32,8 +30,6 @@ def observe_noisy(s: Rail, p: NoisyParams, obs: Row[float]):
 
 
 class Noisy(lw.Task):
-    """A task with a parameter that has the name of a planner setting."""
-
     model, obs = staticmethod(rail), {"x": 1}
     World, Params, observe = Rail, NoisyParams, observe_noisy
 
@@ -156,7 +152,7 @@ def test_invalid_planner_arguments_raise_a_one_line_error(words: dict[str, Any],
 
 
 def test_planning_params_are_ignored_if_there_is_a_value_function() -> None:
-    """``planning.params`` changes the rewards, but the value function was fitted to the task's rewards without them."""
+    """The value function was fitted to rewards without ``planning.params``."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
@@ -181,7 +177,7 @@ def test_discount_defaults_to_the_discount_of_the_value_function(
     assert arguments(planned(settings={"discount": 0.8}), value=value, **words)[0].discount == expected
 
 
-def test_settings_that_a_task_suggests_for_one_update_do_not_apply_to_another_update() -> None:
+def test_settings_suggested_for_one_update_do_not_apply_to_another() -> None:
     task = planned(settings={"update": "cem", "elites": 5, "min_noise": 0.1, "samples": 20})
     assert (arguments(task)[0].elites, arguments(task)[0].min_noise) == (5, 0.1)
     other = arguments(task, update="predictive_sampling")[0]
@@ -194,7 +190,7 @@ def test_omitted_settings_get_the_defaults_of_the_update() -> None:
         return config.include_plan, config.elites, config.min_noise
 
     assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
-    assert chosen(samples=1)[0] is False  # if the only sample were the plan itself, the planner would try nothing new
+    assert chosen(samples=1)[0] is False  # a single sample would be the plan itself, and nothing new would be tried
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 
@@ -215,7 +211,7 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
         ("reach", dict(samples=79), ("mujoco", "cpu")),
         ("reach", dict(samples=20, models=4), ("warp", "cuda:0")),
         ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
-        # on a GPU, the hand is slow unless its noslip solver is turned off
+        # on a GPU, the noslip solver makes the hand slow
         ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
     ],

@@ -1,5 +1,3 @@
-"""Plan for several plants at once, and compare with a planner for each plant."""
-
 from typing import Any
 
 import pytest
@@ -44,12 +42,12 @@ def states_of(task: Any, count: int) -> torch.Tensor:
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES))
 @pytest.mark.parametrize("case, engine", [*((c, "mujoco") for c in CASES), *((c, "warp") for c in ON_WARP)])
-def test_one_planner_for_several_plants_equals_one_planner_per_plant(case: str, engine: str) -> None:
+def test_planner_for_several_plants_equals_separate_planners(case: str, engine: str) -> None:
     settings = dict(horizon=6, samples=8, temperature=0.5, engine=engine) | CASES[case]
     states = states_of(settings["task"], 3)
     together = lw.MPPI(**settings, seed=5, plants=3)
     alone = [lw.MPPI(**settings, seed=5 + i) for i in range(3)]
-    for plan in alone:  # a planner for several plants uses one set of models for all of them
+    for plan in alone:
         for name, rows in plan.model_fields.items():
             rows.copy_(together.model_fields[name])
     for shift in (1, 2):
@@ -98,7 +96,7 @@ def test_reset_with_a_mask_restarts_only_the_selected_plants() -> None:
     plan.reset([4, 9, 1])
     assert not torch.allclose(*plan(states)[:2])
     plan.reset(9, where=torch.tensor([False, False, True]))
-    assert plan.seeds == [4, 9, 11]  # the other plants keep their seeds
+    assert plan.seeds == [4, 9, 11]
     torch.testing.assert_close(plan(states)[2], lw.MPPI("point_mass", horizon=5, samples=6, update="cem", elites=2,
                                                         knots=2, seed=11)(states[2]))  # fmt: skip
 
@@ -123,10 +121,10 @@ def test_plan_of_a_plant_does_not_change_if_all_its_samples_fail(update: str) ->
         torch.testing.assert_close(actions[i], alone(states[i], shift=0))
 
 
-def test_plans_for_each_world_control_an_environment() -> None:
+def test_planner_controls_every_world_of_an_environment() -> None:
     env = lw.make("point_mass", nworld=4, seed=2, horizon=30)
     state = env.get_state()
-    state[1, env.state_space.parts["step"]] = 10  # the episode of world 1 ends after 20 steps
+    state[1, env.state_space.parts["step"]] = 10
     env.set_state(state)
     settings: dict[str, Any] = dict(task="point_mass", horizon=12, samples=64, temperature=0.1)
     plan, alone = lw.MPPI(**settings, plants=4), lw.MPPI(**settings, seed=101)

@@ -8,7 +8,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient
 
 
 def test_fisher_product_equals_the_covariance_of_the_score() -> None:
-    """Fisher information is E[score score^T]; quadrature over each action gives the exact expectation."""
+    """The Fisher information is E[score score^T]. Quadrature over each action gives the exact expectation."""
     torch.manual_seed(1)
     policy = lw.GaussianPolicy(5, 2, (6, 4))
     for parameter in policy.parameters():

@@ -1,5 +1,3 @@
-"""Test that NPG takes steps of the given length, resumes exactly, and learns a task."""
-
 import copy
 import dataclasses
 import math
@@ -62,7 +60,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) 
 
 
 def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], object]) -> list[NPGIteration]:
-    """Run NPG on modified rewards; ``change`` gets the rewards (steps, nworld), and the iteration's number."""
+    """Run NPG on modified rewards. ``change`` gets the rewards (steps, nworld) and the iteration's number."""
     env.rand_reset(3)
     config = dataclasses.replace(SMALL, value_epochs=20, value_rate=1e-2, mean_every=0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -98,7 +96,7 @@ def test_extreme_reward_is_bounded_and_counted(env: lw.Env) -> None:
     assert disturbed[-1].step_norm > 0.1 * plain[-1].step_norm
 
     def first(reward: torch.Tensor, iteration: int) -> None:
-        if iteration == 1:  # the outlier does not change the scale of the rewards
+        if iteration == 1:
             reward[5, 2] = 1e10
 
     assert learned(env, 6, first)[-1].explained_variance > 0.5
@@ -116,7 +114,7 @@ def test_a_step_that_exceeds_the_kl_limit_is_shortened(env: lw.Env) -> None:
 
 
 def test_kl_limit_includes_the_change_of_observation_statistics() -> None:
-    """Observations jump in iteration 4, but the KL divergence between sampling policies stays below its limit."""
+    """Observations jump in iteration 4. The KL divergence between sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -182,7 +180,7 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
         steps.append(npg.rollout.step.clone())
     joined = torch.cat(steps)
     assert torch.equal(joined, (joined[0] + torch.arange(30.0)[:, None]) % 12)
-    assert len(joined[0].unique()) > 5  # the worlds' episodes end at different times
+    assert len(joined[0].unique()) > 5
     # an episode does not count if its first steps were not sampled
     assert math.isnan(lengths[0])
     assert lengths[-1] == 12.0
@@ -190,7 +188,7 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in an iteration of 5 steps."""
+    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -284,7 +282,6 @@ def test_a_reward_or_observation_that_is_not_finite_is_a_fault(
 
 
 def wild(task_file: TaskFile, params: dict[str, float], **changes: object) -> lw.NPG:
-    """Make NPG on a task whose observations or rewards are finite, but overflow float32."""
     env = lw.make(str(task_file("wild.py", WILD)), nworld=4, **params)
     plain = {"mean_every": 0, "normalize": False, "activation": "relu", "value_activation": "relu"}
     return lw.NPG(env, config=dataclasses.replace(SMALL, **plain | changes))
@@ -360,7 +357,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 @pytest.mark.gpu
 def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this test, every synchronizing call raises an error, except for one call."""
+    """Every other synchronizing call raises an error."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
@@ -382,7 +379,7 @@ def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.gpu
 def test_gpu_learner_continues_after_loading_a_state() -> None:
-    """The graph of the value fit contains the addresses of Adam's moments, so it is captured again after loading."""
+    """The graph of the value fit contains addresses of Adam's moments, so it is captured again after loading."""
     npg = on_gpu()
     saved = npg.state_dict()
     first = next(npg)

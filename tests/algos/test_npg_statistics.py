@@ -41,7 +41,6 @@ def rollout() -> lw.Rollout:
 
 
 def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    """Return the samples of some worlds, as if one process had collected only them."""
     return SimpleNamespace(
         **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
         episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
@@ -80,7 +79,7 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
 
 
 def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The mean metrics of a rollout equal the pooled means of two subsets of its worlds, or NaN without episodes."""
+    """The means of a rollout equal the pooled means of two subsets of its worlds, or NaN without episodes."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1

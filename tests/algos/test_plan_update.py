@@ -1,5 +1,3 @@
-"""Compare plan updates that a user writes, in torch or in Warp, with the updates of the package."""
-
 from typing import Any
 
 import pytest
@@ -14,7 +12,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """A plan update that takes the mean of the best samples, and does not change the noise."""
+    """Takes the mean of the best samples, and does not change the noise."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -44,7 +42,7 @@ class TorchCEM(EliteMean):
 
 
 class HalfWay(EliteMean):
-    """A plan update that moves the plan halfway to the mean of the best samples."""
+    """Moves the plan halfway to the mean of the best samples."""
 
     def fit(self, samples: lw.PlanSamples) -> None:
         samples.plan.lerp_(samples.nominal, 0.5)
@@ -58,7 +56,7 @@ def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary:
 
 
 class First(lw.PlanUpdate):
-    """A plan update that chooses the first sample in a Warp kernel."""
+    """Chooses the first sample in a Warp kernel."""
 
     capturable = True
 
@@ -113,7 +111,7 @@ def test_update_with_warp_launches_is_captured_in_the_graph(engine: str) -> None
     assert plan.summary["best_return"] == plan.returns[0]
 
 
-def test_plan_does_not_change_if_all_samples_of_a_user_written_update_fail() -> None:
+def test_plan_of_a_user_written_update_does_not_change_if_all_samples_fail() -> None:
     plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
     plan.actions.fill_(0.25)
     plan(plan.state_of(), shift=0)
@@ -133,7 +131,7 @@ def test_planner_settings_contain_the_attributes_of_a_user_written_update() -> N
 
 
 class Returning(EliteMean):
-    """An update that returns the weights instead of writing them."""
+    """Returns the weights instead of writing them."""
 
     def weigh(self, samples: lw.PlanSamples) -> Any:
         return torch.softmax(samples.returns, 1)

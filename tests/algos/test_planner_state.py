@@ -23,7 +23,7 @@ def reset_state(task: str) -> tuple[torch.Tensor, dict[str, slice]]:
     return plant.get_state()[0], dict(plant.state_space.parts)
 
 
-def test_parts_of_a_state_that_are_not_given_have_their_reset_values(reach: lw.MPPI) -> None:
+def test_missing_parts_of_a_state_get_their_reset_values(reach: lw.MPPI) -> None:
     qpos = np.linspace(-0.5, -0.1, 7)
     state = reach.state_of(qpos=qpos, qvel=[0.1] * 7, time=0.3, mocap_pos=torch.tensor([[0.1, 0.2, 0.3]]), step=15)
     expected, parts = reset_state("reach")
@@ -35,7 +35,7 @@ def test_parts_of_a_state_that_are_not_given_have_their_reset_values(reach: lw.M
     reach(state)
 
 
-def test_step_of_a_state_follows_from_its_time_unless_the_step_is_given(reach: lw.MPPI) -> None:
+def test_step_is_computed_from_the_time_by_default(reach: lw.MPPI) -> None:
     step = reach.env.state_space.parts["step"]
     assert reach.state_of(time=0.2)[step] == 10
     assert reach.state_of(time=0.2, step=3)[step] == 3

@@ -1,5 +1,3 @@
-"""Test that NPG rejects unsuitable networks, and trains suitable ones like its default network."""
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,8 +14,6 @@ from lyceum_warp.runs.folder import Run
 
 
 class Net(nn.Module):
-    """A network that applies the function ``change`` to its output."""
-
     def __init__(self, change: Callable[[torch.Tensor], object] = lambda mean: mean) -> None:
         super().__init__()
         self.first, self.last = nn.Linear(6, 8), nn.Linear(8, 2)
@@ -45,7 +41,7 @@ class Unused(Net):
 
 
 class Counting(Net):
-    """A network whose output depends on the number of previous calls."""
+    """Its output depends on the number of previous calls."""
 
     def forward(self, obs: torch.Tensor) -> object:
         self.calls = getattr(self, "calls", 0.0) + 1.0

@@ -29,7 +29,6 @@ RUNS = pytest.mark.parametrize(("name", "run"), [("policy.onnx", run_onnx), ("po
 
 
 def trained(**options: object) -> lw.GaussianPolicy:
-    """Make a policy with random weights and non-trivial observation statistics."""
     torch.manual_seed(0)
     policy = lw.GaussianPolicy(5, 2, (16, 8), **options)
     with torch.no_grad():
@@ -40,14 +39,13 @@ def trained(**options: object) -> lw.GaussianPolicy:
 
 
 def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
-    """Compare actions for several batch sizes, for single observations, and for clipped observations."""
     for n in (1, 7):
         obs = (40.0 * np.random.default_rng(n).standard_normal((n, 5))).astype(np.float32)
         with torch.no_grad():
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        # tolerance for the rounding errors of three layers
+        # three layers add rounding errors
         np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)
 
 

@@ -1,5 +1,3 @@
-"""Test that PPO learns, bootstraps truncated episodes, follows its schedules, and resumes exactly."""
-
 import copy
 import dataclasses
 import math
@@ -29,7 +27,6 @@ def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.PPO:
 
 
 def numbers(it: PPOIteration) -> dict[str, Any]:
-    """Return an iteration's numbers without measured times."""
     return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
 
 
@@ -61,10 +58,10 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
     first = [numbers(next(ppo)) for _ in range(2)]
     saved = ppo.state_dict()
     rest = [numbers(next(ppo)) for _ in range(2)]
-    torch.manual_seed(2)  # torch's global generators stay unchanged
+    torch.manual_seed(2)  # the run does not depend on torch's global generators
     again = fresh(1)
     np.testing.assert_equal([numbers(next(again)) for _ in range(4)], first + rest)
-    resumed = fresh(2, learning_rate=1e-4)  # the saved state contains the learning rate
+    resumed = fresh(2, learning_rate=1e-4)
     next(resumed)
     resumed.load_state_dict(saved)
     np.testing.assert_equal([numbers(next(resumed)) for _ in range(2)], rest)
@@ -73,7 +70,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 
 
 def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: SharedEnv) -> None:
-    """Every episode has 10 steps; an episode that starts at a random step does not count."""
+    """Every episode has 10 steps. Episodes that start at a random step do not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
     for _ in range(3):

@@ -1,5 +1,3 @@
-"""Test the contents, n-step returns, sampling and saved states of the replay buffer."""
-
 from typing import Any
 
 import numpy as np
@@ -17,9 +15,9 @@ def env(shared_env: SharedEnv) -> lw.Env:
 
 
 def filled(env: lw.Env, steps: int, *, capacity: int = 45, bad: int = -1) -> tuple[lw.Replay, list[dict[str, Any]]]:
-    """Take random steps; return the buffer and a plain list of the same transitions.
+    """Take random steps, and store them in a buffer and in a plain list.
 
-    World 1 has a non-finite action in step ``bad``.
+    World 1 gets a non-finite action in step ``bad``.
     """
     replay, plain = lw.Replay(env, capacity), []
     random = torch.Generator().manual_seed(0)
@@ -40,7 +38,7 @@ def filled(env: lw.Env, steps: int, *, capacity: int = 45, bad: int = -1) -> tup
 @pytest.mark.parametrize("n_step", [1, 3, 20])
 @pytest.mark.parametrize("steps", [7, 40])
 def test_n_step_returns_across_episode_ends_equal_a_plain_sum(steps: int, n_step: int, env: lw.Env) -> None:
-    """40 steps overwrite the oldest steps; episodes end by termination, by the time limit and by a fault."""
+    """40 steps overwrite the oldest ones. Episodes end by termination, the time limit and a fault."""
     replay, plain = filled(env, steps, bad=5)
     kept, gamma, ends = plain[-15:], 0.9, set()
     assert len(replay) == 3 * len(kept)

@@ -7,9 +7,8 @@ from metered_task import Metered
 import lyceum_warp as lw
 
 
-@pytest.mark.parametrize("graphs", [True, False])  # graphs are captured in the second step
+@pytest.mark.parametrize("graphs", [True, False])
 def test_rollout_buffer_stores_inputs_and_results_of_each_step(graphs: bool) -> None:
-    """Observation groups that were not requested are not stored."""
     env, plain = (lw.make(Metered, nworld=3, horizon=4, seed=2, graphs=g) for g in (graphs, True))
     rollout = lw.Rollout(env, 6, groups=("critic",))
     policy = lw.GaussianPolicy(1, 1, generator=torch.Generator().manual_seed(0))
@@ -37,7 +36,7 @@ def test_rollout_buffer_stores_inputs_and_results_of_each_step(graphs: bool) -> 
     torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
-def test_rollout_buffer_with_first_only_counts_only_the_first_episode_of_each_world() -> None:
+def test_first_only_counts_one_episode_per_world() -> None:
     env = lw.make("hopper", nworld=8)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     noise = torch.randn(200, 8, 3, generator=torch.Generator().manual_seed(0))
@@ -60,7 +59,7 @@ def test_faults_within_a_rollout_are_counted() -> None:
     noise[1:3, 2] = math.nan
     rollout.collect(policy, noise)
     assert rollout.faults.tolist() == [0, 0, 2]
-    # a fault counts as truncation, not as termination, because learners bootstrap after it
+    # a fault counts as truncation, because learners bootstrap after it
     assert rollout.done[1, 2] and not rollout.terminated.any()
     assert env.fault_counts["action"] == 2
     noise.zero_()

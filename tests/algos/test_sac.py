@@ -1,5 +1,3 @@
-"""Test that SAC's updates equal those of plain torch code, and that runs learn and resume exactly."""
-
 import copy
 import dataclasses
 import math
@@ -32,14 +30,13 @@ def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.SAC:
 
 
 def numbers(it: SACIteration) -> dict[str, Any]:
-    """Return an iteration's numbers without measured times."""
     return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
 
 
 def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
     """With random actions, the pole falls after about 5 steps.
 
-    After these updates, the pole falls after 45 to 75 steps (measured for other seeds).
+    After these updates, it falls after 45 to 75 steps (measured for other seeds).
     """
     config = lw.SACConfig(
         hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,
@@ -54,7 +51,7 @@ def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
 
 
 class Plain(torch.nn.Module):
-    """One of the twin critics, written in plain torch with float64."""
+    """One of the twin critics, in plain torch and float64."""
 
     def __init__(self, twin: lw.TwinCritic, k: int) -> None:
         super().__init__()
@@ -77,7 +74,7 @@ def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: 
     sac = made(env, target_entropy=-0.7, temperature=0.3, **changes)
     for _ in range(2):
         next(sac)
-    with torch.no_grad():  # change the critics, because they equal their targets at first
+    with torch.no_grad():
         for p in sac.target.parameters():
             p += 0.05
     sac.draw()
@@ -159,7 +156,7 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
     first = [numbers(next(sac)) for _ in range(3)]
     saved = sac.state_dict(), sac.replay.state_dict()
     rest = [numbers(next(sac)) for _ in range(3)]
-    torch.manual_seed(2)  # torch's global generators stay unchanged
+    torch.manual_seed(2)  # the run does not depend on torch's global generators
     again = fresh(1)
     np.testing.assert_equal([numbers(next(again)) for _ in range(6)], first + rest)
     resumed = fresh(2)
@@ -210,7 +207,7 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
     assert other.config.hidden == (8,)
     assert not math.isnan([next(other) for _ in range(2)][-1].critic_loss)
     assert not torch.equal(policy.network[0].weight, sac.policy.network[0].weight)
-    assert (other.replay.action[:4].abs() < 1.0).all()  # the given policy also acts during the warm-up
+    assert (other.replay.action[:4].abs() < 1.0).all()
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), mean_every=0))
     with pytest.raises(ValueError, match="policy of SAC must be of type SquashedPolicy.* not GaussianPolicy"):
         lw.SAC(env, npg.policy)  # type: ignore[arg-type]

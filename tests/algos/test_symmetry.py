@@ -1,5 +1,3 @@
-"""Test exactly symmetric policies, and losses and samples that make policies more symmetric."""
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -27,14 +25,14 @@ def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
 
 
 def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> float:
-    """Return the mean absolute difference between actions for mirrored observations and mirrored actions."""
+    """Return the mean absolute difference between mirrored actions and actions for mirrored observations."""
     mirror = PolicyMirror(reflections(env))
     obs = torch.randn(500, env.obs_space.size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         return (policy(mirror.obs(obs)) - mirror.action(policy(obs))).abs().mean().item()
 
 
-def test_symmetric_policy_is_equivariant_bit_for_bit_before_and_after_loading(env: lw.Env, tmp_path: Path) -> None:
+def test_symmetric_policy_is_equivariant_before_and_after_loading(env: lw.Env, tmp_path: Path) -> None:
     """The policy is symmetric although the normaliser's statistics are not."""
     ppo = learner(env, "exact")
     run = lw.train(ppo, tmp_path / "run", iterations=2)
@@ -47,7 +45,7 @@ def test_symmetric_policy_is_equivariant_bit_for_bit_before_and_after_loading(en
     obs = torch.randn(9, 6)
     (action,) = runtime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})
     np.testing.assert_allclose(action, policy(obs), rtol=1e-5, atol=1e-6)
-    # the policy stays symmetric if NPG or another run of PPO continues to train it
+    # NPG and another run of PPO keep the policy symmetric
     npg = lw.NPG(env, lw.load(run), config=lw.NPGConfig(samples=512, value_hidden=(8,), mean_every=0))
     next(npg)
     assert asymmetry(npg.policy, env) == 0.0
@@ -96,7 +94,7 @@ def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> N
 
 
 def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
-    """Policy and value function are zero, hence symmetric, so mirrored samples add the mirror image of the gradient."""
+    """Policy and value function are zero, hence symmetric. Mirrored samples add the gradient's mirror image."""
     ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
     with torch.no_grad():
         for network in (ppo.policy.network, ppo.value.network):
@@ -129,7 +127,7 @@ def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env,
     policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
-        assert max(before, asymmetry(policy.act, env)) < 1e-6  # scaling actions to their bounds rounds the results
+        assert max(before, asymmetry(policy.act, env)) < 1e-6  # scaling actions to their bounds adds rounding errors
         assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
     else:
         assert asymmetry(policy.act, env) < before

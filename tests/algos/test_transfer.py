@@ -26,7 +26,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())
-    # results vary much more between initial states than between engines, so only paired episodes show the agreement
+    # results vary more between initial states than between engines, so only paired episodes show the agreement
     assert returns.verdict == lengths.verdict == "same" and own.lengths.std() > 1.0
     assert returns.high - returns.low < 0.2 * own.returns.std().item()
     assert shown[-1][0] <= shown[-1][1] == 400 and torch.equal(env.get_state(), before)

@@ -7,7 +7,7 @@ from lyceum_warp.runs.checkpoints import policy_content
 from lyceum_warp.runs.folder import Run
 
 
-def test_value_function_keeps_the_discount_factor_of_its_training_returns(tmp_path: Path) -> None:
+def test_value_function_has_the_discount_factor_of_its_training(tmp_path: Path) -> None:
     env = lw.make("point_mass", nworld=2, horizon=12)
     config = lw.NPGConfig(samples=24, gamma=0.9)
     value = lw.ValueFunction(env.obs_space.size, (4,))

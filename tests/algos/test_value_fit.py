@@ -1,5 +1,3 @@
-"""Fit value functions, with and without CUDA graphs."""
-
 from typing import Any
 
 import pytest
@@ -13,7 +11,7 @@ from lyceum_warp.algos.value_fit import ValueFit
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 def test_value_fit_with_hand_written_gradients_equals_a_fit_with_autograd(activation: Any) -> None:
-    """The second fit continues with the optimizer moments of the first fit."""
+    """The second fit continues with the first fit's optimizer moments."""
     generator = torch.Generator().manual_seed(2)
     data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller than the others
     fits = []
@@ -50,8 +48,8 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 
 @pytest.mark.gpu
 def test_gpu_captured_value_fit_equals_plain_launches() -> None:
-    """The first fit captures a graph after its first mini-batch; the second fit replays this graph on other samples."""
-    samples, batch = 1000, 96  # the last mini-batch is smaller than the others
+    """The first fit captures a graph. The second fit replays it on other samples."""
+    samples, batch = 1000, 96
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]
     fits = []

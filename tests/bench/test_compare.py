@@ -1,5 +1,3 @@
-"""Compare two checkouts: identical checkouts have no difference, and every change is reported."""
-
 import json
 import os
 import shutil
@@ -32,8 +30,7 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Compare the working tree with a copy in which one task exits, one raises an error, and point_mass has a changed
-    reward."""
+    """Compare the working tree with a copy that has two broken tasks and a changed reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
         "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
@@ -162,5 +159,4 @@ def test_signal_ends_both_processes_and_removes_their_folders(number: signal.Sig
 
 
 def environment(folder: Path) -> dict[str, str]:
-    """Return environment variables that put a program's temporary files into a folder."""
     return os.environ | {"TMPDIR": str(folder)}

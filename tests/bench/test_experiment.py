@@ -27,7 +27,7 @@ RATES = {"ours": 3.0, "theirs": 2.0}
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """An experiment with known measurements; ``toy.measured`` lists the cases that were measured."""
+    """An experiment with known measurements. ``toy.measured`` lists the measured cases."""
     measured: list[Case] = []
 
     def cases(options: Any) -> list[Case]:
@@ -86,7 +86,7 @@ def test_stopped_experiment_continues_without_repeating_cases(
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 13) == 130
     assert "stopped; the same command continues" in capsys.readouterr().err
-    path.write_bytes(path.read_bytes()[:-9])  # an interrupted write leaves an incomplete line
+    path.write_bytes(path.read_bytes()[:-9])
     toy.measured.clear()
     assert toy.main("--out", path, "--contestants", "ours") == 0
     assert [(case.task, case.repeat) for case in toy.measured] == [("hop", 1), ("walk", 0), ("walk", 1)]

@@ -45,7 +45,6 @@ def test_trajectories_with_different_dynamics_diverge(monkeypatch: pytest.Monkey
 
 def test_worlds_count_as_diverged_after_their_first_divergence() -> None:
     error = torch.zeros(6, 4)
-    # three worlds diverge after 3, 5 and 4 steps, and one never diverges
     error[2:, 0], error[4:, 1], error[3, 2] = 1.0, 1.0, 1.0
     assert fidelity.half_apart(error) == 4
     assert fidelity.half_apart(error[:, [1, 3]]) == 5

@@ -12,7 +12,6 @@ import lyceum_warp as lw
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run on go1_velocity whose policy has not learned."""
     config = lw.PPOConfig(hidden=(4,), value_hidden=(4,), num_steps=4, mean_every=0)
     made = lw.train(
         lw.PPO(lw.make("go1_velocity", nworld=2), config=config), tmp_path_factory.mktemp("gate") / "run", iterations=1

@@ -14,12 +14,12 @@ def main(out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize("task", ["reach", "half_cheetah", "adroit_pen"])
-def test_environments_in_plain_python_return_the_same_rewards_as_this_package(task: str) -> None:
+def test_plain_python_environments_return_the_same_rewards(task: str) -> None:
     if task == "adroit_pen":
         pytest.importorskip("gymnasium_robotics")
     env = lw.make(task, autoreset=False, nthread=1, seed=3)
     theirs = mppi.python_mppi.ENVS[task](lw.make(task, nthread=1).model)
-    env.step(torch.full_like(env.action, 0.1))  # this step leaves the initial state
+    env.step(torch.full_like(env.action, 0.1))
     theirs.set_state(env.get_state()[0].numpy())
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):

@@ -13,7 +13,6 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 
 
 def case(contestant: str, **changes: Any) -> Any:
-    """Return a case of the short mode with fewer samples."""
     found = npg.cases(npg.Options(short=True, contestants=(contestant,), threads=1))[0]
     return dataclasses.replace(found, samples=500, nworld=found.nworld and 4, **changes)
 
@@ -46,7 +45,7 @@ def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
     for world in range(nworld):
         ends = ours.done[:, world].nonzero()
         assert len(ends), "no episode ended in these steps, so no restart was compared"
-        until = int(ends[0]) + 1  # the next episode begins in a different state
+        until = int(ends[0]) + 1
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
@@ -57,7 +56,7 @@ def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_first_gymnasium_episodes_continue_from_the_step_counters_of_the_environment(mode: str) -> None:
+def test_first_gymnasium_episodes_continue_at_the_current_steps(mode: str) -> None:
     env = lw.make("swimmer", nworld=2, nthread=1)
     state = env.get_state()
     state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)
@@ -101,5 +100,4 @@ def test_npg_tables_and_figure_are_made_from_stored_results(tmp_path: Path) -> N
     assert found["NPG, Gymnasium's environments (sync)"][7] == "3.00 (3.00 to 3.00)"
     assert len(agreement.rows) == 10 and "differ at 0 of 10 points" in agreement.title
     npg.figure(rows).savefig(tmp_path / "npg.png")
-    # runs that were stopped early are also plotted
     npg.figure([rows[0], row("npg", 1, [[0, 0.0, 5.0], [50_000, 2.0, 9.0]])])

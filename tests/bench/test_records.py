@@ -6,7 +6,7 @@ import records
 
 
 @pytest.mark.long
-def test_stopped_run_continues_and_its_seconds_are_summed(
+def test_resumed_run_adds_to_the_measured_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ("--algorithm", "npg", "--mean-every", "1", "--nworld", "2", "--samples", "100", "--mean-episodes", "2")

@@ -17,7 +17,6 @@ FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 
 @pytest.fixture
 def work(request: pytest.FixtureRequest, pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return an empty folder for saved states; the path is the same in every run of the tests."""
     cache = getattr(pytestconfig, "cache", None)
     folder: Path = cache.mkdir(request.node.name) if cache else tmp_path / "work"
     for file in folder.glob("*.pt"):
@@ -43,7 +42,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 9,?600 \|", capsys.readouterr().out)
 
 
-def test_variant_of_a_task_in_a_module_with_several_tasks_uses_the_right_structs(tmp_path: Path) -> None:
+def test_variant_of_a_task_among_several_uses_the_right_structs(tmp_path: Path) -> None:
     file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
     own = TaskSource(find_task(file), "soak")
     observe = own.functions["observe"]

@@ -68,7 +68,6 @@ def test_dm_control_tasks_are_measured_with_equal_numbers_of_worlds_by_every_lib
 def test_gymnasium_versions_of_tasks_return_the_same_observations_and_rewards(
     task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From equal states and actions, Gymnasium's environment returns the same observations and rewards."""
     monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))
     import gymnasium
     import numpy as np

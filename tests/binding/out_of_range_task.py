@@ -1,4 +1,4 @@
-"""Define a task in which a function writes outside its array; a parameter chooses the function."""
+"""Define a task in which a chosen function writes outside its array."""
 
 import warp as wp
 

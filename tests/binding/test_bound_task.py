@@ -1,5 +1,3 @@
-"""Test the checks of a task's class, its field types and its observation size."""
-
 from pathlib import Path
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Test that equal functions share kernels, and that the kernels have the same names in every process."""
-
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ def test_different_functions_have_different_kernels(tmp_path: Path) -> None:
     assert kernels(f"{file}:Tiny") is not kernels(f"{file}:Other")
 
 
-def test_kernel_module_name_is_equal_for_a_copied_task_file_and_changes_with_the_file(tmp_path: Path) -> None:
+def test_copied_task_file_shares_kernel_modules_until_it_changes(tmp_path: Path) -> None:
     """Warp caches compiled kernels by the module's name."""
     (tmp_path / "copy").mkdir()
     file, copy = (tiny_task.write(folder, tiny_task.TINY) for folder in (tmp_path, tmp_path / "copy"))

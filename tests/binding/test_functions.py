@@ -1,5 +1,3 @@
-"""Find a task's structs and functions in its class or module, and check them against ``task.FUNCTIONS``."""
-
 from pathlib import Path
 
 import pytest
@@ -12,9 +10,8 @@ from lyceum_warp.task import FUNCTIONS
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # these functions must be defined together, and need additional structs
+    if name not in ("tally", "share")  # these functions must be defined together, with additional structs
 }
-"""The source of each function of ``task.FUNCTIONS`` in a task's file."""
 
 
 def source_of(folder: Path, text: str) -> TaskSource:

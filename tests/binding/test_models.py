@@ -1,5 +1,3 @@
-"""Find a task's model, and change it so that both engines run the same physics."""
-
 import importlib.util
 from pathlib import Path
 
@@ -31,9 +29,7 @@ def test_compiled_model_raises_an_error() -> None:
         load_spec(ball().compile())
 
 
-def test_relative_model_path_starts_at_the_folder_of_the_task_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_relative_model_path_is_relative_to_the_task_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "models").mkdir()
     (tmp_path / "models" / "robot.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
     file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", "models/robot.xml")))
@@ -43,9 +39,7 @@ def test_relative_model_path_starts_at_the_folder_of_the_task_file(
     assert task_spec(find_task(file)).modelname == "hopper"
 
 
-def test_current_folder_is_searched_only_for_a_model_that_is_given_as_an_option(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_model_option_is_relative_to_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.geom("torso_geom").density = 5000
     (tmp_path / "hopper.xml").write_text(spec.to_xml())
@@ -157,8 +151,10 @@ def test_error_of_an_invalid_model_names_the_model() -> None:
 
 
 def test_replica_has_the_model_of_its_original_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A replica ignores later edits of the MjSpec, and does not call a ``model`` function again, which may return a
-    different model at each call."""
+    """Later edits of the MjSpec do not change a replica.
+
+    A ``model`` function could return another model at each call, so a replica does not call it again.
+    """
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000
@@ -207,7 +203,7 @@ def test_error_of_a_model_given_as_xml_text_suggests_an_mjspec() -> None:
         load_spec(f"\n  {CUBE}")
 
 
-def test_no_body_is_simple_if_its_inertial_frame_is_randomized() -> None:
+def test_bodies_with_a_randomized_inertial_frame_are_not_simple() -> None:
     assert compile_model(ball(), (), PHYSICS).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_mass"]).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_ipos"]).body_simple[1] == 0

@@ -1,5 +1,3 @@
-"""Test the values of a task's parameters: defaults, checks, and the array for the kernels."""
-
 from pathlib import Path
 from typing import Any
 
@@ -112,7 +110,7 @@ def test_values_for_the_worlds_may_be_given_as_any_sequence(values: Any, model: 
     np.testing.assert_array_equal(parameters(model, gain=values).values["gain"], [1.0, 2.0])
 
 
-def test_parameter_array_has_one_entry_until_a_value_differs_between_worlds(model: mujoco.MjModel) -> None:
+def test_parameter_array_grows_only_if_values_differ_between_worlds(model: mujoco.MjModel) -> None:
     device = wp.get_device("cpu")
     shared = parameters(model, offset=(1, 2, 3), lively=True).array(device)
     assert shared.shape == (1,)
@@ -134,7 +132,7 @@ class Tables:
     order: wp.array[int] = (2, 0, 1)
 
 
-def test_table_is_read_from_array_tensor_list_or_file(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_array_parameter_is_read_from_array_tensor_list_or_file(model: mujoco.MjModel, tmp_path: Path) -> None:
     rows = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.5]]
     np.save(tmp_path / "rows.npy", rows)
     for given in (rows, np.array(rows), torch.tensor(rows, requires_grad=True), wp.array(rows, dtype=float),
@@ -145,7 +143,7 @@ def test_table_is_read_from_array_tensor_list_or_file(model: mujoco.MjModel, tmp
     assert (values["points"].shape, values["order"].tolist()) == ((3, 3), [2, 0, 1])
 
 
-def test_table_is_a_read_only_copy(model: mujoco.MjModel) -> None:
+def test_array_parameter_is_a_read_only_copy(model: mujoco.MjModel) -> None:
     given = np.zeros((2, 2), dtype=np.float32)
     values = parameters(model, Tables, motion=given).values
     given[0, 0] = 5.0
@@ -170,12 +168,12 @@ def test_table_is_a_read_only_copy(model: mujoco.MjModel) -> None:
         ({"order": [2**40]}, r"order of 'arm' has 1.*at \[0\]: it must be a whole number of 32 bits"),
     ],
 )
-def test_invalid_table_raises_an_error(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
+def test_invalid_array_parameter_raises_an_error(given: dict[str, Any], message: str, model: mujoco.MjModel) -> None:
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         parameters(model, Tables, **given)
 
 
-def test_file_without_a_table_raises_an_error(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_file_without_an_array_raises_an_error(model: mujoco.MjModel, tmp_path: Path) -> None:
     (tmp_path / "text.npy").write_text("1 2 3")
     np.savez(tmp_path / "several.npz", a=1)
     for name, message in (("text.npy", "cannot be read"), ("several.npz", "a .npy file written by numpy.save")):
@@ -183,7 +181,7 @@ def test_file_without_a_table_raises_an_error(model: mujoco.MjModel, tmp_path: P
             parameters(model, Tables, motion=tmp_path / name)
 
 
-def test_table_of_another_type_raises_an_error(model: mujoco.MjModel) -> None:
+def test_array_of_another_type_raises_an_error(model: mujoco.MjModel) -> None:
     struct = wp.struct(type("Params", (), {"__annotations__": {"t": wp.array(dtype=wp.float64)}, "t": [1.0]}))
     with pytest.raises(ValueError, match="the parameter 't' of the task 'arm' has the type .*float64.*: a table is"):
         parameters(model, struct)
@@ -196,7 +194,7 @@ class Named:
     chains: wp.array2d[int] = [lw.bodies("upper", "lower"), [lw.body("lower"), 0]]
 
 
-def test_table_of_named_elements_contains_their_indices(model: mujoco.MjModel) -> None:
+def test_array_of_named_elements_contains_their_indices(model: mujoco.MjModel) -> None:
     found = parameters(model, Named).values
     assert (found["joints"].tolist(), found["chains"].tolist()) == ([1, 0], [[1, 2], [2, 0]])
     assert parameters(model, Named, joints=["shoulder"]).values["joints"].tolist() == [0]
@@ -214,14 +212,14 @@ def test_table_of_named_elements_contains_their_indices(model: mujoco.MjModel) -
         (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': its elements belong to 'qvel'"),
     ],
 )
-def test_table_with_elements_of_another_kind_raises_an_error(
+def test_array_with_elements_of_another_kind_raises_an_error(
     joints: list[Any], message: str, model: mujoco.MjModel
 ) -> None:
     with pytest.raises(ValueError, match=message):
         parameters(model, Named, joints=joints)
 
 
-def test_table_accepts_each_kind_of_element(model: mujoco.MjModel) -> None:
+def test_array_parameter_accepts_each_kind_of_element(model: mujoco.MjModel) -> None:
     kinds = {
         "sites": "site_xpos", "bodies": "xpos", "geoms": "geom_xpos", "joints": "xanchor", "qposes": "qpos",
         "dofs": "qvel", "actuators": "actuator_force", "sensors": "sensordata",
@@ -234,8 +232,8 @@ def test_table_accepts_each_kind_of_element(model: mujoco.MjModel) -> None:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_functions_read_new_tables_after_graphs_are_captured(engine: str) -> None:
-    """The new tables have the same shape, a different shape, or one value per world."""
+def test_functions_read_new_arrays_after_graphs_are_captured(engine: str) -> None:
+    """The new arrays have the same shape, a different shape, or one value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -257,12 +255,11 @@ def test_functions_read_new_tables_after_graphs_are_captured(engine: str) -> Non
     torch.testing.assert_close(env.reward[1], 2.0 * env.reward[0])
 
 
-def test_changed_tables_reach_replicas_planners_and_evaluations() -> None:
-    """Changed tables take effect in a larger replica, in ``get_obs``, in environments that called ``follow``, in a
-    planner, and in the evaluation of a policy."""
+def test_changed_arrays_reach_replicas_planners_and_evaluations() -> None:
+    """They reach a larger replica, ``get_obs``, environments that called ``follow``, a planner and an evaluation."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
-    motion[:] = 9.0  # changing the array has no effect, because the environment has a copy
+    motion[:] = 9.0  # the environment has a copy of the array
     more = env.replicate(nworld=3)
     assert more.obs[:, 1].tolist() == [0.25] * 3
     env.set_params(motion=[[0.75, 0.0], [0.5, 0.0]])
@@ -280,8 +277,8 @@ def test_changed_tables_reach_replicas_planners_and_evaluations() -> None:
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
-def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found: str, engine: str) -> None:
-    """The out-of-range read is reported even if it returns NaN. A NaN ends the episode with a fault."""
+def test_check_task_finds_an_out_of_range_read_of_an_array(task_file: Any, found: str, engine: str) -> None:
+    """The read is reported even if it returns NaN, which ends the episode with a fault."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]
@@ -295,7 +292,7 @@ def test_check_task_finds_an_out_of_range_read_of_a_table(task_file: Any, found:
         check_task(str(task_file(f"beyond_{found}.py", wrong)), engine=engine, steps=12, checks=[check_bounds])
 
 
-def test_check_task_accepts_reads_within_a_table() -> None:
+def test_check_task_accepts_reads_within_an_array() -> None:
     check_task(Follow, steps=12, checks=[check_bounds])
 
 

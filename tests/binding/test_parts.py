@@ -1,5 +1,3 @@
-"""Test the order, sizes, types and errors of named parts of memory and observations."""
-
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +100,7 @@ def test_states_and_observations_contain_all_parts_in_order(engine: str) -> None
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_table_that_would_change_the_sizes_of_parts_raises_an_error() -> None:
+def test_parameter_that_would_change_the_sizes_of_parts_raises_an_error() -> None:
     env = lw.make(Marked, places=[1.0, 2.0])
     assert env.obs.shape == (1, 5)
     env.set_params(places=[3.0, 4.0])
@@ -174,7 +172,7 @@ def test_invalid_part_raises_a_one_line_error_that_names_it(
 
 
 def test_helper_function_called_by_observe_defines_no_observation_group(tmp_path: Path) -> None:
-    """The helper has the name of an observation group's function, but ``observe`` calls it."""
+    """The helper is named like the function of an observation group."""
     helper = struct_of(PART, "observe_all(s, p, obs)").replace(
         "@wp.func\n",
         "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",

@@ -1,5 +1,3 @@
-"""Test that an environment's model is read-only, but otherwise behaves like any MjModel."""
-
 import copy
 import pickle
 from collections.abc import Callable

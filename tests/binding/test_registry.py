@@ -18,7 +18,6 @@ Load = Callable[[str, str], ModuleType]
 
 @pytest.fixture
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
-    """Import a file as a module with ``load("name", source)``, and undo its registrations after the test."""
     monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
 
     def imported(name: str, source: str) -> ModuleType:

@@ -1,5 +1,3 @@
-"""Test reward terms, terminations and metrics: functions whose arguments are found by name."""
-
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +16,6 @@ ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
 
 def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
-    """Collect the states before and after each step, the actions, rewards and metrics, and whether the episode
-    ended."""
     found = []
     generator = torch.Generator().manual_seed(0)
     for _ in range(steps):
@@ -112,7 +108,6 @@ TASK = "class Tiny(lw.Task):"
 
 
 def term(function: str, *lines: str, before: str = "") -> list[tuple[str, str]]:
-    """Make changes that add a function and lines to the task's source."""
     body = "\n".join(f"    {line}" for line in lines or ('rewards = {"upright": 1.0}',))
     return [(TASK, f"{before}@wp.func\n{function}\n\n{TASK}\n{body}")]
 

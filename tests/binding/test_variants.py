@@ -1,5 +1,3 @@
-"""Test variants of tasks. A variant extends its parent's structs and uses its parent's functions."""
-
 import subprocess
 import sys
 from pathlib import Path
@@ -38,7 +36,7 @@ def test_variant_has_the_terms_of_its_parent_and_additional_terms(engine: str) -
     torch.testing.assert_close(env.reward, total, rtol=1e-5, atol=1e-7)
 
 
-def test_variants_of_the_same_structs_share_kernels_and_do_not_change_their_parents() -> None:
+def test_variants_share_kernels_and_do_not_change_their_parents() -> None:
     before = lw.make(Terms).task.kernels
     assert lw.make(Variant).task.kernels is lw.make(Same).task.kernels is not before
     assert lw.make(Terms).task.kernels is before

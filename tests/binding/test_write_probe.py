@@ -22,8 +22,7 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""For each function: the parameter value that selects it, the size and name of the array that it writes, and what the
-error says about this size."""
+"""For each function: the parameter value that selects it, size and name of its array, and words of the error."""
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -1,5 +1,3 @@
-"""Find the arguments that a Warp function writes."""
-
 import sys
 from typing import Any
 

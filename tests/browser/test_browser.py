@@ -1,5 +1,3 @@
-"""Test in a real browser that the viewer's page draws the scene and responds to input."""
-
 import contextlib
 import http.server
 import io
@@ -35,9 +33,9 @@ from lyceum_warp.viz.page import write_page
 pytestmark = pytest.mark.browser
 
 SECONDS = 120.0
-"""Time limit for a page, in seconds; without a GPU, a browser draws only a few frames per second."""
+"""Time limit for a page, in seconds. Without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""A busy browser may lose a key or a click. If it has no effect after this number of seconds, the test repeats it."""
+"""Seconds after which the test repeats a key or a click, because a busy browser may lose it."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -84,7 +82,7 @@ def observe_block(s: BlockWorld, p: BlockParams, obs: Row[float]):
 
 
 class Block(lw.Task):
-    """A red block on a rail. A browser without a GPU renders it quickly."""
+    """A red block on a rail, which a browser without a GPU renders quickly."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(MODEL))
     obs = {"x": 1}
@@ -93,7 +91,7 @@ class Block(lw.Task):
 
 
 class WatchedWindow(Window):
-    """A viewer window that stores the last frame and the user's commands, and also sends commands that a test adds."""
+    """A viewer window that stores the last frame and the commands. Tests can also send commands."""
 
     def __init__(self, *given: Any) -> None:
         self.last: Frame | None = None
@@ -153,18 +151,19 @@ class Tab:
         return self
 
     def loaded_again(self) -> None:
-        """Wait until the open page has drawn the panel."""
         self.logs("First remote draw frame applied")
         self.frames(3)
 
     def frames(self, number: int) -> None:
-        """Wait until the browser has drawn some frames."""
         self.page.evaluate(
             "n => new Promise(done => { const f = () => n-- > 0 ? requestAnimationFrame(f) : done(); f(); })", number
         )
 
     def repeat(self, act: Callable[[int], None], until: Callable[[], Any]) -> None:
-        """Repeat an action until a condition holds, with pauses, because a second key or click might undo the first."""
+        """Repeat an action until a condition holds.
+
+        The pauses matter: a second key or click might undo the first.
+        """
         for attempt in range(20):
             act(attempt)
             end = time.monotonic() + INPUT_SECONDS
@@ -175,7 +174,7 @@ class Tab:
         raise AssertionError("the page did not reach the expected state")
 
     def press(self, keys: str, until: Callable[[], Any]) -> None:
-        """Press keys such as "Control+ArrowRight", each long enough for the page to notice it."""
+        """Press keys such as "Control+ArrowRight" long enough for the page to notice them."""
 
         def act(attempt: int) -> None:
             names = keys.split("+")
@@ -196,7 +195,7 @@ class Tab:
             self.frames(1)
 
     def click_near(self, x: float, y: float, until: Callable[[], Any]) -> None:
-        """Click at a point of the panel, or slightly above or below this point."""
+        """Click at a point of the panel, or slightly above or below it."""
         self.repeat(lambda attempt: self.click(x, y + (0, 0, 20, -20, 0, 40, -40)[attempt % 7]), until)
 
     def release(self) -> None:
@@ -206,7 +205,7 @@ class Tab:
         self.frames(2)
 
     def place(self) -> float:
-        """Return the horizontal position of the red block's centre, from 0 to 1."""
+        """Return the horizontal position of the red block, from 0 to 1."""
         self.frames(3)
         return red_place(self.page)
 
@@ -225,7 +224,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start a headless browser: that of LYCEUM_WARP_BROWSER, playwright's browser, or the system's."""
+    """Start a headless browser: that of LYCEUM_WARP_BROWSER, playwright's or the system's."""
     with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
@@ -243,7 +242,7 @@ def browser(launch: Callable[[], Browser]) -> Iterator[Browser]:
 
 
 def new_context(browser: Browser) -> BrowserContext:
-    """Open a browser context without cookies, with a window small enough for a machine without a GPU."""
+    """Open a browser context without cookies. The window is small, for machines without a GPU."""
     return browser.new_context(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
 
 
@@ -284,7 +283,7 @@ def tab(shared_tab: Tab) -> Tab:
 
 
 @pytest.mark.long
-def test_keys_and_buttons_pause_the_worlds_make_a_step_and_choose_a_controller(tab: Tab) -> None:
+def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
     viewer = tab.viewer
     before = viewer.session.stage.env.get_state()
     tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)
@@ -299,7 +298,7 @@ def test_keys_and_buttons_pause_the_worlds_make_a_step_and_choose_a_controller(t
     tab.click_near(*LEFT, lambda: viewer.status.controller == "left")
 
 
-@pytest.mark.long  # a double click needs frames within 0.3 s, so without a GPU, it needs many attempts
+@pytest.mark.long  # a double click needs frames within 0.3 s; without a GPU, this takes many attempts
 def test_dragging_a_body_pushes_it(tab: Tab) -> None:
     viewer = tab.viewer
     middle = tab.place()
@@ -323,7 +322,7 @@ def test_dragging_a_body_pushes_it(tab: Tab) -> None:
 
 
 @pytest.mark.long
-def test_slider_and_play_button_show_a_recorded_episode(tab: Tab) -> None:
+def test_slider_and_play_button_show_a_saved_episode(tab: Tab) -> None:
     viewer = tab.viewer
     viewer.window.extra += [SetMode("playback"), Seek(0), SetBackwards(False)]
     tab.wait(lambda: viewer.status.mode == "playback")
@@ -352,7 +351,7 @@ def test_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> No
     assert tab.page.evaluate("fetch('/saved/other.html').then((answer) => answer.status)") == 404
 
 
-def test_a_recorded_page_plays_without_a_server(browser: Browser, tmp_path: Path) -> None:
+def test_a_saved_page_plays_without_a_server(browser: Browser, tmp_path: Path) -> None:
     env = lw.make(Block, autoreset=False)
     episode = lw.control(env, lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
     file = write_page(env, episode.states, tmp_path / "block.html", camera=FreeCamera(azimuth=90, elevation=-20))

@@ -22,13 +22,12 @@ def npg() -> lw.NPG:
 
 @pytest.fixture(scope="module")
 def first(npg: lw.NPG) -> lw.Iteration:
-    """Run the first iteration, in which no episode ends."""
+    """No episode ends in this iteration."""
     return next(npg)
 
 
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
-    """Return the display of a run after it has printed its first line."""
     shown = display.Display(console)
     with shown.training(Run(Path("run"), {}), npg, total):
         console.file.truncate(0)
@@ -45,7 +44,6 @@ def test_first_line_names_task_worlds_algorithm_and_folder(npg: lw.NPG) -> None:
 
 
 def line(npg: lw.NPG, iteration: lw.Iteration, **changes: object) -> str:
-    """Return the line that an iteration prints without a terminal."""
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with shown_on(console, npg) as shown:
         shown(dataclasses.replace(iteration, samples_per_second=29_412.0, **changes))

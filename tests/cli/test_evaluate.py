@@ -38,7 +38,7 @@ def test_run_from_a_gpu_is_evaluated_on_a_cpu(
     assert "no device 'cuda:7'" in capsys.readouterr().err
 
 
-def test_eval_prints_statistics_of_the_episodes_of_its_seed(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_with_equal_seeds_prints_equal_statistics(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     outputs = []
     for seed in ("7", "7", "8"):
         assert cli.main(["eval", str(trained), "--episodes", "3", "--seed", seed, "--nworld", "2"]) == 0

@@ -17,7 +17,6 @@ INSTALL = "pip install 'lyceum-warp[hand]'"
 
 
 def rows(out: str) -> dict[str, list[str]]:
-    """Return the words in each task's row as a dict from task names. Descriptions and notes are indented lines."""
     table, _, legend = out.partition("\n\n")
     assert legend.startswith("obs, act: ")
     heading, *lines = table.splitlines()
@@ -27,7 +26,6 @@ def rows(out: str) -> dict[str, list[str]]:
 
 @pytest.fixture
 def without_the_hand(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """Hide the ``hand`` extra, and change to an empty working directory."""
     find = importlib.util.find_spec
 
     def find_others(name: str, *args: Any) -> Any:

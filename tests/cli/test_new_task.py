@@ -1,5 +1,3 @@
-"""Test lyceum-warp new, which writes a task file for any model, and rejects unsuitable models and names."""
-
 import importlib.util
 import re
 import shutil
@@ -48,7 +46,7 @@ QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_m
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to an empty directory that has the same path in every run, so that Warp reuses compiled kernels."""
+    """Change to an empty directory at a constant path, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("new")) if cache else tmp_path / "new"
     shutil.rmtree(folder, ignore_errors=True)
@@ -58,7 +56,6 @@ def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def new(name: str, xml: str) -> Path:
-    """Return the task file that the command writes for a model."""
     Path(f"{name}.xml").write_text(xml)
     assert cli.main(["new", name, "--model", f"{name}.xml"]) == 0
     return Path(f"{name}.py")
@@ -71,7 +68,7 @@ def test_new_task_passes_check_task_on_both_engines(engine: str, folder: Path) -
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
 
-def test_new_task_observes_the_state_and_the_sensors_that_measure_the_state(folder: Path) -> None:
+def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
     task = env.task.task
     assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
@@ -114,8 +111,7 @@ def test_new_task_for_any_model_passes_check_task(model: str, engine: str, folde
 
 
 def package_models() -> list[Path]:
-    """Return the models in gymnasium, dm_control and MuJoCo Warp, except for models without actuators or with missing
-    files."""
+    """Return the models of gymnasium, dm_control and MuJoCo Warp that have actuators and all their files."""
     folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
     found: list[Path] = []
     for package, within in folders.items():

@@ -1,5 +1,3 @@
-"""Test ``lyceum-warp new --template velocity``, which writes a velocity task for a robot's model."""
-
 from pathlib import Path
 
 import numpy as np
@@ -45,14 +43,15 @@ SLED = """
   </actuator>
 </mujoco>
 """
-"""A robot with two legs and a tail; its feet are boxes in bodies without joints. The order of the actuators differs
-from the order of the joints."""
+"""A robot with two legs and a tail. Its feet are boxes in bodies without joints.
+
+The actuators and the joints have different orders.
+"""
 
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to an empty folder that has the same path in every run of the tests, so that Warp finds compiled
-    kernels."""
+    """Change to an empty folder at a constant path, so that Warp reuses compiled kernels."""
     assert pytestconfig.cache is not None
     folder: Path = pytestconfig.cache.mkdir("new_velocity")
     for file in folder.iterdir():
@@ -99,7 +98,7 @@ def test_ppo_trains_a_new_velocity_task_for_an_iteration(folder: Path, tmp_path:
 
 
 def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """New sites are at the centres of the soles, an existing site is reused, and other joints keep their pose."""
+    """New sites are at the centres of the soles. An existing site is reused, and other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
     env = lw.make("sled_walk.py", nworld=1, **{"push_seconds": (1e6, 1e6), "sliding_friction": (1.0, 1.0)})

@@ -56,7 +56,6 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
     report = json.loads((out / "report.json").read_text())
     assert report["episodes"] == 2 and report["steps"] == 80
-    # a user without this package can also read the file
     with np.load(out / "episode-001.npz", allow_pickle=False) as file:
         assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
     # the same controller, called from Python, gives the same episode
@@ -108,7 +107,7 @@ def test_flag_real_time_runs_the_plant_asynchronously_in_real_time(
 
 
 def measured_by(microseconds: float) -> Any:
-    """Return a replacement for ``planning_time``: the time is proportional to samples and horizon."""
+    """Replace ``planning_time`` by a time proportional to samples and horizon."""
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
@@ -130,7 +129,7 @@ def test_flag_real_time_leaves_given_settings_unchanged(
         assert json.loads((out / "report.json").read_text())["deadline_ms"] == pytest.approx(20.0)
 
 
-def test_flag_real_time_shortens_the_horizon_and_makes_plans_less_frequent(
+def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(250.0))

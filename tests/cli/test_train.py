@@ -67,7 +67,7 @@ def test_train_and_eval_accept_a_task_file(
     rows = metrics(out)
     assert [row["iteration"] for row in rows] == ["1", "2"]
     assert [bool(row["mean_return"]) for row in rows] == [False, True]
-    monkeypatch.chdir("/")  # the task is also found from another working directory
+    monkeypatch.chdir("/")
     assert cli.main(["eval", str(tmp_path / out), "--episodes", "2"]) == 0
 
 
@@ -152,7 +152,6 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     options += ["--horizon", "32", "--nthread", "2"]
-    # the task's default integrator is RK4
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0
     solver = {"iterations": 7, "ls_iterations": 9}
     given = {"integrator": "euler", "solver": solver, "deterministic": True}
@@ -199,7 +198,6 @@ def test_named_physics_are_saved_as_options_and_eval_can_replace_them(
 
 
 def changed_config(trained: Path, folder: Path, change: Any) -> list[str]:
-    """Copy a run, change its configuration, and return a command that resumes it."""
     shutil.copytree(trained, folder)
     config = Run.open(folder).config
     change(config)
@@ -393,7 +391,6 @@ def test_training_of_a_task_that_is_not_valid_is_refused(
 
 
 def assert_continues(out: Path, output: str, trained: Path) -> None:
-    """Check that a run that was interrupted after iteration 3 lost no iteration and prints how to continue."""
     done = Run.open(out).read()["iteration"]
     assert f"after {done} of 2000 iterations" in output
     assert f"lyceum-warp train --resume {out} --iterations 2000" in output
@@ -409,7 +406,7 @@ def assert_continues(out: Path, output: str, trained: Path) -> None:
 def test_interrupted_run_ends_after_the_iteration_and_can_be_resumed(
     moment: str, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The signal arrives in this process while the run samples, learns or writes."""
+    """The signal arrives while the run samples, learns or writes."""
     out = tmp_path / "run"
     owner: Any = {"step": lw.Env, "save": Run}.get(moment, lw.NPG)
     original, calls = getattr(owner, moment), []
@@ -429,7 +426,7 @@ def test_interrupted_run_ends_after_the_iteration_and_can_be_resumed(
     assert_continues(out, capsys.readouterr().out, trained)
 
 
-def test_second_interrupt_ends_a_run_immediately_and_it_resumes_from_its_last_save(
+def test_second_interrupt_ends_a_run_immediately(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, steps = tmp_path / "run", []

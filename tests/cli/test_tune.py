@@ -1,5 +1,3 @@
-"""Test the table, the printed flags and the errors of lyceum-warp tune."""
-
 import dataclasses
 from pathlib import Path
 

@@ -14,8 +14,6 @@ from lyceum_warp.viewer.protocol import Frame, Scene
 
 
 class Opened:
-    """A fake window that collects the scenes and frames of the command."""
-
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
         self.frames: list[Frame] = []

@@ -1,5 +1,3 @@
-"""Test that tasks with arbitrary models pass ``check_task`` on every engine that supports the model."""
-
 from typing import Any
 
 import mujoco
@@ -20,7 +18,6 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
 }  # fmt: skip
-"""Options of ``check_task`` for each engine."""
 
 
 @wp.struct
@@ -89,7 +86,6 @@ class Sensing(lw.Task):
 
 
 def moving(model: str) -> type[lw.Task]:
-    """Return a task that uses a model and observes its positions and velocities."""
     spec = mujoco.MjSpec.from_string(model)
     compiled = spec.copy().compile()
     return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})
@@ -116,7 +112,7 @@ def test_task_with_sensors_passes_check_task(model: str, engine: str) -> None:
     check_task(sensing(model), engine=engine, **OPTIONS[engine])
 
 
-# these models use plugins and other features that MuJoCo Warp lacks
+# these models use features that MuJoCo Warp lacks, such as plugins
 
 
 @pytest.mark.quick("Actuator plugins not supported")
@@ -233,8 +229,6 @@ def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params
 
 
 class Pushed(lw.Task):
-    """A task that pushes a joint of a model without actuators."""
-
     World, observe, control, randomize, reward = PushedWorld, look, push, start_pushed, judge_pushed
     model = mujoco.MjSpec.from_string(text(ARM, ""))
     obs = {"position": 1, "velocity": 1}

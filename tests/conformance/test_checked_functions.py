@@ -1,5 +1,3 @@
-"""Test that index-checked copies of Warp functions find mistakes and compute the same numbers."""
-
 import re
 import sys
 from typing import Any
@@ -157,7 +155,7 @@ FINDINGS = [
 
 
 KEPT: list[wp.array] = []
-"""Arrays that other arrays point to; this list keeps them alive."""
+"""Other arrays point to these arrays, so they must stay alive."""
 
 
 DEVICE = wp.get_device("cpu")

@@ -1,5 +1,3 @@
-"""Run ``check_task`` for every task of the package on both engines, and for some tasks on a toy engine."""
-
 import pytest
 from conftest import settle
 from toy_engine import ToyEngine
@@ -17,14 +15,14 @@ EVERY_RULE = {
     "mujoco": ("hopper", "humanoid", "adroit_pen", "soft_ball"),
     "warp": ("hopper", "adroit_pen", "soft_ball"),
 }
-"""Tasks for which all rules are checked, by engine; together they use most features of models."""
+"""For these tasks, all rules are checked. Together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""Rules for other tasks on the C engine; two slow rules whose results hardly depend on the task are omitted."""
+"""For other tasks on the C engine, two slow rules are omitted. Their results hardly depend on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""Rules for other tasks on the Warp engine; there are few because this engine is slow on a CPU."""
+"""For other tasks on the Warp engine, only a few rules are checked, because this engine is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -37,8 +35,8 @@ def settled_again() -> None:
 def options(task: str, engine: str) -> dict[str, int]:
     """Return how many steps the long rules take.
 
-    For hopper, the steps suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
-    milliseconds, so the rules take only a few steps of other tasks on this engine.
+    For hopper, they suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
+    milliseconds.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
@@ -48,7 +46,7 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-# these cases cover contacts, tasks without contacts, and tasks for planners; test_rules.py covers events and dynamics
+# contacts, tasks without contacts, and tasks for planners; test_rules.py covers events and dynamics
 @pytest.mark.quick("mujoco-cartpole_swingup", "mujoco-reach", "warp-half_cheetah", "warp-point_mass")
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
 def test_task_passes_all_checks_of_check_task(task: str, engine: str) -> None:
@@ -65,7 +63,7 @@ def test_task_passes_the_quick_checks_of_check_task(task: str, engine: str) -> N
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
     if engine == "warp" and "rough" in task:
-        # this rule compares both engines, but the C engine creates more contacts with a height field than MuJoCo Warp
+        # on a height field, the C engine creates more contacts than MuJoCo Warp
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 

@@ -1,5 +1,3 @@
-"""Test that the index rule finds errors in a task's file that would silently give wrong results."""
-
 import re
 
 import pytest
@@ -78,7 +76,7 @@ def test_index_rule_reports_indices_out_of_range(task_file: TaskFile, engine: st
     with pytest.raises(AssertionError, match="tiny on the .* engine breaks the rule 'bounds': ") as caught:
         check_task(task_file("wrong.py", WRONG), engine=engine, steps=10, checks=[check_bounds])
     message = str(caught.value)
-    assert message.count("\n") == 1  # the first line names the problem, and the state follows
+    assert message.count("\n") == 1
     for pattern in MISTAKES:
         assert re.search(pattern, message), f"{pattern} is not in {message}"
     assert message.count("out of range") == len(MISTAKES)

@@ -1,5 +1,3 @@
-"""Test that every rule of ``check_task`` fails if an environment is patched to violate it."""
-
 import itertools
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -23,7 +21,7 @@ Function = Callable[..., Any]
 
 
 def then(extra: Callable[[Any], object]) -> Callable[[Function], Function]:
-    """Return a decorator that calls a function after each call of the decorated method."""
+    """Call ``extra`` after each call of the decorated method."""
 
     def wrap(method: Function) -> Function:
         def longer(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -74,8 +72,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Set the step counter to zero while observations are computed, so that their noise equals the noise of the
-    reset."""
+    """Observe with step counter 0, so the noise repeats the noise of the reset."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -162,7 +159,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""Patches that violate each rule, for hopper."""
+"""Patches that violate the rules on hopper."""
 
 FULL_BREAKS: list[Break] = [
     ("groups", lw.Env, "step", then(another_critic)),
@@ -180,12 +177,10 @@ FULL_BREAKS: list[Break] = [
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),
     ("rejection", Worlds, "_redraw", nothing),
 ]
-"""Patches that violate each rule, for the task with every feature."""
 
 SETTLED_BREAKS: list[Break] = [
     ("settle", MujocoEngine, "settle", at_once),
 ]
-"""Patches that violate each rule, for a variant of this task that takes substeps before each episode."""
 
 ALL_BREAKS = [
     *(("hopper", *broken) for broken in BREAKS),
@@ -221,7 +216,7 @@ def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 
 
-def test_task_with_every_feature_passes_the_checks_of_these_features_on_the_warp_engine() -> None:
+def test_task_with_every_feature_passes_on_the_warp_engine() -> None:
     rules = ("groups", "events", "inputs", "dynamics", "rejection")
     checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)

@@ -1,5 +1,3 @@
-"""Test checks of controllers and actions, the conversion of time steps, and descriptions of controllers."""
-
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +62,7 @@ def test_invalid_action_or_plan_raises_an_error(run: Run, env: lw.Env) -> None:
             run(env, controller)
 
 
-def test_long_plan_steps_hold_or_interpolate_actions_and_short_plan_steps_skip_actions(env: lw.Env) -> None:
+def test_plan_is_resampled_to_the_time_step_of_the_plant(env: lw.Env) -> None:
     plan = torch.tensor([[0.0, 1.0], [1.0, 3.0], [2.0, 9.0]])
 
     def applied(timestep: float, steps: int, **words: str) -> list[float]:
@@ -90,9 +88,7 @@ def test_time_step_that_is_not_a_multiple_of_the_plant_time_step_raises_an_error
 
 
 @pytest.mark.parametrize("between, change", [("hold", [0, 1, 0, 1, 0]), ("linear", [1, 1, 1, 1, 1])])
-def test_actions_of_a_planner_with_doubled_time_step_are_applied_twice_or_interpolated(
-    between: str, change: list[int]
-) -> None:
+def test_planner_with_a_doubled_time_step_repeats_or_interpolates_actions(between: str, change: list[int]) -> None:
     plant = lw.make("point_mass", autoreset=False, horizon=40)
     plan = lw.MPPI("point_mass", frame_skip=2 * plant.task.frame_skip, horizon=4, samples=8, between=between)
     assert plan.timestep == 2 * plant.timestep

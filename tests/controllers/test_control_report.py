@@ -27,7 +27,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
-    """Replace the planning times of an episode, so that the first plan takes one second."""
+    """Set planning times; the first plan takes one second."""
     plans = len(times) + 1
     return dataclasses.replace(
         episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
@@ -61,7 +61,7 @@ def test_report_omits_a_quantile_with_too_few_plans(episode: Trajectory, times: 
     assert report.miss_share is None and ("planning time max", "-") in report.rows()
 
 
-def test_success_has_the_wilson_confidence_interval(episode: Trajectory) -> None:
+def test_success_rate_has_a_wilson_confidence_interval(episode: Trajectory) -> None:
     for successes, low, high in ((8, 0.4902, 0.9433), (0, 0, 0.2775), (10, 0.7225, 1)):
         ten = [
             dataclasses.replace(episode, success=torch.ones(40, dtype=torch.bool) & (i < successes)) for i in range(10)
@@ -171,7 +171,7 @@ def test_report_rows_have_units_and_dashes_for_missing_values(episode: Trajector
     assert rows["age of the action, max"] == "5 steps (5000 ms)"
 
 
-def test_report_rows_show_ages_in_steps_and_milliseconds(env: lw.Env) -> None:
+def test_report_rows_show_the_age_of_plans_in_steps_and_milliseconds(env: lw.Env) -> None:
     episode = control(env, SamplingPlanner(0), steps=3)
     old = dataclasses.replace(episode, plan_steps=episode.plan_steps - 1, ages=episode.ages * 0 + 0.0202)
     rows = dict(control_report(old).rows())

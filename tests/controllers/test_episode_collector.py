@@ -1,5 +1,3 @@
-"""Test the code that both control loops share: limits, progress, and trajectories of interrupted episodes."""
-
 import time
 from collections.abc import Callable
 
@@ -60,7 +58,7 @@ def test_progress_includes_the_step_and_counts_the_plans(
     monkeypatch.setattr(env, "step", slow)
     seen: list[ControlProgress] = []
     episode = run(env, SamplingPlanner(0), steps=6, on_step=seen.append)
-    assert seen[0].time >= 0.01  # progress is reported after the step
+    assert seen[0].time >= 0.01
     assert all(now.step / now.time <= 100 for now in seen)
     assert [now.plans - 1 for now in seen] == episode.plan_of.tolist()
 

@@ -51,7 +51,7 @@ def test_equal_seeds_give_equal_episodes(env: lw.Env) -> None:
     assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 
 
-def test_shift_is_zero_for_the_first_plan_after_a_reset_and_otherwise_one(env: lw.Env) -> None:
+def test_plan_is_shifted_by_one_step_except_after_a_reset(env: lw.Env) -> None:
     planner = StepPlanner(env)
     assert control(env, planner, seed=4, steps=4).done_reason == 0
     assert planner.shifts == [0, 1, 1, 1] and planner.resets == [4]
@@ -61,9 +61,7 @@ def test_shift_is_zero_for_the_first_plan_after_a_reset_and_otherwise_one(env: l
 
 
 @pytest.mark.parametrize("ratio, shifts", [(2.0, [0, 0, 1, 0, 1, 0, 1]), (0.25, [0, 4, 4, 4, 4, 4, 4])])
-def test_episode_in_two_runs_shifts_plans_like_an_episode_in_one_run(
-    env: lw.Env, ratio: float, shifts: list[int]
-) -> None:
+def test_continued_episode_shifts_plans_like_an_uninterrupted_one(env: lw.Env, ratio: float, shifts: list[int]) -> None:
     planner = StepPlanner(env)
     planner.timestep = ratio * env.timestep
     control(env, planner, steps=3)

@@ -23,7 +23,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_if_plans_take_less_than_a_period_actions_are_one_step_old(env: lw.Env) -> None:
+def test_actions_are_one_step_old_if_plans_take_less_than_a_period(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=0.3, steps=6)
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]

@@ -61,7 +61,7 @@ def test_damaged_trajectory_file_raises_an_error(episode: Trajectory, tmp_path: 
         states = archive.getinfo("states.npy")
     whole, broken = path.read_bytes(), tmp_path / "broken.npz"
     half = len(whole) // 2
-    data = states.header_offset + 100 + states.compress_size // 2  # damage a byte inside the compressed states
+    data = states.header_offset + 100 + states.compress_size // 2
     for content in (b"", b"no zip", whole[:half], whole[:-1], whole[:data] + b"????????" + whole[data + 8 :]):
         broken.write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.npz is broken, or is not a trajectory"):

@@ -1,4 +1,4 @@
-"""Generate models with every element that both engines support, and list the combinations that they cover."""
+"""Generate models with every element that both engines support."""
 
 import functools
 import itertools
@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 
 Case = dict[str, str]
-"""A dict from the names of factors to their levels."""
+"""The level of each factor."""
 
 GENERAL = "<general {place} {kind} {extra}/>"
 DRIVES = {
@@ -27,14 +27,13 @@ DRIVES = {
     "dcmotor": '<dcmotor {place} motorconst=".5" resistance="1" {extra}/>',
     "user": GENERAL.replace("{kind}", 'dyntype="user" gaintype="user" biastype="user" actdim="1"'),
 }  # fmt: skip
-"""Actuators by their type of dynamics."""
 
 DRIVE_GROUPS = {
     "instant": ("motor", "servo", "damper"),
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""Groups of actuators; a model combines each actuator of one group with each transmission."""
+"""A model combines each actuator of one group with each transmission."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -45,7 +44,7 @@ PLACES = {
     "site": 'site="tip" gear="0 0 .3 0 .1 0"',
     "refsite": 'site="tip" refsite="here" gear="0 0 .3 0 0 0"',
 }
-"""Transmissions of actuators, except for adhesion, which is a separate factor."""
+"""Transmissions of actuators. Adhesion is a separate factor."""
 
 EQUALITIES = {
     "none": "",
@@ -116,7 +115,7 @@ STAGES = {
     "energy": "energy",
     "acceleration": "qacc qfrc_actuator",
 }
-"""Fields that a task's World may request, by the stage that computes them."""
+"""Fields of World, by the stage that computes them."""
 
 FIELDS = {
     "nothing": "",
@@ -125,7 +124,6 @@ FIELDS = {
     "velocities": " ".join(STAGES[name] for name in ("camlight", "com velocity", "velocity")),
     "everything": " ".join(STAGES.values()).replace("subtree_linvel ", ""),
 }
-"""Sets of requested fields, which may span several stages."""
 
 FLAGS = {
     "": "",
@@ -194,7 +192,7 @@ UNKNOWN = {
     "mjDSBL_AUTORESET": "MuJoCo Warp refuses it",
     "mjNDISABLE": "it is a number of flags",
 }
-"""Members of MuJoCo's enums that occur in no model of the table, each with a reason."""
+"""Enum members that no model uses, each with a reason."""
 
 
 def xml(case: Case) -> str:
@@ -279,12 +277,11 @@ def model_of(case: Case) -> mujoco.MjModel:
 
 
 def is_refused(case: Case) -> bool:
-    """Return whether MuJoCo or MuJoCo Warp rejects a case."""
     return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
 
 
 def singles() -> Iterator[Case]:
-    """Yield a case for each level of each factor; the other factors have their first levels."""
+    """Yield a case for each level of each factor. All other factors have their first levels."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -293,10 +290,9 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that together contain every combination of ``strength`` levels of different factors.
+    """Return cases that contain every combination of ``strength`` levels.
 
-    The search is greedy: each case starts with a missing combination, and the other factors take the levels that add
-    the most missing combinations. Combinations that an engine rejects are omitted.
+    The search is greedy: a case starts with a missing combination, and each further level adds the most missing ones.
     """
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
@@ -307,7 +303,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # an engine rejects this combination, whatever the levels of the other factors
+            del missing[first]  # an engine always rejects this combination
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)
@@ -316,8 +312,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Complete a case: in random order, each remaining factor takes the level that adds the most missing
-    combinations."""
+    """Choose the remaining levels in random order, to add the most missing combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:
@@ -335,7 +330,6 @@ def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], stre
 
 
 def title(case: Case) -> str:
-    """Return the levels in which a case differs from the plain case."""
     return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
 
 
@@ -360,4 +354,3 @@ ENUMS: dict[str, Reader] = {
     "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
     "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
 }
-"""MuJoCo's enums, each with a function that lists the members in a model."""

@@ -1,5 +1,3 @@
-"""Test that the deterministic mode sorts contacts and constraint rows, and that its graphs share scratch memory."""
-
 import contextlib
 import copy
 import dataclasses
@@ -26,8 +24,7 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove Warp's custom allocators, so that the engine runs on the CPU. Custom allocators exist only on CUDA
-    devices."""
+    """Remove custom allocators, which exist only on CUDA devices."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 
@@ -49,7 +46,6 @@ def test_deterministic_engine_takes_the_same_steps_as_the_warp_engine() -> None:
 
 @pytest.mark.usefixtures("without_allocators")
 def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scratch memory is reserved for at least 256 worlds, if it fits into memory and into Warp's buffers."""
     engine: Any = lw.make("hopper", engine=DeterministicEngine, nworld=2).engine
     assert not engine._scratch.blocks
     engine.nworld = 1000
@@ -70,13 +66,11 @@ def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pyte
     assert 100_010 <= block.size < 100_010 + 512
 
 
-# on a GPU, the order of contacts and rows is random; these tests shuffle them, and check that sorting restores the
-# order
+# on a GPU, the order of contacts and rows is random; these tests shuffle them instead
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
 def forwarded(request: pytest.FixtureRequest) -> tuple[WarpEngine, CanonicalOrder]:
-    """Return an engine with humanoids that touch the ground and reach joint limits, and a sorter for its contacts."""
     model = copy.copy(lw.make("humanoid").model)
     model.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{request.param.upper()}")
     engine = WarpEngine(model, 3, wp.get_device("cpu"), [describe(model, "qpos")])
@@ -156,7 +150,7 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
 def test_contact_field_without_a_sorting_rule_raises_an_error(
     forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new version of MuJoCo Warp may add a contact field that is not sorted yet."""
+    """A new version of MuJoCo Warp may add contact fields."""
     engine, _ = forwarded
     # type: ignore[attr-defined]
     known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
@@ -166,7 +160,7 @@ def test_contact_field_without_a_sorting_rule_raises_an_error(
 
 
 class Capturing:
-    """A fake CUDA device during a capture: Warp allocates some memory in the capture, and some outside it."""
+    """A fake CUDA device. During a capture, Warp allocates some memory in the capture and some outside it."""
 
     is_capturing = True
 
@@ -194,12 +188,12 @@ def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch)
     for sizes in ([1000, 2000], [512, 1500, 1000], [4000]):
         scratch.open()
         launches.append([range(start := scratch.allocate(size), start + size) for size in sizes])
-    for pieces in launches:  # the buffers of one launch lie in the block and do not overlap
+    for pieces in launches:
         for before, after in itertools.pairwise(pieces):
             assert before.stop <= after.start
         assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
     assert (scratch.peak, scratch.largest) == (4096, 4096)
-    more = scratch.allocate(2000)  # the scratch block is full
+    more = scratch.allocate(2000)
     assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
     scratch.deallocate(more, 2000)
     assert not device.freed

@@ -1,5 +1,3 @@
-"""Test per-world model fields, inputs, initial states and substeps before an episode on every engine."""
-
 import copy
 from collections.abc import Mapping
 
@@ -60,7 +58,6 @@ def make(
     initial: np.ndarray | None = None,
     written: tuple[str, ...] = (),
 ) -> Engine:
-    """Return an engine after a reset; the named model fields may differ between its worlds."""
     kept = [describe(model, name) for name in (*STATE, *fields)]
     kept += [describe(model, name, written=True) for name in written]
     dynamics = [describe_model_field(model, name) for name in names]
@@ -71,12 +68,10 @@ def make(
 
 
 def worlds(nworld: int = N, *chosen: int) -> wp.array:
-    """Return a mask of the chosen worlds, or of all worlds if none is chosen."""
     return wp.array([not chosen or w in chosen for w in range(nworld)], dtype=bool)
 
 
 def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
-    """Scale the model fields of the chosen worlds (by default all worlds) by random factors, and apply them."""
     rng = np.random.default_rng(seed)
     for name in sorted(engine.dynamics):
         array, own = engine.arrays[name].numpy(), engine.nominal[name].numpy()
@@ -92,7 +87,6 @@ def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
 
 
 def run(engine: Engine, steps: int = 5, nstep: int = 2) -> np.ndarray:
-    """Return positions and velocities after some steps under fixed controls, (nworld, nq + nv)."""
     for _ in range(steps):
         engine.ctrl.numpy()[:] = (0.5, -0.3, 0.2)
         engine.step(nstep)
@@ -140,7 +134,7 @@ def test_worlds_with_their_own_models_step_like_plain_mujoco(engine: type[Engine
     draw(made)
     draw(plain)
     steps = [(run(made, 1), run(plain, 1)) for _ in range(5)]
-    assert np.ptp(steps[-1][1], axis=0).max() > 0.01  # worlds with different models move differently
+    assert np.ptp(steps[-1][1], axis=0).max() > 0.01
     for got, expected in steps:
         if engine is MujocoEngine:
             np.testing.assert_array_equal(got, expected)
@@ -161,9 +155,7 @@ CHANGES: Mapping[str, float] = {
 )  # fmt: skip
 @pytest.mark.parametrize("name", CHANGES)
 @pytest.mark.parametrize("engine", [MujocoEngine, WarpEngine])
-def test_model_field_that_is_zero_in_the_model_can_be_nonzero_in_a_single_world(
-    engine: type[Engine], name: str
-) -> None:
+def test_zero_model_field_can_be_nonzero_in_one_world(engine: type[Engine], name: str) -> None:
     model = copy.copy(MODEL)
     if name == "wind":
         model.opt.density = 100.0
@@ -194,7 +186,7 @@ def test_model_change_in_one_world_does_not_affect_other_worlds(engine: type[Eng
     assert (got[1] != expected[1]).any()
 
 
-def test_per_world_fields_with_nominal_values_give_the_steps_of_the_shared_model() -> None:
+def test_nominal_per_world_fields_give_the_steps_of_the_shared_model() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
@@ -225,12 +217,12 @@ def test_restored_state_restores_its_model_fields(engine: type[Engine]) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_steps_equal_the_original_steps_after_nominal_model_values_are_restored(engine: type[Engine]) -> None:
+def test_restored_nominal_values_give_the_original_steps(engine: type[Engine]) -> None:
     made, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
     draw(made)
     for name, nominal in made.nominal.items():
         made.arrays[name].numpy()[:] = nominal.numpy()
-    for _ in range(2):  # in the second pass, all model fields are already nominal
+    for _ in range(2):
         made.apply_model(worlds())
     np.testing.assert_array_equal(run(made), run(untouched))
 
@@ -256,7 +248,7 @@ def test_rollout_uses_the_model_fields_of_each_state(
     controls = wp.array(np.full((4, N, MODEL.nu), 0.3), dtype=float)
     names = ("qpos", "qvel", "body_mass", *current)
     buffers = {name: wp.zeros((5, *source.arrays[name].shape), dtype=source.arrays[name].dtype) for name in names}
-    for _ in range(2):  # in the second pass, no model field changes
+    for _ in range(2):
         planner.rollout(state, controls, 2, buffers)
         for t in range(4):
             for name, buffer in buffers.items():
@@ -272,7 +264,7 @@ def test_rollout_uses_the_model_fields_of_each_state(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine whose ``settle`` computes forward passes of all worlds, as the deterministic engine's does."""
+    """``settle`` computes forward passes of all worlds, as in the deterministic engine."""
 
     partial_refresh = False
 
@@ -300,7 +292,7 @@ def test_settle_advances_only_masked_worlds(engine: type[Engine]) -> None:
     assert not made.fault.numpy().any()
 
 
-def test_graphs_give_the_same_results_as_direct_calls_of_apply_model_and_settle() -> None:
+def test_apply_model_and_settle_give_the_same_results_in_graphs() -> None:
     captured, direct = (make(WarpEngine, *DRAWN) for _ in range(2))
     mask = worlds(N, 0, 2)
 
@@ -314,7 +306,7 @@ def test_graphs_give_the_same_results_as_direct_calls_of_apply_model_and_settle(
 
     for engine, enabled in ((captured, True), (direct, False)):
         calls = Graphs(CPU, enabled=enabled).sequence(phases(engine))
-        for seed in range(4):  # the first iteration runs the launches, and the second iteration captures them
+        for seed in range(4):
             rng = np.random.default_rng(seed)
             for name in engine.dynamics:
                 array = engine.arrays[name].numpy()
@@ -382,8 +374,8 @@ SLIDERS = """<mujoco><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_inverse_weights_of_sliding_or_rotating_bodies_equal_those_of_a_compiled_model() -> None:
-    """In directions in which a body cannot move, MuJoCo's inverse weight is 0, unlike MuJoCo Warp's ``set_const``."""
+def test_inverse_weights_equal_those_of_a_compiled_model() -> None:
+    """If a body cannot move in a direction, MuJoCo's inverse weight is 0. MuJoCo Warp's ``set_const`` differs."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

@@ -1,5 +1,3 @@
-"""Test that both engines treat fields, controls, resets and options equally."""
-
 import gc
 from pathlib import Path
 
@@ -82,7 +80,7 @@ def file(task_file: TaskFile) -> Path:
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_lagged_fields_are_current_after_a_reset(file: Path, engine: str) -> None:
+def test_fields_of_the_last_substep_are_current_after_a_reset(file: Path, engine: str) -> None:
     env = lw.make(file, engine=engine, nworld=2)
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
     for _ in range(6):
@@ -153,7 +151,7 @@ def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: st
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_do_not_change_the_simulation(file: Path, engine: str) -> None:
-    """Only the size of the state changes: it grows by the additional field of the acceleration stage."""
+    """Only the size of the state changes, by the field of the acceleration stage."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)
@@ -255,7 +253,7 @@ def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
 
 
 def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forward passes of only the restarting worlds give the same results as passes of all worlds."""
+    """A partial pass computes only the restarting worlds."""
     runs = []
     for partial in (True, False):
         monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
@@ -277,7 +275,7 @@ def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A world starts with too many contacts, and the first step reports the overflow."""
+    """A world starts with too many contacts."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1

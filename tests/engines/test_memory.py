@@ -37,8 +37,7 @@ def test_memory_check_first_frees_the_gpu_memory_that_torch_has_cached(monkeypat
 
 
 def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
-    """The estimate includes MuJoCo Warp's data for all worlds, its data for the few worlds that one refresh computes
-    together, and temporary arrays."""
+    """The estimate includes data for all worlds, data for the few worlds of one refresh, and temporary arrays."""
     for task in ("hopper", "ant"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine

@@ -1,5 +1,3 @@
-"""Resolve device names and engine="auto", and choose devices for a few worlds and for a planner's samples."""
-
 import types
 from typing import Any
 
@@ -33,7 +31,6 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture
 def gpu(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a fake CUDA device, which can be found but not used."""
     device = types.SimpleNamespace(is_cpu=False, is_cuda=True, alias="cuda:0", free_memory=10**9)
     found = placement.find_device
     monkeypatch.setattr(placement, "find_device", lambda name: device if str(name).startswith("cuda") else found(name))
@@ -112,14 +109,14 @@ def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made
         open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
-def test_small_numbers_of_worlds_run_on_the_cpu_instead_of_a_gpu_only_with_engine_auto() -> None:
+def test_only_engine_auto_moves_few_worlds_to_the_cpu() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}
 
 
-def test_plant_whose_device_is_a_gpu_runs_on_the_cpu(gpu: Any) -> None:
-    """On the GPU, the plant's steps would wait for the planner, so even with engine="warp", the CPU is used."""
+def test_plant_runs_on_the_cpu_even_if_its_device_is_a_gpu(gpu: Any) -> None:
+    """On the GPU, the plant's steps would wait for the planner."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):
@@ -127,7 +124,7 @@ def test_plant_whose_device_is_a_gpu_runs_on_the_cpu(gpu: Any) -> None:
 
 
 def test_engine_of_a_planner_depends_on_the_number_of_samples(gpu: Any) -> None:
-    """Only engine="auto" chooses a device; an explicit engine is used unchanged."""
+    """An explicit engine is used unchanged."""
 
     def chosen(
         samples: int,

@@ -1,5 +1,3 @@
-"""Test that a refresh equals a full forward pass bit for bit, but computes only the required parts."""
-
 from typing import Any
 
 import mujoco
@@ -87,7 +85,7 @@ def only(engine: Engine, *worlds: int) -> wp.array:
 
 
 def begin(engine: Engine, mask: wp.array, seed: int) -> None:
-    """Begin episodes of the masked worlds in random states, some of them beyond a limit or in contact."""
+    """Begin episodes in random states, some beyond a limit or in contact."""
     rng, chosen = np.random.default_rng(seed), mask.numpy().astype(bool)
     engine.reset(mask)
     write(engine, "qpos", chosen, engine.arrays["qpos"].numpy() + 0.1 * rng.normal(size=engine.arrays["qpos"].shape))
@@ -112,12 +110,10 @@ def put(engine: Engine, state: np.ndarray, mask: wp.array) -> None:
 
 
 def shown(engine: Engine) -> dict[str, np.ndarray]:
-    """Return copies of all derived fields."""
     return {name: engine.arrays[name].numpy().copy() for name in engine.fields if name in FIELDS.split()}
 
 
 def full_forward(engine: Engine) -> dict[str, np.ndarray]:
-    """Compute all derived fields with MuJoCo's own forward pass in separate data."""
     state = state_of(engine)[:, : engine.integration_size]
     spec, names = mujoco.mjtState.mjSTATE_INTEGRATION.value, [n for n in FIELDS.split() if n in engine.fields]
     if isinstance(engine, WarpEngine):
@@ -136,7 +132,6 @@ def full_forward(engine: Engine) -> dict[str, np.ndarray]:
 
 
 def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(None)) -> None:
-    """Compare all fields, and all sensors of the position and velocity stages, with a full forward pass."""
     found, wanted = shown(engine), full_forward(engine)
     columns = early_sensor_columns(engine.model)
     for name, value in found.items():
@@ -173,7 +168,6 @@ def make(kind: type[Engine], sensors: str, equality: str = "") -> Engine:
 )  # fmt: skip
 @pytest.mark.parametrize("sensors", SENSORS)
 def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) -> None:
-    """Check restarts, steps, restored states and changed states, including sensor histories."""
     engine = make(kind, sensors)
     for steps in (1, 3):
         check_current(engine, whole=True)
@@ -220,7 +214,6 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     assert np.abs(left[:, late]).max() > 0
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"], left)
-    # change the velocities of two worlds, as a push event does
     before, chosen = state_of(engine), only(engine, 0, 2)
     write(engine, "qvel", chosen.numpy(), engine.arrays["qvel"].numpy() + 1.0)
     engine.commit(chosen)
@@ -291,8 +284,7 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
-    """After a step, a stage of the physics runs for one world after another in the same MjData. Fields outside
-    this stage contain the values of another world in this MjData."""
+    """Worlds that share an MjData run each stage one after another. Other fields then hold values of another world."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
@@ -312,7 +304,7 @@ def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # other sensors belong to the last substep, not to the current state
+    early = early_sensor_columns(model)  # other sensors belong to the last substep
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

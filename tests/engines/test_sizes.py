@@ -1,5 +1,3 @@
-"""Test that contact and constraint buffers are large enough, or that a warning is logged."""
-
 import mujoco
 import pytest
 from conftest import TaskFile
@@ -11,7 +9,7 @@ from lyceum_warp.engines.warp.sizes import probe_sizes
 
 @pytest.fixture(autouse=True)
 def unknown_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Probe every model, even if an earlier run of the tests has probed it."""
+    """Probe every model, even if the tests' cache contains its sizes."""
     monkeypatch.setattr(sizes, "_known", {})
 
 

@@ -1,5 +1,3 @@
-"""Compare the Warp engine's steps with MuJoCo Warp's, bit for bit, for all kinds of model elements and fields."""
-
 import copy
 import itertools
 from collections.abc import Callable, Sequence
@@ -25,7 +23,6 @@ SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
 @pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
 def device(request: pytest.FixtureRequest) -> wp.Device:
-    """Return a device on which steps are reproducible bit for bit; on a GPU, the engine is the deterministic one."""
     return wp.get_device(request.param)
 
 
@@ -36,7 +33,6 @@ def make(model: mujoco.MjModel, names: list[str], device: wp.Device, dynamics: S
 
 
 def begin(engine: WarpEngine, mask: wp.array, seed: int) -> None:
-    """Begin episodes of the masked worlds in random states."""
     rng, chosen, model = np.random.default_rng(seed), mask.numpy(), engine.model
     engine.reset(mask)
     qpos, qvel = engine.arrays["qpos"].numpy(), engine.arrays["qvel"].numpy()
@@ -57,10 +53,10 @@ def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
 
 
 def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
-    """Run MuJoCo Warp's own step or forward pass, but let constraints read the current velocities.
+    """Run MuJoCo Warp's step or forward pass, but let constraints read the current velocities.
 
-    MuJoCo Warp's ``make_constraint`` reads the bodies' velocities of the last forward pass. The engine recomputes these
-    velocities, so that a step depends only on the state.
+    MuJoCo Warp's ``make_constraint`` reads velocities of the last forward pass. The engine recomputes them, so a step
+    depends only on the state.
     """
 
     def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
@@ -74,7 +70,6 @@ def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.
 
 
 def check(case: Case, device: wp.Device) -> None:
-    """Compare steps and fields of an engine with those of MuJoCo Warp."""
     model, names = table.model_of(case), table.fields_of(case)
     engine = make(model, names, device)
     begin(engine, wp.full(N, True, dtype=bool, device=device), 1)
@@ -152,7 +147,7 @@ LADEN = table.PLAIN | {
 @pytest.mark.quick("com", "tendon", "transmission", "com velocity", "energy", "acceleration")
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_step_reuses_fields_that_are_already_computed(asked: str, device: wp.Device) -> None:
-    """A step computes only those stages of the physics that a field needs and that are not computed yet."""
+    """A step computes a stage of the physics only if a field needs it and it is not computed yet."""
     check(LADEN | {"asked": asked}, device)
 
 
@@ -165,7 +160,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels without which a field has no effect; the other factors have the levels in ``DRAWN``."""
+"""Fields that need other levels to have an effect. All other factors have the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
@@ -194,7 +189,7 @@ def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, devi
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    # most joints slip, and the friction force of a slipping joint does not depend on solref
+    # most joints slip, and a slipping joint's friction force does not depend on solref
     most = 3.0 if name == "dof_solref" else 1.1
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
@@ -238,7 +233,7 @@ def test_engines_reject_the_listed_combinations(levels: dict[str, tuple[str, ...
 
 
 def test_table_contains_every_member_of_the_mujoco_enums() -> None:
-    """This test fails for a new MuJoCo element until the table contains it or gives a reason for its absence."""
+    """A new MuJoCo element must be added to the table, or listed with a reason."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}

@@ -1,7 +1,7 @@
 """Run ``lyceum-warp`` with random command lines.
 
-A case is "COMMAND SEED", or the name of a minimal case in ``minimal_cases.py``. The flags are read from the help texts,
-so new flags are included automatically.
+A case is "COMMAND SEED" or the name of a case in ``minimal_cases.py``. Flags come from the help texts, so new ones are
+included.
 """
 
 import contextlib
@@ -50,10 +50,9 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
 FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict.fromkeys(
     ("train --resume good", "train --from good"), ""
 )
-"""Arguments that follow a command; by default the name of a task."""
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Omitted flags: some print or start other processes, and with one of them a single native call can take hours."""
+"""Omitted flags: they print, start other processes, or lead to native calls of hours."""
 
 
 @functools.cache
@@ -122,7 +121,6 @@ def attack(case: str) -> str:
 
 
 def run(line: list[str]) -> str:
-    """Run a command line in a folder that contains a training run, and check the outcome."""
     os.chdir(HERE.parent)
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()
@@ -161,7 +159,6 @@ def _spelled(line: list[str]) -> str:
 
 
 def warm_up() -> None:
-    """Make a run, and run every command once."""
     lyceum_warp.cli.view.view = lambda *args, **options: None  # no window
     torch.set_num_threads(1)
     HERE.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """Read randomly damaged files of runs, saved episodes, models and tables.
 
-A case is "KIND SEED", or the name of a minimal case in ``minimal_cases.py``.
+A case is "KIND SEED" or the name of a case in ``minimal_cases.py``.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
-"""Documented error types for invalid files and arguments."""
+"""Documented errors for invalid files and arguments."""
 BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
 
 TASK = """
@@ -148,7 +148,7 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files to delete, so that a reader must use another file."""
+"""Files to delete, so a reader must use another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
@@ -158,7 +158,6 @@ class RefusedError(Exception):
 
 
 def command(*words: object) -> None:
-    """Run a command in this process; raise RefusedError if it exited with 2, and ProblemError for any other error."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = cli.main([str(word) for word in words])
@@ -181,7 +180,6 @@ def attack(case: str) -> str:
 
 
 def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
-    """Damage a file in a copy of the base folder, and read it."""
     kind = KINDS[name]
     shutil.rmtree(CASE, ignore_errors=True)
     shutil.copytree(BASE, CASE)
@@ -228,7 +226,6 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def warm_up() -> None:
-    """Make the base folder, unless an earlier process made it, and call every reader once."""
     lyceum_warp.cli.view.view = lambda *args, **options: None  # no window
     torch.set_num_threads(1)
     if not BASE.exists():

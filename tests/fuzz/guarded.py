@@ -1,7 +1,7 @@
-"""Run attacks in a subprocess, limit the time and the memory of each attack, and collect the problems.
+"""Run attacks in a subprocess with limits on time and memory, and collect the problems.
 
-An attack program calls ``serve``; a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats single
-cases, prints their tracebacks, and writes files into the current directory.
+An attack program calls ``serve``, and a test calls ``attacks``. ``python tests/fuzz/PROGRAM.py CASE ...`` repeats
+single cases with tracebacks.
 """
 
 import contextlib
@@ -20,17 +20,17 @@ from pathlib import Path
 from typing import Any
 
 MEMORY = 512 * 2**20
-"""Additional bytes of address space that a case may use after the warm-up."""
+"""Additional address space for a case, in bytes."""
 PATIENCE = 3.0
-"""Seconds between SIGINTs. A SIGINT must end a command."""
+"""Seconds between SIGINTs, which must end a command."""
 LIMIT = 60.0
-"""Seconds after which a case is killed with a traceback if it ignores SIGINT."""
+"""Seconds after which a case that ignores SIGINT is killed."""
 ROOT = Path(__file__).parents[2]
 
 
 @dataclasses.dataclass
 class Outcome:
-    """The outcome of a case: "refused", "worked", "interrupted", or a one-line description of a problem."""
+    """The outcome: "refused", "worked", "interrupted", or a one-line problem."""
 
     case: str
     did: str
@@ -39,19 +39,16 @@ class Outcome:
 
 
 Attack = Callable[[str], str]
-"""Run a case and return its outcome; raise ProblemError if the case violates a rule."""
+"""Runs a case and returns its outcome, or raises ProblemError."""
 
 
 class ProblemError(Exception):
-    """A case violated a rule; the message is one line."""
-
     def __init__(self, text: str, error: BaseException | None = None) -> None:
         super().__init__(text if error is None else f"{text}: {place(error)}")
         self.error = error
 
 
 def place(error: BaseException) -> str:
-    """Return an error's type, the innermost package function in its traceback, and its message."""
     frames = traceback.extract_tb(error.__traceback__)
     frames = [f for f in frames if "lyceum_warp/" in f.filename and "/tests/" not in f.filename]
     where = f"{Path(frames[-1].filename).name}:{frames[-1].name}" if frames else "outside"
@@ -62,7 +59,6 @@ _OUT_OF_MEMORY = ("can't allocate memory", "not enough memory", "bad_alloc", "co
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Return whether an error or one of its causes is a failed allocation rather than an error of the package."""
     one: BaseException | None = error
     while one is not None:
         own = type(one).__module__.startswith("lyceum_warp")
@@ -73,8 +69,10 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
-    """Run the cases given on the command line. Before memory is limited, ``warm_up`` loads the modules that the cases
-    need."""
+    """Run the cases of the command line.
+
+    ``warm_up`` loads modules before memory is limited.
+    """
     results = sys.argv[2] if sys.argv[1:2] == ["--results"] else None
     cases = sys.argv[3:] if results else sys.argv[1:]
     os.environ["XDG_STATE_HOME"] = str(Path("state").absolute())
@@ -84,7 +82,7 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
     with open(results, "a") if results else contextlib.nullcontext(sys.__stdout__) as file:
         for case in cases:
             print(json.dumps({"begin": case}), file=file, flush=True)
-            gc.collect()  # free the environments of earlier cases
+            gc.collect()
             size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
             resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, resource.RLIM_INFINITY))
             faulthandler.dump_traceback_later(LIMIT, exit=True)
@@ -97,7 +95,6 @@ def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
 
 
 def _guarded(attack: Attack, case: str) -> Outcome:
-    """Run a case, and interrupt it by SIGINT if it takes too long."""
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
         signal.setitimer(signal.ITIMER_REAL, PATIENCE, PATIENCE)
@@ -107,7 +104,7 @@ def _guarded(attack: Attack, case: str) -> Outcome:
         return Outcome(case, "broke a rule", str(problem), text[-4000:])
     except KeyboardInterrupt:
         return Outcome(case, "interrupted")
-    except BaseException as error:  # the attack program itself has failed
+    except BaseException as error:
         return Outcome(case, "failed", f"the attack failed: {place(error)}", traceback.format_exc()[-4000:])
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -115,7 +112,7 @@ def _guarded(attack: Attack, case: str) -> Outcome:
 
 
 def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outcome]:
-    """Run cases in a subprocess, and start a new one after each crash."""
+    """Run cases in a subprocess that restarts after each crash."""
     outcomes: dict[str, Outcome] = {}
     results = folder / "results.txt"
     environment = os.environ | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": str(ROOT), "COLUMNS": "120"}

@@ -1,7 +1,7 @@
-"""Call public functions with random values for each of their arguments.
+"""Call public functions with random values for each argument.
 
-A case is "CALL SEED", or the name of a minimal case in ``minimal_cases.py``. The arguments are read from the
-signatures, so new arguments are included automatically.
+A case is "CALL SEED" or the name of a case in ``minimal_cases.py``. Arguments come from the signatures, so new ones are
+included.
 """
 
 import dataclasses
@@ -35,12 +35,11 @@ OBJECTS: tuple[Any, ...] = (
     Path("x"), (1, 2), ("qpos",), ("nothing",), {"iterations": 1e9}, {"x": torch.zeros(2)}, frozenset(), "auto",
     "hopper", Exception("x"), iter(()), slice(2),
 )  # fmt: skip
-"""Invalid values that a program may pass by mistake."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A function to call, with valid arguments and the keyword arguments that its signature does not list."""
+    """A function, its valid arguments, and keyword arguments that are missing in its signature."""
 
     function: Callable[..., Any]
     valid: Callable[[], dict[str, Any]]
@@ -48,7 +47,7 @@ class Call:
 
     @property
     def names(self) -> list[str]:
-        """Return the names of the arguments to attack; videos are excluded, because a subprocess makes them."""
+        """Return the arguments to attack. Videos are excluded, because a subprocess makes them."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
         return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]
@@ -56,7 +55,7 @@ class Call:
 
 @functools.cache
 def _env(**options: Any) -> lw.Env:
-    """Make an environment that all cases share; a case may leave it in any state."""
+    """Cases share this environment and may leave it in any state."""
     return lw.make("point_mass", horizon=4, **options)
 
 
@@ -113,7 +112,6 @@ def attack(case: str) -> str:
 
 
 def call(name: str, words: dict[str, Any]) -> str:
-    """Call a function with some arguments replaced."""
     shutil.rmtree(HERE / "run", ignore_errors=True)
     shown = f"{name}({', '.join(f'{word}={_shown(value)}' for word, value in words.items())})"
     with warnings.catch_warnings():
@@ -144,7 +142,6 @@ def _shown(value: Any) -> str:
 
 
 def warm_up() -> None:
-    """Train a run that the calls can load, and make every call once."""
     torch.set_num_threads(1)
     HERE.mkdir(exist_ok=True)
     os.chdir(HERE)

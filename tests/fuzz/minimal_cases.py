@@ -14,8 +14,6 @@ def _json(**changes: Any) -> Callable[[bytes], bytes]:
 
 
 def _saved(change: Callable[[dict[str, Any]], Any]) -> Callable[[bytes], bytes]:
-    """Change the content of a torch file."""
-
     def changed(data: bytes) -> bytes:
         content = torch.load(io.BytesIO(data), weights_only=True)
         file = io.BytesIO()
@@ -38,8 +36,6 @@ def _shape(**sizes: Any) -> Callable[[bytes], bytes]:
 
 
 def _info(**changes: Any) -> Callable[[bytes], bytes]:
-    """Change the metadata of a saved episode."""
-
     def changed(data: bytes) -> bytes:
         with np.load(io.BytesIO(data)) as file:
             arrays = dict(file)
@@ -52,7 +48,7 @@ def _info(**changes: Any) -> Callable[[bytes], bytes]:
 
 
 def _header(data: bytes) -> bytes:
-    """Declare a shape of 40 GB in a table's header."""
+    """Declare a shape of 40 GB in the header of an array file."""
     return data.replace(b"(40, 2), }        ", b"(9999999999,), }  ")
 
 
@@ -105,7 +101,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "a run that is a list": ("load", {"run": []}),
     "resume that is a number": ("train", {"resume": 7}),
 }
-"""Cases as (call, arguments); the error must name an argument or its value."""
+"""Cases as (call, arguments). The error must name an argument or its value."""
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",

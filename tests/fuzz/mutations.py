@@ -24,7 +24,7 @@ TEXTS = (
     "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000,
 )  # fmt: skip
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [0], [[1.5]], [None], {"x": 1}, {"": []})
-"""Values of JSON's types; most of them are invalid everywhere."""
+"""Values of JSON's types; most are invalid everywhere."""
 
 
 class Canary:
@@ -38,7 +38,6 @@ class Canary:
 
 
 def mutated_bytes(data: bytes, random: Random) -> bytes:
-    """Delete, repeat, flip, overwrite, insert or cut off bytes at one to four places."""
     for _ in range(random.choice((1, 1, 1, 2, 4))):
         start = random.randrange(len(data) + 1)
         stop = start + random.randint(1, 64)
@@ -52,7 +51,6 @@ def mutated_bytes(data: bytes, random: Random) -> bytes:
 
 
 def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -> Any:
-    """Change, drop or add one entry of a nested value."""
     if isinstance(tree, dict | list) and tree and random.random() < 0.8:
         entries: dict[Any, Any] = dict(tree) if isinstance(tree, dict) else dict(enumerate(tree))
         name, kind = random.choice(list(entries)), random.randrange(8)
@@ -71,7 +69,6 @@ def mutated_value(tree: Any, random: Random, values: tuple[Any, ...] = VALUES) -
 
 
 def mutated_json(data: bytes, random: Random) -> bytes:
-    """Change bytes or an entry of a JSON document, or nest the document too deeply."""
     if random.random() < 0.3:
         return mutated_bytes(data, random)
     if random.random() < 0.05:
@@ -80,7 +77,6 @@ def mutated_json(data: bytes, random: Random) -> bytes:
 
 
 def mutated_csv(data: bytes, random: Random) -> bytes:
-    """Change bytes of a table, or change, drop or add a cell or a row."""
     if random.random() < 0.4:
         return mutated_bytes(data, random)
     long_cell = "1" * 200_000
@@ -102,7 +98,6 @@ _PLAIN = [str(value) for value in (*NUMBERS, *TEXTS) if "\0" not in str(value)]
 
 
 def mutated_xml(data: bytes, random: Random) -> bytes:
-    """Change bytes of a model, or change, drop or add elements or attributes."""
     if random.random() < 0.3:
         return mutated_bytes(data, random)
     root = ET.fromstring(data)
@@ -127,7 +122,6 @@ def mutated_xml(data: bytes, random: Random) -> bytes:
 
 
 def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> bytes:
-    """Drop, repeat, rename, change or replace an entry of an archive."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = [(name, archive.read(name)) for name in archive.namelist()]
     mains = [entry for entry in entries if entry[0].endswith(main)]
@@ -146,7 +140,6 @@ def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> 
 
 
 def mutated_checkpoint(data: bytes, random: Random, canary: Path) -> bytes:
-    """Change bytes, archive entries, the pickle or the saved values of a torch file."""
     kind = random.randrange(4)
     if kind == 0:
         return mutated_bytes(data, random)
@@ -165,7 +158,6 @@ def _saved(array: np.ndarray) -> bytes:
 
 
 def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
-    """Change bytes, archive entries, arrays or the metadata of a saved episode."""
     kind = random.randrange(4)
     if kind == 0:
         return mutated_bytes(data, random)
@@ -186,7 +178,6 @@ def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
 
 
 def mutated_table(data: bytes, random: Random, canary: Path) -> bytes:
-    """Change bytes, the shape, the type or the numbers of a NumPy array file."""
     kind = random.randrange(5)
     if kind == 0:
         return mutated_bytes(data, random)

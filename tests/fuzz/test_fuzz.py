@@ -1,6 +1,6 @@
-"""Damage files, command lines and arguments at random; each must work or raise a documented error.
+"""Damage files, command lines and arguments at random. Each must work or raise a documented error.
 
-The message of a failure names the case and the command that repeats it.
+A failure prints the case and the command that repeats it.
 """
 
 import functools
@@ -35,7 +35,6 @@ MINIMAL: dict[str, Mapping[str, Any]] = {
 
 
 def each(names: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
-    """Pair each program with each of the program's names."""
     return [(program, name) for program in names for name in names[program]]
 
 
@@ -43,7 +42,7 @@ def each(names: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``outcomes(program, random)``, which runs random cases or all minimal cases.
 
-    The folder of the cases has the same path in every run of the tests.
+    The folder of the cases has a constant path.
     """
     cache = getattr(pytestconfig, "cache", None)
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")

@@ -1,5 +1,3 @@
-"""Test on a GPU that steps do not wait for the device, graphs equal direct launches, and runs are reproducible."""
-
 import contextlib
 import gc
 import math
@@ -118,7 +116,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
 
 
 def test_deleted_torch_graph_does_not_break_a_capture() -> None:
-    """Garbage collection may delete the torch graph at any time, and CUDA forbids this during a capture."""
+    """CUDA forbids deleting a graph during a capture, but garbage collection may do so at any time."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)
@@ -148,7 +146,7 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
 
 
 def test_capture_does_not_disturb_running_graphs() -> None:
-    """Graphs share memory that a capture clears. No other call of this test waits until the running graphs end."""
+    """Graphs share memory that a capture clears. Nothing else in this test waits for the running graphs."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs) for graphs in (True, False)
     )
@@ -172,7 +170,7 @@ def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_deterministic_mode_takes_as_much_memory_as_its_estimate() -> None:
+def test_deterministic_mode_uses_the_estimated_memory() -> None:
     def free() -> int:
         gc.collect()
         torch.cuda.empty_cache()
@@ -196,7 +194,7 @@ def test_deterministic_mode_takes_as_much_memory_as_its_estimate() -> None:
         env.rand_reset()
         estimated, taken = sizes.bytes_of(nworld) + nworld * plain, before - free()
         assert 0.8 * estimated < taken < 1.2 * estimated, (nworld, estimated, taken)
-        assert made - free() < 0.1 * taken  # graphs reuse the reserved scratch memory
+        assert made - free() < 0.1 * taken
         del env
     with pytest.raises(ValueError, match=r"nworld=\d+ at most"):
         lw.make("hopper", nworld=int(1.3 * most), device=CUDA, deterministic=True)
@@ -228,7 +226,7 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
 
 
 def test_fault_of_one_humanoid_does_not_change_the_other_worlds() -> None:
-    """Even for only a few worlds, the contact buffer has room for a world with excessive contacts."""
+    """The contact buffer has room for one world with excessive contacts."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

@@ -1,5 +1,3 @@
-"""Compare graphs on a GPU with the C engine, for worlds with different models."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -23,7 +21,7 @@ CHOSEN = [0, 3, *range(50, 150)]  # the number of worlds exceeds the size of a r
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Return factors for the model fields of each world. In the worlds ``CHOSEN``, the factors depend on ``turn``."""
+    """Return factors for the model fields. Only those of the worlds ``CHOSEN`` depend on ``turn``."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size
@@ -38,7 +36,7 @@ def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
 def write(engine: Engine, name: str, factors: np.ndarray) -> None:
     array = engine.arrays[name]
     values = engine.nominal[name].numpy().reshape(1, -1) * factors
-    if name == "geom_quat":  # the rotation makes the floor a slope
+    if name == "geom_quat":
         angles = 0.1 * np.arange(N) / N
         values.reshape(N, -1, 4)[:, 0] = np.stack([np.cos(angles), 0 * angles, np.sin(angles), 0 * angles], axis=1)
     wp.copy(array, wp.array(values.reshape(array.numpy().shape), dtype=array.dtype, device=engine.device))

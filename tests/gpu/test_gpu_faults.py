@@ -1,5 +1,3 @@
-"""Inject faults into some worlds on a GPU at random steps."""
-
 import pytest
 import torch
 

@@ -93,7 +93,7 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 @pytest.mark.parametrize("update", UPDATES)
 def test_equal_returns_give_equal_plan_updates_on_gpu_and_cpu(update: str) -> None:
-    """The returns of the first iteration differ by rounding, which may swap samples that are almost equal."""
+    """Rounding errors may swap samples with almost equal returns."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))

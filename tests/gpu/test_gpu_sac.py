@@ -1,5 +1,3 @@
-"""Test that SAC on a GPU gives equal results with and without graphs, waits once per iteration, and resumes exactly."""
-
 from pathlib import Path
 from typing import Any
 

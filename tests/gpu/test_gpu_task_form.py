@@ -1,6 +1,3 @@
-"""Test that a task with every feature passes ``check_task`` on a GPU, agrees with the C engine, and never waits for
-the device."""
-
 import pytest
 import torch
 from full_task import Full

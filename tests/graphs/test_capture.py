@@ -1,5 +1,3 @@
-"""Test that the phases of a step are captured as graphs that compute the same numbers in the same order."""
-
 import gc
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -21,8 +19,6 @@ def append(digit: int, number_inout: wp.array[int]):
 
 
 class Digits:
-    """Phases that each append a digit to a number and count their calls."""
-
     def __init__(self) -> None:
         self.number = wp.zeros(1, dtype=int, device="cpu")
         self.calls = 0
@@ -45,7 +41,7 @@ def graphs(**options: bool) -> Graphs:
     return Graphs(wp.get_device("cpu"), **options)
 
 
-def test_consecutive_phases_are_captured_as_one_graph_and_replayed_from_the_third_call() -> None:
+def test_consecutive_phases_become_one_graph_in_the_second_call() -> None:
     digits = Digits()
     calls = graphs().sequence([digits.phase(1), digits.phase(2, engine=True), digits.phase(3)])
     assert len(calls) == 1
@@ -92,8 +88,7 @@ def test_threads_divide_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.M
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # the first calls launch kernels for all worlds, the second calls capture these launches, and later calls capture a
-    # graph for each half of the worlds if the phase allows it
+    # first calls launch for all worlds, second calls capture, and later calls split the worlds if the phase allows it
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -104,7 +99,7 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_graph_contains_only_launches_of_its_own_thread() -> None:
-    """While one thread captures, another thread launches, copies, captures and runs a loop, with correct results."""
+    """While one thread captures, another thread launches, copies, captures and runs a loop."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()

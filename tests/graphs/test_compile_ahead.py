@@ -1,5 +1,3 @@
-"""Test that kernels are compiled before the first step, and that progress is shown."""
-
 import os
 import runpy
 import subprocess
@@ -79,5 +77,5 @@ def test_c_engine_also_reports_compilation_for_a_new_task(
     modules = len(list(tmp_path.rglob("*.o")))
     env.step()
     lw.make(str(file), engine="mujoco")
-    assert len(list(tmp_path.rglob("*.o"))) == modules  # the step must compile no additional module
+    assert len(list(tmp_path.rglob("*.o"))) == modules
     assert capsys.readouterr().err == ""

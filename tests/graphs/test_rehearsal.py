@@ -1,4 +1,4 @@
-"""Test rehearsals: a rehearsal replaces functions of Warp to list the kernels that a function would launch."""
+"""Test rehearsals, which list the kernels that a function would launch."""
 
 import inspect
 import subprocess
@@ -46,7 +46,6 @@ def launch(mask: wp.array, row: wp.array, rows: wp.array) -> None:
 
 @pytest.fixture
 def arrays() -> tuple[wp.array, wp.array, wp.array]:
-    """Return arrays for the test kernel: a mask, a row of ones and three rows of zeros."""
     mask = wp.full(3, True, dtype=bool, device="cpu")
     return mask, wp.full(2, 1, dtype=wp.float64, device="cpu"), wp.zeros((3, 2), dtype=wp.float64, device="cpu")
 
@@ -55,7 +54,7 @@ def test_a_rehearsal_lists_launches_without_running_them(arrays: tuple[wp.array,
     flag = wp.zeros(1, dtype=int, device="cpu")
     with rehearse() as rehearsal:
         launch(*arrays)
-        wp.capture_if(flag, on_true=lambda: launch(*arrays))  # this launch does not depend on the flag
+        wp.capture_if(flag, on_true=lambda: launch(*arrays))
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
     assert list(rehearsal.modules) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()
@@ -76,7 +75,6 @@ def test_rehearsal_restores_warp_after_success_and_after_an_error(arrays: tuple[
 
 
 def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
-    """The second rehearsal waits for the first, and Warp is restored at the end."""
     before, order = originals(), []
     inside, release = threading.Event(), threading.Event()
 
@@ -98,7 +96,7 @@ def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.arra
     threads[1].start()
     threads[1].join(0.2)
     assert threads[1].is_alive() and not order
-    launch(*arrays)  # launches of other threads run as usual
+    launch(*arrays)
     assert arrays[2].numpy().all()
     release.set()
     for thread in threads:

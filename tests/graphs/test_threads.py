@@ -1,5 +1,3 @@
-"""Test that environments give the same results in parallel threads as in one thread."""
-
 import threading
 from collections.abc import Callable
 
@@ -12,7 +10,6 @@ CASES = [("warp", "hopper", 1), ("mujoco", "hopper", 2), ("warp", "hopper", 3), 
 
 
 def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
-    """Return observations, rewards and states of environments that run one after the other."""
     found = []
     for _ in range(envs):
         env = lw.make(task, engine=engine, nworld=3, seed=seed)
@@ -30,7 +27,6 @@ def numbers(engine: str, task: str, seed: int, envs: int) -> list[torch.Tensor]:
 
 
 def in_threads(*functions: Callable[[], list[torch.Tensor]]) -> list[list[torch.Tensor] | Exception]:
-    """Run functions in parallel threads; return their results or errors."""
     results: list[list[torch.Tensor] | Exception] = [RuntimeError("did not end")] * len(functions)
 
     def call(i: int) -> None:

@@ -1,5 +1,3 @@
-"""Test that worker threads run calls in parallel and end with their pool, and that errors in calls are raised."""
-
 import gc
 import signal
 import threading
@@ -50,7 +48,7 @@ def test_interrupt_waits_for_running_calls() -> None:
 
     def late() -> None:
         begun.wait()
-        time.sleep(0.05)  # the caller is now waiting
+        time.sleep(0.05)
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)  # type: ignore[arg-type]
         time.sleep(0.2)
         ended.append(True)

@@ -1,4 +1,4 @@
-"""Compile kernels for a GPU; this needs Warp's compiler but no GPU."""
+"""Compile kernels for a GPU. This needs Warp's compiler but no GPU."""
 
 import pkgutil
 from importlib import import_module

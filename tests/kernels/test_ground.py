@@ -1,5 +1,3 @@
-"""Compare heights of a height field with MuJoCo's rays, and changes of the terrain level with their definition."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ OFFSET = (0.5, -0.25, 0.125)
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """Make a height field with random heights and rectangular cells. The geom of the field is not at the origin."""
+    """The cells are rectangular, and the field is not at the origin."""
     spec = mujoco.MjSpec()
     heights = np.random.default_rng(0).uniform(size=NROW * NCOL)
     spec.add_hfield(name="field", size=SIZE, nrow=NROW, ncol=NCOL, userdata=heights)
@@ -28,7 +26,7 @@ def ground(model: mujoco.MjModel) -> wp.array:
 
 
 def ray_heights(model: mujoco.MjModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return heights and normals of the ground at points, (n,) and (n, 3), from MuJoCo's rays, or NaN without a hit."""
+    """Return the ground's heights and normals from MuJoCo's rays, (n,) and (n, 3); NaN without a hit."""
     data, hit, normal = mujoco.MjData(model), np.zeros(1, np.int32), np.zeros(3)
     mujoco.mj_forward(model, data)
     heights, normals = np.full(len(points), np.nan), np.zeros((len(points), 3))
@@ -51,7 +49,7 @@ def look_up(ground: wp.array2d[float], points: wp.array[wp.vec2], out: wp.array2
 
 
 def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
-    """Look up the ground's height, normal and presence, and its distance to a point at height 2 m, (n, 6)."""
+    """Return the ground's height, normal and presence, and its distance to points at 2 m, (n, 6)."""
     out = wp.zeros((len(points), 6), dtype=float, device="cpu")
     wp.launch(look_up, len(points), [ground, wp.array(points, dtype=wp.vec2, device="cpu"), out], device="cpu")
     found: np.ndarray = out.numpy()
@@ -59,7 +57,6 @@ def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
 
 
 def cells() -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum corner of each cell (cells, 2) and the side lengths of a cell (2,)."""
     x = OFFSET[0] + np.linspace(-SIZE[0], SIZE[0], NCOL)
     y = OFFSET[1] + np.linspace(-SIZE[1], SIZE[1], NROW)
     corners = np.stack(np.meshgrid(x[:-1], y[:-1]), axis=-1).reshape(-1, 2)
@@ -137,7 +134,7 @@ def levels(level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint3
 
 
 def next_levels(level: int, walked: float, commanded: float) -> np.ndarray:
-    """Return the next level in worlds with different random numbers; the terrain has five levels of 8 m patches."""
+    """Return the next level for different random numbers. The terrain has five levels of 8 m patches."""
     rng = wp.array(np.arange(2000, dtype=np.uint32).reshape(-1, 1), dtype=wp.uint32, device="cpu")
     out = wp.zeros(len(rng), dtype=int, device="cpu")
     wp.launch(levels, len(rng), [level, walked, commanded, rng, out], device="cpu")

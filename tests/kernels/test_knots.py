@@ -1,5 +1,3 @@
-"""Test how spline plans interpolate between knots, and shift their knots over time."""
-
 import numpy as np
 import pytest
 import warp as wp
@@ -13,7 +11,6 @@ SPLINES = ["zero", "linear", "cubic"]
 def interpolated(
     values: np.ndarray, horizon: int, count: int, spline: str, phase: int = 0, models: int = 1, limit: float = np.inf
 ) -> np.ndarray:
-    """Interpolate actions from knots, (nknot, samples, nact)."""
     _, samples, nact = values.shape
     out = wp.zeros((horizon, samples * models, nact), dtype=float, device="cpu")
     bounds = [wp.array(np.full(nact, sign * limit), dtype=float, device="cpu") for sign in (-1, 1)]

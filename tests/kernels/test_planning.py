@@ -1,5 +1,3 @@
-"""Check planning noise, sample weights at extreme temperatures, and value functions in Warp."""
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,7 @@ from lyceum_warp.kernels import planning, random
 
 @pytest.fixture(scope="module")
 def many() -> MPPI:
-    """Make a planner with many samples and little noise, so that no action is clipped."""
+    """Make a planner with little noise, so that no action is clipped."""
     return MPPI("point_mass", horizon=8, samples=4000, noise=[0.02, 0.05], temperature=1e9)
 
 
@@ -21,7 +19,6 @@ def first_state(seed: int) -> torch.Tensor:
 
 
 def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
-    """The noise is independent between steps, actions, samples, plans and seeds."""
     many.reset(0)
     draws = []
     for seed in (0, 0, 1):
@@ -44,7 +41,7 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
             assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
 
 
-def test_samples_have_distinct_random_keys_that_differ_from_those_of_the_plant() -> None:
+def test_planner_samples_and_plants_have_distinct_random_keys() -> None:
     """Planner and plant have equal seeds and world indices."""
     n = 256
     found, plants = [], []

@@ -1,5 +1,3 @@
-"""Test counter-based random numbers, which depend only on (seed, world, episode, step)."""
-
 import itertools
 
 import numpy as np
@@ -40,7 +38,6 @@ def draw_vectors(rng_inout: wp.array2d[wp.uint32], one_out: wp.array2d[float], m
 
 
 def draws(counters: np.ndarray) -> np.ndarray:
-    """Return four random numbers for each row (seed, world, episode, step)."""
     columns = [wp.array(column, dtype=int, device="cpu") for column in counters.T]
     rng = wp.zeros((len(counters), 1), dtype=wp.uint32, device="cpu")
     values = wp.zeros((len(counters), 4), dtype=float, device="cpu")
@@ -82,7 +79,7 @@ def test_random_numbers_are_independent_along_every_counter(counter: str) -> Non
     check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
 
 
-def test_seeds_of_masked_worlds_depend_on_their_index_plus_an_offset() -> None:
+def test_seed_of_a_world_depends_on_its_index_plus_an_offset() -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
     seed = wp.array([5], dtype=int, device="cpu")
     keys, episodes = [], []

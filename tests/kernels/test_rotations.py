@@ -1,5 +1,3 @@
-"""Compare quaternion functions with MuJoCo's, for random numbers and edge cases."""
-
 from collections.abc import Callable
 
 import mujoco
@@ -54,14 +52,14 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def inputs() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return rows of two quaternions, a vector and an angle in float32; the first rows are edge cases."""
+    """The first rows are edge cases."""
     rng = np.random.default_rng(0)
     a, b = (unit(rng.normal(size=(N, 4))) for _ in range(2))
     v, angle = rng.normal(size=(N, 3)), rng.uniform(-7, 7, N)
     a[:8] = np.vstack([np.eye(4), -np.eye(4)])
     a[8:12] = unit(np.array([[1, 1e-4, -2e-4, 0], [-1, 1e-4, 0, 1e-4], [1e-5, 1, 0, 0], [1, 1e-25, 0, 0]]))
     b[12], b[13] = a[12], -a[13]
-    a[14:16] = unit(np.array([[1, 0, 1, 0], [1, 1, -1, -1]]))  # the second Euler angle is a right angle
+    a[14:16] = unit(np.array([[1, 0, 1, 0], [1, 1, -1, -1]]))
     v[:2], angle[0] = [[0, 0, 0], [1e-6, 0, 0]], 0.0
     return a.astype(np.float32), b.astype(np.float32), v.astype(np.float32), angle.astype(np.float32)
 
@@ -77,7 +75,6 @@ def found() -> dict[str, np.ndarray]:
 
 
 def mju(function: Callable[..., None], size: int, *columns: np.ndarray) -> np.ndarray:
-    """Return the results of a MuJoCo function, row by row."""
     results = np.zeros((N, size))
     for row, *values in zip(results, *(column.astype(float) for column in columns), strict=True):
         function(row, *values)
@@ -88,7 +85,7 @@ def check(found: np.ndarray, expected: np.ndarray, tolerance: float = 2e-6) -> N
     np.testing.assert_allclose(found.reshape(expected.shape), expected, atol=tolerance, rtol=tolerance)
 
 
-def test_products_inverses_and_matrices_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
+def test_quaternion_products_and_inverses_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> None:
     a, b, _, _ = inputs()
     check(found["mul"], mju(mujoco.mju_mulQuat, 4, a, b))
     check(found["inverse"], mju(mujoco.mju_negQuat, 4, a))
@@ -153,8 +150,7 @@ def test_euler_angles_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> Non
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:
-    """Any two components of a uniform unit quaternion form a vector in the plane. The squared length of this vector is
-    U(0, 1), and the angle is uniform."""
+    """Two components of a uniform unit quaternion are a vector with a uniform angle. Its squared length is U(0, 1)."""
     n = 4000
     rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
     wp.launch(draw, n, [rng, quats], device="cpu")

@@ -50,14 +50,12 @@ def flat(observation: dict[str, Any]) -> np.ndarray:
 
 
 def state(domain: str, physics: Any) -> dict[str, np.ndarray]:
-    """Return the state of an episode, and the pose of its target."""
     targets = [np.ravel(getattr(physics.named.model, field)[name]) for field, name in TARGETS.get(domain, ())]
     found = {"qpos": physics.data.qpos, "qvel": physics.data.qvel, "act": physics.data.act}
     return {name: value.copy() for name, value in found.items()} | {"target": np.concatenate([[], *targets])}
 
 
 def begin_segment(physics: Any, action: np.ndarray) -> None:
-    """Round the state to float32, and compute all derived quantities."""
     for name in ("qpos", "qvel", "act"):
         getattr(physics.data, name)[:] = getattr(physics.data, name).astype(np.float32)
     physics.set_control(action)
@@ -72,7 +70,7 @@ def round_target(domain: str, physics: Any) -> None:
 
 
 def stored(domain: str, task: str) -> dict[str, Any]:
-    """Return the arrays of a task to store: (starts, segments, size), or (resets, size) for initial states."""
+    """Return a task's arrays: (starts, segments, size), or (resets, size) for initial states."""
     env = suite.load(domain, task, task_kwargs={"random": 0})
     physics, spec = env.physics, env.action_spec()
     rng = np.random.default_rng(0)

@@ -40,18 +40,15 @@ OPTIONS = (
 
 
 def names(model: mujoco.MjModel, kind: mujoco.mjtObj, count: int) -> list[str]:
-    """Return the names of a model's elements without mjlab's prefix and suffixes."""
     found = [mujoco.mj_id2name(model, kind, i) or "" for i in range(count)]
     return [name.removeprefix("robot/").removesuffix("_joint").replace("_collision", "") for name in found]
 
 
 def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
-    """Return the model's constants, without visual meshes, and the names of its bodies and geoms."""
     kind = mujoco.mjtObj
     bodies = names(model, kind.mjOBJ_BODY, model.nbody)
     geoms = names(model, kind.mjOBJ_GEOM, model.ngeom)
     rows = {
-        # the model has an additional body, which is fixed to the world
         "body": [i for i, name in enumerate(bodies) if name != "terrain"],
         "geom": [i for i, name in enumerate(geoms) if name],
         "actuator": actuators(model),
@@ -64,14 +61,13 @@ def model_arrays(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def actuators(model: mujoco.MjModel) -> list[int]:
-    """Return the indices of the actuators in the order of the joints."""
     joints = names(model, mujoco.mjtObj.mjOBJ_JOINT, model.njnt)[1:]
     own = names(model, mujoco.mjtObj.mjOBJ_ACTUATOR, model.nu)
     return [own.index(name) for name in joints]
 
 
 def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
-    """Run the C engine under random controls; two trajectories start in the default pose, and two start tumbling."""
+    """Two trajectories start in the default pose, and two start tumbling."""
     rng = np.random.default_rng(0)
     home, order = model.key_qpos[0], actuators(model)
     qpos, controls = np.zeros((TRAJECTORIES, SUBSTEPS + 1, 19)), np.zeros((TRAJECTORIES, SUBSTEPS, 12))
@@ -96,8 +92,6 @@ def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
 
 
 def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
-    """Return states under random actions, and the values of mjlab's functions in these states. Contacts are up to
-    date."""
     torch.manual_seed(0)
     robot, command = env.scene["robot"], env.command_manager.get_term("twist")
     feet = env.scene["feet_ground_contact"]
@@ -115,7 +109,7 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         if step % EVERY:
             continue
         kept = {name: value.clone() for name, value in vars(feet._air_time_state).items()}, swing.peak_heights.clone()
-        # update timers and contacts to this state, because they are one substep old after the step
+        # update timers and contacts, which are one substep old after the step
         feet.update(env.physics_dt)
         swing.peak_heights[:] = 0.15 * torch.rand_like(swing.peak_heights)
         origins = env.scene.env_origins
@@ -154,7 +148,6 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
 
 
 def noiseless(env: ManagerBasedRlEnv, group: str) -> torch.Tensor:
-    """Return an observation group without noise."""
     manager = env.observation_manager
     terms = zip(manager.active_terms[group], manager._group_obs_term_cfgs[group], strict=True)
     return torch.cat([term.func(env, **term.params) for _, term in terms], dim=-1)

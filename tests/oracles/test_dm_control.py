@@ -18,7 +18,6 @@ TASKS = ["cartpole", "cartpole_swingup"]
 
 @pytest.fixture(scope="module")
 def dm_cartpole() -> mujoco.MjModel:
-    """Load the file of dm_control's cartpole without importing dm_control."""
     package = importlib.util.find_spec("dm_control")
     if package is None or not package.submodule_search_locations:
         pytest.skip("dm_control, whose cartpole.xml is the reference, is not installed: pip install dm_control")
@@ -44,8 +43,7 @@ def test_model_has_the_masses_joints_and_motor_of_dm_control(
 
 
 class Physics:
-    """A class with the interface of dm_control's cartpole physics, because dm_control's own class (1.0.50) does not
-    support MuJoCo 4."""
+    """dm_control's own class (1.0.50) does not support MuJoCo 4."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self.model, self.data = model, mujoco.MjData(model)
@@ -78,14 +76,13 @@ class Physics:
 
 
 def balance_task(*, swing_up: bool = False, sparse: bool = False) -> Any:
-    """Return dm_control's task, the reference for rewards and observations."""
     module = pytest.importorskip("dm_control.suite.cartpole")
     return module.Balance(swing_up=swing_up, sparse=sparse, random=0)
 
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_cartpole_has_the_reward_and_observation_of_dm_control(shared_env: SharedEnv, sparse: bool) -> None:
-    """The states are random, near the goal and far from it, and some actions exceed the control range."""
+    """Some states are far from the goal, and some actions exceed the control range."""
     env = shared_env("cartpole", nworld=NWORLD, autoreset=False, sparse=sparse)
     theirs, balanced, physics = balance_task(sparse=sparse), balance_task(sparse=True), Physics(env.model)
     rng, rewards = np.random.default_rng(0), []

@@ -1,8 +1,7 @@
-"""Compare dm_control's suite with the package's tasks of the same names, on the C engine.
+"""Compare tasks with dm_control's suite, on the C engine.
 
-dm_control 1.0.50 does not run on MuJoCo 4, so ``store_dm_control.py`` stored five episodes of each task with MuJoCo
-3.17. MuJoCo 3.17 and 4.0 compute equal results for these models: even 40 steps after equal states, numbers differ only
-by rounding to float32. Initial states must have the same distribution.
+dm_control 1.0.50 does not run on MuJoCo 4, so ``store_dm_control.py`` stored episodes with MuJoCo 3.17. For these
+models, the results of both releases differ only by rounding to float32.
 """
 
 import functools
@@ -22,14 +21,13 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep computes; they are not functions of the state."""
+"""Parts of observations that the last substep computes. They are not functions of the state."""
 RESETS = 512
 quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
 
 @functools.cache
 def stored(task: str) -> dict[str, np.ndarray]:
-    """Return the stored arrays of a task, (starts * segments, size)."""
     domain = TASKS[task].removeprefix("dm_")
     name = task.removeprefix(f"dm/{domain}_")
     with np.load(DATA / f"{domain}.npz") as file:
@@ -37,13 +35,11 @@ def stored(task: str) -> dict[str, np.ndarray]:
 
 
 def rows(task: str, name: str) -> np.ndarray:
-    """Stack the arrays of all segments."""
     values = stored(task)[name]
     return values.reshape(values.shape[0] * values.shape[1], *values.shape[2:])
 
 
 def segments(shared_env: SharedEnv, task: str) -> lw.Env:
-    """Return an environment with one world in the first state of each segment."""
     qpos = rows(task, "qpos")
     env = shared_env(task, nworld=len(qpos), autoreset=False)
     state = env.get_state()
@@ -63,7 +59,6 @@ def segments(shared_env: SharedEnv, task: str) -> lw.Env:
 
 
 def current_columns(task: str) -> np.ndarray:
-    """Return the columns of observations that are functions of the state."""
     values = stored(task)
     return np.repeat([part not in LAST_SUBSTEP for part in values["parts"]], values["sizes"])
 
@@ -75,7 +70,6 @@ ARGUMENTS: Mapping[str, tuple[object, ...]] = {
     "dm/swimmer_swimmer15": (15,),
     "dm/swimmer_swimmer6": (6,),
 }
-"""Arguments for dm_control's function that makes a model."""
 FIELDS = (
     "body_mass body_inertia body_pos body_quat body_ipos body_iquat body_invweight0 "
     "geom_type geom_size geom_pos geom_quat geom_friction geom_contype geom_conaffinity geom_condim geom_solref "
@@ -90,7 +84,6 @@ KINDS = {
 
 
 def dm_controls_model(task: str) -> mujoco.MjModel:
-    """Compile the XML that dm_control generates, with the installed MuJoCo."""
     module = importlib.import_module(f"dm_control.suite.{TASKS[task].removeprefix('dm_')}")
     make = getattr(module, "make_model", None) or module.get_model_and_assets
     made = make(*ARGUMENTS.get(task, ()))
@@ -103,7 +96,7 @@ def dm_controls_model(task: str) -> mujoco.MjModel:
 
 @quick
 @pytest.mark.parametrize("task", TASKS)
-def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, task: str) -> None:
+def test_model_equals_the_model_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     ours, theirs = shared_env(task, nworld=len(rows(task, "qpos")), autoreset=False).model, dm_controls_model(task)
     for field in FIELDS:
         kind, count = KINDS[field.partition("_")[0]]
@@ -117,7 +110,7 @@ def test_model_equals_the_model_that_dm_control_makes(shared_env: SharedEnv, tas
             np.testing.assert_allclose(named[0][name], named[1][name], rtol=1e-9, atol=1e-12, err_msg=f"{field} {name}")
     for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
-    # the package's model may have additional keyframes, from which the sizes of MuJoCo Warp's buffers are probed
+    # additional keyframes serve to probe the sizes of MuJoCo Warp's buffers
     np.testing.assert_allclose(ours.key_qpos[: theirs.nkey], theirs.key_qpos, rtol=1e-9, atol=1e-12)
     damping = theirs.dof_damping.copy()
     if task == "dm/finger_spin":  # dm_control sets this field at each reset
@@ -140,8 +133,6 @@ def test_task_has_the_sizes_and_time_steps_of_dm_control(shared_env: SharedEnv, 
     assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
     np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
     np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
-    # an episode has a first step, middle steps and a last step; a discount of 1 shows that the time limit ended the
-    # episode
     assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
 
 
@@ -159,9 +150,7 @@ def test_observations_and_rewards_in_stored_states_equal_those_of_dm_control(sha
 
 @quick
 @pytest.mark.parametrize("task", TASKS)
-def test_step_from_a_stored_state_gives_the_next_state_observation_and_reward_of_dm_control(
-    shared_env: SharedEnv, task: str
-) -> None:
+def test_step_from_a_stored_state_gives_the_results_of_dm_control(shared_env: SharedEnv, task: str) -> None:
     env = segments(shared_env, task)
     env.step()
     check_positions(env, rows(task, "next_qpos"), "qpos")
@@ -173,7 +162,6 @@ def test_step_from_a_stored_state_gives_the_next_state_observation_and_reward_of
 
 
 def check_positions(env: lw.Env, wanted: np.ndarray, name: str) -> None:
-    """Compare a part of the state with numbers that were rounded to float32."""
     found = env.state_space.split(env.get_state())[name].numpy()
     error = np.abs(found - wanted).max(1)
     print(f"{env.task.name} {name}: {np.quantile(error, [0.5, 0.95, 1.0])}")
@@ -182,10 +170,8 @@ def check_positions(env: lw.Env, wanted: np.ndarray, name: str) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
-def test_forty_steps_from_each_stored_state_give_the_final_state_of_dm_control(
-    shared_env: SharedEnv, task: str
-) -> None:
-    """The segments together contain all steps of five episodes."""
+def test_forty_steps_give_the_final_states_of_dm_control(shared_env: SharedEnv, task: str) -> None:
+    """The segments contain all steps of five episodes."""
     env = segments(shared_env, task)
     for _ in range(40):
         env.step()
@@ -195,7 +181,7 @@ def test_forty_steps_from_each_stored_state_give_the_final_state_of_dm_control(
 @quick
 @pytest.mark.parametrize("task", TASKS)
 def test_initial_states_have_the_distribution_of_dm_control(shared_env: SharedEnv, task: str) -> None:
-    """The two-sample Kolmogorov-Smirnov test compares the distribution of each number of the initial state."""
+    """The two-sample Kolmogorov-Smirnov test compares each number of the initial state."""
     theirs = stored(task)
     env = lw.make(task, nworld=RESETS)
     env.rand_reset(seed=1)
@@ -231,14 +217,14 @@ def test_reward_of_acrobot_depends_on_the_energy_if_energy_weight_is_set(shared_
     np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
 
 
-def test_balance_effort_of_acrobot_predicts_the_effort_of_optimal_feedback(shared_env: SharedEnv) -> None:
-    """The feedback with the least effort for the linearized task spends the effort that ``balance_effort`` predicts."""
+def test_balance_effort_of_acrobot_is_the_effort_of_optimal_feedback(shared_env: SharedEnv) -> None:
+    """The optimal feedback is that of the linearized task."""
     env = shared_env("dm/acrobot_swingup", nworld=1, autoreset=False)
     effort, dt = np.asarray(env.task.params["balance_effort"]).reshape(4, 4), env.timestep
     state = env.get_state()
     parts = env.state_space.split(state)
     step = np.zeros((5, 4))
-    for column in range(5):  # the effect of each part of the state, and of the action
+    for column in range(5):
         x = 1e-3 * np.eye(5)[column]
         parts["qpos"][0], parts["qvel"][0] = torch.tensor(x[:2]), torch.tensor(x[2:4])
         env.set_state(state)

@@ -1,8 +1,7 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-Both engines run the same task functions on different physics: the C engine uses float64, and the Warp engine uses
-float32. With pyramidal friction cones, trajectories differ, because MuJoCo and MuJoCo Warp use different contact
-frames for a capsule on a plane. These tests use elliptic cones, which do not depend on the contact frame.
+The C engine uses float64, and the Warp engine float32. The tests use elliptic friction cones: for pyramidal cones,
+trajectories differ, because MuJoCo and MuJoCo Warp use different contact frames for a capsule on a plane.
 """
 
 import dataclasses
@@ -30,7 +29,7 @@ quick = pytest.mark.quick(
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
-"""Parts of observations that depend on constraint forces; these forces are exact only to the solver's tolerance."""
+"""Parts of observations that depend on constraint forces, which are exact only to the solver's tolerance."""
 
 
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
@@ -40,14 +39,18 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters by task. With these parameters, some episodes end under random field values. For some robots, the solver's
-limits are raised, because the engines agree up to rounding only if the solver converges."""
+"""With these parameters, some episodes end under random field values.
+
+Some solver limits are raised, because the engines agree up to rounding only if the solver converges.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """Bounds on the difference between the engines after one substep. The difference in a world is the maximum over
-    coordinates; the bounds apply to its quantiles over the worlds."""
+    """Bounds on the difference between the engines after one substep.
+
+    A world's difference is the maximum over coordinates. The bounds apply to quantiles over the worlds.
+    """
 
     qpos_median: float
     qpos_p95: float
@@ -55,8 +58,8 @@ class Bounds:
     qvel_p95: float
 
 
-# Each bound is three to four times the difference measured with mujoco and mujoco_warp 4.0.0 on the CPU, over 320
-# states along random rollouts. A float32 position of about 1 has a precision of 6e-8.
+# Each bound is three to four times the difference that was measured with mujoco and mujoco_warp 4.0.0 on the CPU, over
+# 320 states of random rollouts. A float32 position of about 1 has a precision of 6e-8.
 ONE_STEP = {  #                         measured: median and 95 % quantile of qpos, then of qvel
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
@@ -73,14 +76,12 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "h1_velocity": Bounds(2.4e-7, 7e-7, 1.7e-5, 1.8e-4),  # 5.9e-8, 1.7e-7; 4.3e-6, 4.5e-5
     "spot_velocity": Bounds(2.4e-7, 8e-7, 8e-6, 2e-4),  # 6.0e-8, 1.9e-7; 2.0e-6, 5.1e-5
     "t1_velocity": Bounds(2.5e-7, 1.4e-6, 4.4e-5, 3.4e-4),  # 6.2e-8, 3.5e-7; 1.1e-5, 8.6e-5
-    # on a height field, the C engine creates a contact per triangle, and MuJoCo Warp creates at most four per pair of
-    # geoms
+    # on a height field, the C engine creates a contact per triangle, and MuJoCo Warp at most four per pair of geoms
     "g1_rough_velocity": Bounds(3e-4, 8e-3, 8e-2, 2.2),  # 8.5e-5, 2.2e-3; 2.1e-2, 5.6e-1
     "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
-    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points between two boxes than the C engine
-    # does
+    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points between two boxes
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
@@ -95,7 +96,7 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "pusher": Bounds(1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
     "reach": Bounds(5e-7, 2e-6, 5e-5, 2e-4),  # 1.5e-7, 5.8e-7; 1.5e-5, 5.8e-5
     "reacher": Bounds(1.2e-7, 5e-7, 7e-7, 2e-6),  # 3.5e-8, 1.6e-7; 2.0e-7, 6.5e-7
-    # only MuJoCo Warp merges flex contacts that are less than 1 mm apart, so strong squeezes differ
+    # only MuJoCo Warp merges flex contacts less than 1 mm apart, so strong squeezes differ
     "soft_ball": Bounds(3e-8, 3e-3, 2.5e-6, 6e-1),  # 8.5e-9, 8.8e-4; 6.8e-7, 1.8e-1
     "swimmer": Bounds(8e-8, 2e-7, 6e-7, 3e-6),  # 2.4e-8, 5.7e-8; 2.0e-7, 9.0e-7
     "walker2d": Bounds(1.2e-7, 2e-7, 2e-5, 8e-5),  # 3.7e-8, 5.8e-8; 6.2e-6, 2.4e-5
@@ -123,16 +124,15 @@ ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module i
 
 @dataclasses.dataclass
 class Engines:
-    """A task on both engines with one substep per step, and states that both engines can represent."""
+    """A task on both engines with one substep per step."""
 
     task: str
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """States along a random rollout of the task, (NWORLD, size) each, rounded to float32."""
+    """States along a random rollout, (NWORLD, size) each, rounded to float32, so that both engines represent them."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
-        """Return random actions for every world; some of them exceed the control range."""
         return random_action(self.c, rng, 1.3)
 
 
@@ -146,7 +146,6 @@ def random_action(env: lw.Env, rng: np.random.Generator, reach: float) -> torch.
 
 
 def rollout_states(env: lw.Env) -> list[torch.Tensor]:
-    """Return every sixth state of 60 random steps, including fallen and reset worlds."""
     rng, states = np.random.default_rng(0), []
     counters = [env.state_space.parts[name] for name in ("step", "key", "episode")]
     for i in range(60):
@@ -162,7 +161,7 @@ def rollout_states(env: lw.Env) -> list[torch.Tensor]:
 
 @pytest.fixture(scope="module", params=DEVICES)
 def device(request: pytest.FixtureRequest) -> str:
-    """Return the Warp engine's device; the C engine always runs on the CPU."""
+    """Return the Warp engine's device. The C engine always runs on the CPU."""
     return str(request.param)
 
 
@@ -193,7 +192,7 @@ def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
     """Compare numbers with a tolerance of 1e-5, and flags exactly.
 
-    The tolerance for force parts of the observation is 1e-3 of their maximum, or 0.01 N if a task clips them.
+    Force parts may differ by 1e-3 of their maximum, or by 0.01 N if a task clips them.
     """
     forces = torch.zeros(ours["obs"].shape[1], dtype=torch.bool)
     for part in (force_parts or {}).values():
@@ -213,7 +212,7 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
             field = torch_view(getattr(batch, name))
-            if field.stride(0) == 0:  # a model field that all worlds share
+            if field.stride(0) == 0:
                 continue
             kept.append((field, field.clone()))
             field.copy_(value)
@@ -268,7 +267,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # the state contains fields of the last substep, so the reset phases recompute these fields on each engine
+            # the state contains fields of the last substep, so the reset phases recompute them
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()
@@ -280,7 +279,7 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
 
 @quick
 def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> None:
-    """Both engines get equal states and actions, and ONE_STEP contains the bounds."""
+    """Both engines start from equal states. ONE_STEP contains the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
     errors: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": []}
@@ -310,7 +309,7 @@ def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> 
 def test_engines_agree_over_fifty_steps_with_inputs_and_randomized_models(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
-    """Masses, frictions and gravity are random, ``control`` writes inputs, and the fifty steps take 150 substeps."""
+    """Masses, frictions and gravity are random, ``control`` writes inputs, and fifty steps take 150 substeps."""
     c = lw.make(task, nworld=8, seed=1, **params)
     warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
     start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0

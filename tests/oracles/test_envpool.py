@@ -1,7 +1,6 @@
-"""Compare tasks of dm_control's suite with EnvPool's versions of them, on the C engine.
+"""Compare tasks with EnvPool's versions of dm_control's suite, on the C engine.
 
-``store_envpool.py`` stored steps of EnvPool 1.2.5, which has MuJoCo 3.6. The test computes states from the stored
-observations and sets them.
+``store_envpool.py`` stored steps of EnvPool 1.2.5, which has MuJoCo 3.6.
 """
 
 import functools
@@ -71,12 +70,10 @@ QPOS: Mapping[str, Callable[[Parts], np.ndarray]] = {
     "acrobot": acrobot, "cartpole": cartpole, "cheetah": without_x, "finger": finger, "hopper": without_x,
     "pendulum": pendulum, "walker": walker,
 }  # fmt: skip
-"""By domain: a function that computes positions from parts of observations. In other domains, the part "position" is
-used."""
+"""Functions that compute positions from observations. Other domains use the part "position"."""
 
 
 def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
-    """Compute states from observations, and set them."""
     state = env.get_state()
     parts = {name: observation[:, part] for name, part in env.obs_space.parts.items()}
     fields = env.state_space.split(state)
@@ -106,7 +103,7 @@ def test_a_step_has_envpools_observations_and_rewards(shared_env: SharedEnv, tas
     columns = np.delete(np.arange(env.obs_space.size), touch)  # the touch sensors belong to the last substep
     np.testing.assert_allclose(env.get_obs()[:, columns], before[:, columns], rtol=1e-6, atol=1e-6)
     env.action.copy_(torch.from_numpy(action))
-    if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 in another way than later releases do
+    if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 differently
         set_states(env, domain, after.astype(float))
         found, rewards = env.get_obs(), env.get_reward(env.get_state(), env.action, env.get_state())
     else:

@@ -1,8 +1,7 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both environments run the same C code in float64. From equal states and warm starts, observations and rewards of both
-environments differ only by rounding to float32. The tests read the tasks' attribute ``gymnasium`` and Gymnasium's
-registry and signatures, so they include new tasks automatically.
+Both run the same C code in float64, so from equal states, results differ only by rounding to float32. The tests find
+tasks by their attribute ``gymnasium``, so new tasks are included.
 """
 
 import dataclasses
@@ -47,10 +46,10 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """A mixin for Gymnasium environments: they use the Newton solver and the contact forces of the last substep.
+    """A mixin for Gymnasium environments: the Newton solver, and contact forces of the last substep.
 
-    Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, a sensor makes MuJoCo compute this
-    field in the sensor stage of the substep, as in lyceum_warp.
+    Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, MuJoCo computes it in the sensor
+    stage, as in lyceum_warp.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -67,13 +66,12 @@ class SensorStage:
 
 
 def unchanged(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Return Gymnasium's class."""
     return load_env_creator(OWN[IDS[task]].entry_point)
 
 
 @functools.cache
 def oracle(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Return Gymnasium's class, with the mixin ``SensorStage`` if the task observes contact forces."""
+    """Return Gymnasium's class, with the mixin if the task observes contact forces."""
     base = unchanged(task)
     return type(base.__name__, (SensorStage, base), {}) if task in WITH_FORCES else base
 
@@ -87,7 +85,6 @@ def make_theirs(task: str, **options: Any) -> Any:
 
 
 def relative_error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Return the largest difference divided by max(1, |value|)."""
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs)), initial=0.0))
 
 
@@ -119,8 +116,6 @@ class Step:
 
 
 class Pair:
-    """A world and Gymnasium's environment that take the same actions from the same states."""
-
     def __init__(self, ours: lw.Env, theirs: Any, seed: int = 0) -> None:
         assert ours.nworld == 1
         self.ours, self.theirs = ours, theirs
@@ -131,8 +126,7 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Reset Gymnasium's environment, apply a change, and round its state to float32. Put both environments into
-        this state, with the same warm start."""
+        """Reset Gymnasium's environment, apply a change, and put both environments into this float32 state."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -151,7 +145,7 @@ class Pair:
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
-        """Return a random action; one action in four exceeds the control range."""
+        """Return a random action. One action in four exceeds the control range."""
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
@@ -175,8 +169,6 @@ class Pair:
         )
 
     def run(self, nstep: int, restart: int = 200) -> list[Step]:
-        """Step both environments from the same state. After a termination, or after ``restart`` steps, restart from a
-        new state."""
         steps: list[Step] = []
         since = restart
         for _ in range(nstep):
@@ -209,7 +201,7 @@ def test_every_gymnasium_id_of_a_task_is_registered() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
-    """Some random actions exceed the control range."""
+    """Some actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)
@@ -230,7 +222,7 @@ def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """Return the expected metric (a distance, a height or a position) if Gymnasium's info contains it."""
+    """Return the expected metric (a distance, height or position) if Gymnasium's info contains it."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:
@@ -255,7 +247,7 @@ def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
 
 
 def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
-    """The test places the cart at the end of the rail, because under random actions, the pole falls too early."""
+    """Under random actions, the pole falls too early for the cart to reach the end."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:
@@ -272,7 +264,7 @@ def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
 
 
 def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
-    """The test places the cylinder beside the hand, which random actions hardly ever reach."""
+    """The cylinder starts beside the hand, because random actions hardly ever reach it."""
     pair = Pair(make_ours("pusher"), make_theirs("pusher"))
     model, (low, high) = pair.theirs.model, pair.theirs.model.jnt_range[:7].T
 
@@ -318,8 +310,7 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of the bounds of termination. A case checks either all bounds, or a single
-    range; the other ranges are then too wide to matter."""
+    """Random states lie on both sides of the bounds. A case checks all bounds, or a single range."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -371,7 +362,7 @@ RESETS = [
 @pytest.mark.quick("1.0")
 @pytest.mark.parametrize(("task", "times"), RESETS)
 def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: float) -> None:
-    """Both environments reset 2,000 times, with Gymnasium's noise scale and with three times this scale."""
+    """The noise scale is Gymnasium's, and three times as large."""
     option = {} if times == 1.0 else {"reset_noise_scale": keywords(task)["reset_noise_scale"] * times}
     theirs, ours = make_theirs(task, **option), make_ours(task, nworld=250, **option)
     theirs.reset(seed=0)
@@ -390,7 +381,7 @@ def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: floa
 def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     """Compare the distributions of two (n, k) samples, for each coordinate and each pair of coordinates.
 
-    Fewer than one in 10,000 pairs of samples from equal distributions exceeds these thresholds; the seeds are fixed.
+    Fewer than one in 10,000 pairs of equally distributed samples exceeds these thresholds. The seeds are fixed.
     """
     n = len(a)
     assert a.shape == b.shape and np.isfinite(b).all()
@@ -398,16 +389,14 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     fixed = spread < 1e-9
     np.testing.assert_allclose(b[:, fixed], a[:, fixed], atol=1e-6)
     a, b = ((x - middle)[:, ~fixed] / spread[~fixed] for x in (a, b))
-    # compare means and standard deviations; the kurtosis determines the error of a standard deviation
+    # the kurtosis determines the error of a standard deviation
     kurtosis = np.mean(a**4, axis=0)
     assert np.abs(b.mean(axis=0)).max() < 5.0 * math.sqrt(2.0 / n)
     assert (np.abs(b.std(axis=0) - 1.0) < 5.0 * np.sqrt((kurtosis - 1.0) / (2.0 * n))).all()
-    # compare the extremes of bounded coordinates
     bounded = kurtosis < 2.3
     for edge in (np.min, np.max):
         assert np.abs(edge(a, axis=0) - edge(b, axis=0))[bounded].max(initial=0.0) < 0.05 * np.ptp(a)
     assert (ks_distance(a, b) < 2.6 * math.sqrt(2.0 / n)).all()
-    # compare the correlations of coordinates, and the distances of pairs of coordinates from the mean
     assert np.abs(np.corrcoef(a.T) - np.corrcoef(b.T)).max() < 5.5 * math.sqrt(2.0 / n)
     pairs = np.array(list(itertools.combinations(range(a.shape[1]), 2)))[:200].T
     lengths = [np.hypot(x[:, pairs[0]], x[:, pairs[1]]) for x in (a, b)]
@@ -415,26 +404,23 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
 
 
 def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the Kolmogorov-Smirnov distance of two (n, k) samples, for each column."""
     order = np.argsort(np.concatenate([a, b]), axis=0)
     ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
     return np.abs(ranks).max(axis=0)
 
 
 IGNORED = {("humanoid_standup", "uph_cost_weight")}
-"""Parameters that Gymnasium 1.4 documents but ignores."""
+"""Gymnasium 1.4 documents these parameters but ignores them."""
 
 
 @functools.cache
 def keywords(task: str) -> dict[str, Any]:
-    """Return the keyword parameters of Gymnasium's class with defaults, without the model file and the camera."""
     parameters = inspect.signature(unchanged(task)).parameters.values()
     others = ("xml_file", "default_camera_config")
     return {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD and p.name not in others}
 
 
 def variants(default: Any) -> list[Any]:
-    """Return values that differ from the default."""
     if isinstance(default, bool):
         return [not default]
     if isinstance(default, tuple):
@@ -455,8 +441,6 @@ PARAMETERS = [
 
 @dataclasses.dataclass(frozen=True)
 class Numbers:
-    """Results of 60 steps of Gymnasium's environment, with fixed actions and its own resets."""
-
     shape: tuple[int, ...]
     steps: list[tuple[float, float, bool]]
 
@@ -493,13 +477,13 @@ def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> No
 
 VALUES = [(task, name, value) for task, name, values in PARAMETERS for value in values]
 DIFFERENT = [task for task in TASKS if task != "walker2d" and not task.startswith("humanoid")]
-"""Tasks without those whose parameters are similar to the hopper's or to the ant's."""
+"""Tasks except those with parameters similar to the hopper's or the ant's."""
 
 
 @pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if task in DIFFERENT))
 @pytest.mark.parametrize(("task", "name", "value"), VALUES, ids=["-".join(map(str, case)) for case in VALUES])
 def test_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, value: Any) -> None:
-    """Compare the effect on results and on the size of the observation."""
+    """Compare results and the size of the observation."""
     default, changed = default_numbers(task), numbers(task, **{name: value})
     ours, theirs = make_ours(task, autoreset=True, **{name: value}), make_theirs(task, **{name: value})
     pair = Pair(ours, theirs)
@@ -534,7 +518,7 @@ def halve_timestep(root: ET.Element) -> None:
 @pytest.mark.quick("ant", "hopper")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_changed_model_file_has_the_same_effect_as_in_gymnasium(task: str, tmp_path: Path) -> None:
-    """The option ``model`` accepts a modified copy of the file, as Gymnasium's ``xml_file`` does."""
+    """The option ``model`` accepts a modified copy, as Gymnasium's ``xml_file`` does."""
     tree = ET.parse(make_theirs(task).fullpath)
     halve_timestep(tree.getroot())
     for motor in tree.getroot().iterfind("actuator/*"):

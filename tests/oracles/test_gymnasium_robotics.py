@@ -1,7 +1,6 @@
 """Compare tasks with their Gymnasium-Robotics environments on the C engine.
 
-A task names its environment in the attribute ``gymnasium``. For a new task, add the states that reach its bonuses to
-SPECIAL.
+For a new task, add the states that reach its bonuses to SPECIAL.
 """
 
 import dataclasses
@@ -41,7 +40,6 @@ TASKS = sorted(ENTRIES)
 
 
 def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
-    """Return the largest difference, relative to the larger of 1 and the value."""
     return float(np.max(np.abs(ours - theirs) / np.maximum(1.0, np.abs(theirs))))
 
 
@@ -51,7 +49,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Return the Gymnasium-Robotics class with the task's changes to the model, and without duplicate contact pairs."""
+    """Return Gymnasium-Robotics' class with the task's changes to the model, and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -67,37 +65,27 @@ def oracle_class(name: str) -> type[MujocoEnv]:
 
 
 def registered(name: str) -> Any:
-    """Make the unchanged Gymnasium-Robotics environment."""
     return gymnasium.make(IDS[name], disable_env_checker=True).unwrapped
 
 
 class Pair:
-    """A world and a Gymnasium-Robotics environment that get the same states and controls.
-
-    Args:
-        ours: The world.
-        theirs: Their environment.
-    """
-
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Fields of Gymnasium-Robotics' model, copied before random resets change them."""
+        """Copies of fields of the model, made before random resets change them."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps of the current episode after which Gymnasium-Robotics reported the goal as achieved."""
+        """Number of steps of the episode in which Gymnasium-Robotics reported the goal as achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # this package computes controls in float32, and Gymnasium-Robotics computes them in float64; the difference
-        # would grow over many steps
+        # the controls are float32 here and float64 in Gymnasium-Robotics; the difference would grow over many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
 
     def reset(self) -> None:
-        """Begin an episode in a random initial state of this package."""
         self.ours.rand_reset()
         first = self.ours.obs[0].numpy().astype(np.float64)
         self.put()
@@ -105,7 +93,6 @@ class Pair:
         self.goals = 0
 
     def put(self, **values: np.ndarray) -> None:
-        """Put both environments into the state of the world, after replacing some of its fields."""
         model, data = self.theirs.model, self.theirs.data
         for field, own in self.places.items():
             getattr(model, field)[:] = own
@@ -127,8 +114,7 @@ class Pair:
         self.ours.set_state(state)
 
     def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Place a mocap body; Gymnasium-Robotics' model may have a mocap body, a fixed body or a site with this
-        name."""
+        """Place a mocap body. Gymnasium-Robotics may have a mocap body, a fixed body or a site with this name."""
         model, data = self.theirs.model, self.theirs.data
         if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
             model.site(body).pos[:] = pos
@@ -146,7 +132,6 @@ class Pair:
         self.goals += self.success
 
     def check(self) -> None:
-        """Compare the results of a step, up to float32 rounding."""
         assert relative_error(self.ours.obs[0].numpy().astype(np.float64), self.obs) <= 1e-5
         assert relative_error(self.ours.reward.item(), float(self.reward)) <= 1e-5
         assert self.ours.terminated.item() == self.terminated
@@ -167,14 +152,13 @@ class Special:
     """A state that random actions do not reach."""
 
     reward: float
-    """Expected reward of Gymnasium-Robotics' next step, within 0.1."""
+    """Reward of Gymnasium-Robotics' next step, within 0.1."""
     joints: dict[str, float]
     """Positions of joints by their names."""
     moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
     """Poses of mocap bodies by their names."""
 
     def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
-        """Return the fields in which this state differs from the environment's current state."""
         parts = env.state_space.split(env.get_state()[0])
         fields = {name: parts[name].numpy().copy() for name in ("qpos", "mocap_pos", "mocap_quat")}
         for joint, value in self.joints.items():
@@ -186,13 +170,13 @@ class Special:
 
 
 def pen(reward: float, angle: float, up: float) -> Special:
-    """Return a state in which the pen has a given height above the palm and a given angle to the target."""
+    """Return a state with the pen at a height above the palm and at an angle to the target."""
     turn = (np.pi / 2 - angle) / 2
     return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
 
 
 def ball(reward: float, up: float, aside: float) -> Special:
-    """Return a state in which the ball has a given height and lateral distance; the target is 0.2 m above the table."""
+    """Return a state with the ball at a height and a lateral distance. The target is 0.2 m above the table."""
     joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
     return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
 
@@ -222,8 +206,7 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, **params)``, which pairs an environment of this package with the Gymnasium-Robotics
-    environment ``theirs``."""
+    """Return ``make_pair(theirs, **params)``, which pairs a world with the original environment ``theirs``."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -234,7 +217,7 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
 
 @pytest.mark.quick("adroit_pen")
 def test_results_under_random_actions_equal_gymnasium_robotics(make_pair: MakePair) -> None:
-    """Run five episodes of 200 steps from random initial states; a quarter of the actions are out of range."""
+    """Run five episodes of 200 steps. A quarter of the actions are out of range."""
     pair = make_pair()
     for _ in range(5):
         pair.reset()
@@ -249,9 +232,8 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_unchanged_gymnasium_robotics_environment_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """Compare with the unchanged model. The comparison ends at the first contact that the package's model lacks, or
-    that the unchanged model counts twice."""
+def test_unchanged_gymnasium_robotics_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+    """The unchanged model has contacts that the package's model lacks, and counts some contacts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
@@ -310,7 +292,6 @@ KINDS = {
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
-    """Return the fields in which elements of the two models differ, with the elements' names."""
     found = set()
     for kind, named in KINDS.items():
         fields = [name for name in dir(theirs) if name.startswith(f"{kind}_")]
@@ -323,7 +304,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
 
 
 def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv, task: str) -> None:
-    """The models may differ only in bodies that a reset moves, duplicate pairs, and the order of sensor sites."""
+    """Only bodies that a reset moves, duplicate pairs, and the order of sensor sites may differ."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
     others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}
@@ -351,8 +332,7 @@ def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePai
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_have_the_distribution_of_gymnasium_robotics(task: str) -> None:
-    """Compare the numbers in the first observations: their distributions by Kolmogorov-Smirnov tests, and their
-    correlations."""
+    """Kolmogorov-Smirnov tests compare the numbers of the first observations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
     ours = env.obs.numpy().astype(np.float64)

@@ -1,7 +1,7 @@
-"""Compare go1_velocity with mjlab's Mjlab-Velocity-Flat-Unitree-Go1: model, observations, rewards and terminations.
+"""Compare go1_velocity with mjlab's Mjlab-Velocity-Flat-Unitree-Go1.
 
-The tests read mjlab's numbers from a file that store_go1.py wrote, so they do not need mjlab. The stored poses and
-contacts are current, because mjlab ran a forward pass before each observation.
+The tests read mjlab's numbers from a file that ``store_go1.py`` wrote. Before each observation, mjlab ran a forward
+pass, so the stored poses and contacts are current.
 """
 
 from pathlib import Path
@@ -42,8 +42,7 @@ def test_model_has_the_options_of_mjlab(shared_env: SharedEnv, name: str) -> Non
 
 @pytest.mark.parametrize("i", range(4))
 def test_trajectories_of_the_model_equal_those_of_mjlab(shared_env: SharedEnv, i: int) -> None:
-    """Run 200 substeps of a standing and of a tumbling robot under equal controls. Both robots collide with
-    themselves."""
+    """Run 200 substeps of a standing and of a tumbling robot. Both robots collide with themselves."""
     model = shared_env("go1_velocity").model
     data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
     data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]
@@ -74,8 +73,6 @@ def stored(name: str) -> torch.Tensor:
 
 
 def mjlabs_states(env: lw.Env, *, heading: bool) -> torch.Tensor:
-    """Return the stored states. If ``heading`` is set, the states contain headings from which the commands follow;
-    otherwise, they contain the commands."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(stored("qpos"))
@@ -111,7 +108,6 @@ def test_stored_states_contain_every_kind_of_command_and_contact() -> None:
 
 @pytest.mark.parametrize("term", TERMS)
 def test_reward_terms_equal_those_of_mjlab(env: lw.Env, term: str) -> None:
-    """Each term is compared alone, with mjlab's weight; all other weights are zero."""
     after = mjlabs_states(env, heading=False)
     before = after.clone()
     if term == "soft_landing":  # mjlab's forces are current, and this package's forces are one substep old

@@ -1,5 +1,3 @@
-"""Compare a PPO update with rsl_rl's, from equal weights and samples."""
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -19,14 +17,13 @@ STEPS, N = 12, 8
 
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
-    """Use float64, because Adam in float32 would amplify rounding errors of tiny gradients to full steps."""
+    """Use float64: Adam in float32 would amplify rounding errors of tiny gradients to full steps."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
 
 
 def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
-    """Return samples near the policy and the value function, so that some ratios and values are clipped."""
     env, generator = ppo.env, torch.Generator().manual_seed(1)
 
     def drawn(*shape: int) -> torch.Tensor:
@@ -44,7 +41,6 @@ def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
 
 
 def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
-    """Return rsl_rl's PPO with the same weights, and an rsl_rl storage with the samples."""
     env = ppo.env
     other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
     for network in (other.actor, other.critic):

@@ -1,5 +1,3 @@
-"""Test that damaged, invalid and missing files of policies and states raise one-line errors."""
-
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +66,6 @@ def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: 
 
 
 def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
-    """Flip one bit of a file, and read the file; return None if reading raises an error."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     path.write_bytes(damaged)
@@ -82,7 +79,7 @@ def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
 @pytest.mark.quick("61")
 @pytest.mark.parametrize("every", [61, 7])
 def test_checkpoint_with_a_flipped_bit_has_the_same_content_or_raises_an_error(run: Run, every: int) -> None:
-    """One of the tested bits marks a zip entry as a folder, so that torch reads no numbers."""
+    """One of the bits marks a zip entry as a folder, so torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
@@ -100,7 +97,7 @@ def test_missing_checkpoint_raises_an_error_that_names_it(run: Run) -> None:
         load(run)
 
 
-def test_policy_of_a_custom_class_is_loaded_into_a_given_policy_and_has_no_value_function(tmp_path: Path) -> None:
+def test_policy_of_a_custom_class_is_loaded_into_a_given_policy(tmp_path: Path) -> None:
     policy, run = Mine(), Run.create(tmp_path / "run", {})
     torch.nn.init.constant_(policy.gain, 3.0)
     run.save(policy_content(1, policy), {})
@@ -112,7 +109,7 @@ def test_policy_of_a_custom_class_is_loaded_into_a_given_policy_and_has_no_value
 
 
 def test_network_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
-    """A value function, stored as a policy, stands in for a policy class that a later release adds."""
+    """A value function stands for a policy class that a later release adds."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)

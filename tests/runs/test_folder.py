@@ -80,7 +80,7 @@ def test_run_can_be_created_in_a_folder_that_a_killed_process_left(
     assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
 
 
-def test_creating_a_run_in_a_folder_with_temporary_files_of_other_programs_raises_an_error(tmp_path: Path) -> None:
+def test_folder_with_temporary_files_of_other_programs_is_not_used(tmp_path: Path) -> None:
     (tmp_path / "mine.tmp").write_text("")
     with pytest.raises(ValueError, match="is not an empty folder"):
         Run.create(tmp_path, {})

@@ -28,7 +28,7 @@ with run_lock(Path(sys.argv[1])):
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[str]:
-    """Lock a folder in another process; yield the description of this process in errors, and kill it at the end."""
+    """Lock a folder in another process; yield the name of this process in errors."""
     command = [sys.executable, "-c", OTHER, str(folder)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "locked\n"
@@ -47,7 +47,7 @@ def test_second_writer_raises_an_error_until_the_first_writer_ends(tmp_path: Pat
         pass
 
 
-def test_run_that_another_process_writes_is_resumed_only_with_the_flag_take_over(
+def test_run_of_another_process_is_resumed_only_with_take_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
@@ -65,9 +65,7 @@ def test_run_that_another_process_writes_is_resumed_only_with_the_flag_take_over
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_flag_take_over_prints_an_error_if_the_flag_resume_is_missing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_take_over_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--take-over has no effect without --resume")
 
@@ -83,9 +81,7 @@ def test_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content, who", [('{"host": "far", "pid": 3}', "process 3 on far"), ("half", "another process")]
 )
-def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
-    content: str, who: str, tmp_path: Path
-) -> None:
+def test_lock_of_another_host_is_taken_over_only_on_request(content: str, who: str, tmp_path: Path) -> None:
     (tmp_path / "lock").write_text(content)
     with pytest.raises(ValueError, match=f"is being written by {who}"), run_lock(tmp_path):
         pass
@@ -94,7 +90,7 @@ def test_lock_of_another_host_is_taken_over_only_with_the_flag_take_over(
 
 
 def test_writer_stops_writing_after_its_lock_was_taken_over(tmp_path: Path) -> None:
-    """When the old writer ends, it does not remove the lock of the new writer."""
+    """The old writer must not remove the new writer's lock."""
     folder, found = tmp_path / "run", {}
 
     def callback(iteration: lw.Iteration) -> None:

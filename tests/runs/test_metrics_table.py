@@ -12,7 +12,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_a_new_column_is_empty_in_earlier_rows(table: Path) -> None:
-    """A newer task or package may add a column, and the order of the names in a row does not matter."""
+    """A newer task or package may add a column. The order of the names in a row does not matter."""
     append_row(table, {"iteration": 1, "kl": 0.5})
     append_row(table, {"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
     append_row(table, {"metrics/forward, m": 2.5, "iteration": 3})
@@ -62,7 +62,7 @@ def test_file_that_is_not_a_metrics_table_raises_an_error(table: Path) -> None:
         read_metrics(table)
 
 
-@pytest.mark.parametrize("place", [0, 12, 16])  # a byte in each of the two column names, and one in a number
+@pytest.mark.parametrize("place", [0, 12, 16])
 def test_metrics_table_with_an_invalid_byte_raises_an_error_and_is_not_changed(place: int, table: Path) -> None:
     damaged = bytearray(b"iteration,value\n1,2\n2,3\n")
     damaged[place] = 0xFF

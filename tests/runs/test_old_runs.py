@@ -1,5 +1,3 @@
-"""Test that runs of earlier releases are loaded, evaluated and resumed."""
-
 import shutil
 from pathlib import Path
 
@@ -45,7 +43,7 @@ def test_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.Cap
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
 def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: float, old_run: Path) -> None:
-    """The file of the old run lacks the scale, which was 1 / (1 - gamma)."""
+    """The old run lacks the scale, which was 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")
@@ -63,8 +61,7 @@ def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: flo
 
 @pytest.fixture(params=["command", "python", "task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations by release 0.1. The run was started from the command line, from Python with a user's
-    model, or with a task file whose model, mesh and table exist only in the run's copy."""
+    """A run of two iterations by release 0.1: from the command line, from Python, or with a task file."""
     return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
 
 
@@ -90,7 +87,7 @@ def test_run_of_release_0_1_is_resumed_and_new_training_starts_from_it(run: Path
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
-    """A run of rsl_rl's PPO, whose algorithm name was rsl-rl in early releases."""
+    """A run of rsl_rl's PPO. Early releases named its algorithm rsl-rl."""
     return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
 
 

@@ -1,5 +1,3 @@
-"""Test that every pretrained policy matches its task and reaches its stored return."""
-
 import json
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""Test how a run's folder stores the replay buffer, and that killed saves lose nothing."""
-
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +13,7 @@ from lyceum_warp.runs.folder import Run
 
 
 def made(replay: int = 80) -> lw.SAC:
-    """Make a learner with 12 steps per iteration; by default its buffer holds 20 steps."""
+    """Make a learner with 12 steps per iteration. By default, its buffer holds 20 steps."""
     config = lw.SACConfig(
         hidden=(8,), value_hidden=(8,), num_steps=12, warmup=40, batch=16, updates=1, replay=replay, mean_every=0
     )
@@ -23,7 +21,6 @@ def made(replay: int = 80) -> lw.SAC:
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
-    """Return the rows of metrics.csv without measured times."""
     rows = Run.open(folder).rows()
     return [{k: v for k, v in row.items() if "time" not in k and k != "samples_per_second"} for row in rows]
 
@@ -46,8 +43,7 @@ class Killed(BaseException):
 def test_run_continues_identically_after_a_save_was_killed_at_any_point(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Each iteration overwrites 12 of 20 steps, so a save has begun to replace files of the last checkpoint when the
-    process is killed."""
+    """Each iteration overwrites 12 of 20 steps, so a killed save has already replaced files of the last checkpoint."""
     sac, function = made(), getattr(owner, name)
     left = [calls]
 
@@ -82,10 +78,8 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
-def test_save_writes_only_those_files_of_the_buffer_that_have_grown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The buffer of 200 steps is saved in files of 4 steps each, and each iteration fills three files."""
+def test_save_writes_only_files_of_the_buffer_that_have_grown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The buffer of 200 steps has files of 4 steps. Each iteration fills three files."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 

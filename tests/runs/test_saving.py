@@ -1,5 +1,3 @@
-"""Test when a run is saved, and that a run with an unwritable folder ends with its last save intact."""
-
 import os
 import resource
 import shutil
@@ -37,7 +35,7 @@ def test_saving_takes_a_small_fraction_of_the_training_time(
         saver = Saver(run, check, npg)
         saver.save()
     assert saver.saved == 0 and not saver.due()
-    saver._seconds = seconds  # simulate the save of a larger run, which takes this long
+    saver._seconds = seconds
     saver._when -= 0.9 * wait
     assert not saver.due()
     saver._when -= 0.2 * wait
@@ -45,8 +43,6 @@ def test_saving_takes_a_small_fraction_of_the_training_time(
 
 
 def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
-    """Train, and call a function after the third iteration."""
-
     def callback(iteration: lw.Iteration) -> None:
         if iteration.iteration == 3:
             at_three()
@@ -57,8 +53,8 @@ def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
 
 
 def test_run_ends_with_its_last_save_intact_if_a_file_cannot_be_written(six: Path, tmp_path: Path) -> None:
-    """A file size limit simulates a full disk; it allows the policy's file, but not the larger file of the complete
-    state."""
+    """A file size limit simulates a full disk. The policy's file fits, but the larger file of the complete state does
+    not."""
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     size = 2 * os.path.getsize(six / "policy.pt")
     assert size < os.path.getsize(six / "checkpoint.pt")

@@ -1,5 +1,3 @@
-"""Test that a run copies its task, and which files are used after the task is moved or edited."""
-
 import shutil
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, m
 
 @pytest.fixture
 def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return a folder with a task, at the same path in every run of the tests, so that Warp reuses compiled kernels."""
+    """Return a folder at a constant path, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
     shutil.rmtree(folder)
@@ -47,16 +45,15 @@ def env_of(folder: Path) -> Env:
 
 
 def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    """Return the line in which eval prints the returns."""
     capsys.readouterr()
     assert cli.main(["eval", *arguments, "--episodes", "2"]) == 0
     output = capsys.readouterr()
-    print(output.err)  # the function ``refused`` reads this line
+    print(output.err)
     return next(line for line in output.out.splitlines() if line.strip().startswith("return"))
 
 
 def test_run_resumes_after_its_task_was_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The included files, meshes and tables are moved together with the task."""
+    """The included files, meshes and arrays are moved together with the task."""
     out = trained(folder)
     before = returns(capsys, str(out))
     assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
@@ -172,7 +169,7 @@ def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: py
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
+def test_run_started_from_another_run_uses_its_copy_of_the_model(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"
@@ -191,7 +188,7 @@ def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
     env = env_of(warm)
     assert np.array_equal(env.model.body_mass, masses)
     assert cli.main(["train", "--resume", str(warm), "--iterations", "2", *QUIET]) == 0
-    if not moved:  # the task is given by name, so its current version is used
+    if not moved:
         arguments[4] = str(folder / "new")
         assert cli.main([*arguments, "1", str(folder / "mine" / "slide.py")]) == 0
         env = env_of(folder / "new")
@@ -210,7 +207,7 @@ def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytes
 
 
 def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Training uses the changed files, because the algorithm was constructed after the change."""
+    """The algorithm was constructed after the change, so training uses the changed files."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:
@@ -233,7 +230,7 @@ def test_run_of_a_task_without_a_file_is_evaluated_with_a_given_task(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
-    Run.open(tmp_path / "run").amend(task=None)  # the configuration has no task if the task is a class in a notebook
+    Run.open(tmp_path / "run").amend(task=None)
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,
@@ -261,7 +258,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""Edits of a task's files during training; None deletes the file."""
+"""Edits of a task's files during training. None deletes the file."""
 
 
 def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Test that the code and files in a run folder of another user are not used until the folder is trusted."""
+"""Test that code and files in another user's run are not used until the run is trusted."""
 
 import json
 import shutil
@@ -29,8 +29,7 @@ SOURCE = tiny_task.changed(
 
 @pytest.fixture(scope="module")
 def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make runs of a task file and of a task of the package, at a constant path, so that Warp reuses compiled
-    kernels."""
+    """Make the runs at a constant path, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
     shutil.rmtree(folder)
@@ -46,15 +45,13 @@ def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture
 def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Return the path of a file that the task file writes when it is executed."""
     monkeypatch.setenv("WITNESS", str(tmp_path / "witness"))
     return tmp_path / "witness"
 
 
 @pytest.fixture
 def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Copy the task file's run as another user would receive it: at another path, untrusted and without the original
-    files."""
+    """Copy the run as another user would receive it: at another path, untrusted and without the original files."""
     folder = made / "theirs"
     shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(made / "own", folder, copy_function=shutil.copy)
@@ -96,9 +93,9 @@ def test_run_of_another_user_raises_an_error_until_it_is_trusted(
     assert records - {str(tmp_path / "out")} == {str(theirs)}
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
     arguments = [word if word != "2" else "3" for word in command]
-    assert cli.main(arguments) == 0  # the run is trusted from now on
+    assert cli.main(arguments) == 0
     (theirs / "task" / "told.py").write_text(SOURCE + "\n")
-    assert cli.main(command) == 2  # a copy with changes is not trusted
+    assert cli.main(command) == 2
 
 
 def outside(folder: Path) -> Path:
@@ -166,7 +163,7 @@ def test_run_with_an_edited_path_raises_an_error(
     with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
         run_env(run, saved.options, saved.params)
     assert str(file) in str(refusal.value) and not witness.exists()
-    if attack in (names_a_table, names_a_model):  # a given task would also read the file that the run's folder names
+    if attack in (names_a_table, names_a_model):  # a given task would also read the file that the run names
         with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
             run_env(run, saved.options, saved.params, task="point_mass")
 
@@ -213,15 +210,13 @@ def test_run_of_a_task_of_the_package_is_used_without_being_trusted(
     assert not (tmp_path / "state").exists()
 
 
-def test_policy_of_an_untrusted_run_is_loaded_and_exported_without_the_task(
-    theirs: Path, witness: Path, tmp_path: Path
-) -> None:
+def test_policy_of_an_untrusted_run_is_loaded_without_its_task(theirs: Path, witness: Path, tmp_path: Path) -> None:
     assert lw.load(theirs).nobs == 1 and lw.load_value(theirs).discount > 0
     assert cli.main(["export", str(theirs), "--to", str(tmp_path / "policy.pt2")]) == 0
     assert not witness.exists() and not (tmp_path / "state").exists()
 
 
-def test_training_continues_with_a_message_if_the_run_cannot_be_added_to_trusted_runs(
+def test_training_continues_if_the_run_cannot_be_added_to_trusted_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "file").write_text("")

@@ -27,7 +27,6 @@ CALM = {
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Run the program in the documentation page, and return its global variables."""
     pytest.importorskip("onnxruntime")
     (program,) = re.findall(r"^```python title=robot_loop.py\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
     assert "lyceum_warp" not in program
@@ -37,7 +36,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
-    """Make a policy with nonzero actions and observation statistics."""
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, normalize=True)
     policy.observe(env.obs + 0.3 * torch.randn(200, 1, env.obs_space.size))
     with torch.no_grad():
@@ -122,6 +120,6 @@ def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pyte
     assert [part["name"] for part in json.loads(found["observations"])] == list(env.obs_space.parts)
     assert json.loads(found["actions"]) == [{"name": name, "size": 1} for name in env.action_space.parts]
     capsys.readouterr()
-    run.amend(task="nowhere.py")  # a policy can also be exported without its task
+    run.amend(task="nowhere.py")
     assert metadata() == {}
     assert "the file has no metadata on the robot: " in capsys.readouterr().err

@@ -1,5 +1,3 @@
-"""Test that only a transition ends an episode, and that both engines report the same reason for the same fault."""
-
 import gymnasium
 import numpy as np
 import pytest
@@ -59,7 +57,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Leave(lw.Task):
-    """A pole that may start in states for which ``terminated`` holds, and may leave these states."""
+    """A pole that may start in terminal states, and may leave them."""
 
     model, frame_skip, obs, horizon = "inverted_pendulum.xml", 2, {"angle": 1, "speed": 1}, 50
 
@@ -76,7 +74,7 @@ def test_terminal_initial_state_does_not_end_an_episode(autoreset: bool, engine:
     assert env.get_terminated(fresh).any()
     assert not env.done.any() and not env.done_reason.any()
     env.step()
-    assert env.terminated.any()  # some worlds stay in states for which ``terminated`` holds
+    assert env.terminated.any()
     if not autoreset:
         assert torch.equal(env.terminated, env.get_terminated(env.get_state()))
     env.set_state(fresh)
@@ -108,7 +106,7 @@ def test_reset_clears_the_done_reason_of_the_previous_episode() -> None:
 
 @pytest.mark.quick("0")
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_rule_gives_the_same_result_alone_and_after_other_rules(seed: int) -> None:
+def test_rule_gives_the_same_result_after_other_rules(seed: int) -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
     check_task(Leave, steps=20, seed=seed, nworld=8)
     check_task(Leave, steps=20, seed=seed, nworld=8, checks=[rule])

@@ -1,4 +1,4 @@
-"""Define tasks in a notebook. The cells of a notebook run in one module, and may run repeatedly."""
+"""Define tasks in a notebook, where cells run in one module and may run repeatedly."""
 
 import sys
 import types
@@ -17,7 +17,7 @@ from lyceum_warp.binding.registry import find_task
 def notebook(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
     module = types.ModuleType("notebook_of_a_test")
     monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))  # undo the registrations of cells after the test
+    monkeypatch.setattr(registry, "_tasks", dict(registry._tasks))
     return module
 
 
@@ -26,7 +26,7 @@ def run_cell(module: types.ModuleType, file: Path) -> None:
 
 
 def test_notebook_task_uses_the_functions_of_its_own_cell(notebook: types.ModuleType, tmp_path: Path) -> None:
-    """Each cell redefines World, Params and observe, and only the first cell defines evaluate."""
+    """Every cell redefines World, Params and observe. Only the first cell defines evaluate."""
     evaluate = "def evaluate(s: World, p: Params) -> float:\n    return 1.0"
     first = tiny_task.with_function(evaluate)
     second = tiny_task.changed(("s.qpos[0]", "2.0"), ("class Tiny", "class Other"))

@@ -1,5 +1,3 @@
-"""Test that invalid values of a task affect only their own world, are reported, and never enter the state."""
-
 import mujoco
 import pytest
 import torch
@@ -124,12 +122,12 @@ def test_invalid_randomized_model_field_causes_a_fault_in_its_world(engine: str)
     env.set_params(damping=[1.0, -1.0, 1.0])
     env.rand_reset()
     state = env.get_state()
-    assert torch.equal(env.get_obs(state), env.obs)  # get_obs computes the same observations from the state
+    assert torch.equal(env.get_obs(state), env.obs)
     env.step()
     assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.MODEL, 0]
     assert env.reward[1] == 0.0
     env.set_params(damping=[1.0, 1.0, 1.0])
-    env.step()  # this episode began with the invalid model field
+    env.step()
     env.step()
     assert env.done_reason.tolist() == [0, 0, 0]
     assert env.fault_counts["model"] == 2

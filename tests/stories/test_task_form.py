@@ -1,7 +1,4 @@
-"""Test features of tasks through the public interface, such as randomized dynamics, observation groups and noise.
-
-``check_task`` tests each feature for any task; the tests in this file need particular tasks.
-"""
+"""``check_task`` tests each feature for any task. These tests need particular tasks."""
 
 from pathlib import Path
 from typing import Any
@@ -27,7 +24,7 @@ def copied(s: PuckWorld, action: Row[float], p: PuckParams, ctrl: Row[float]):
 
 
 class DrawnWithControl(Drawn):
-    """``Drawn`` with a ``control``, so that rollouts run step by step."""
+    """The ``control`` makes rollouts run step by step."""
 
     control = copied
 
@@ -55,7 +52,7 @@ def draw_wind(s: WindyWorld, p: PuckParams, rng: Row[wp.uint32]):
 
 
 class Windy(lw.Task):
-    """A random force that is chosen at a reset and stays constant during the episode."""
+    """The random force is chosen at a reset and stays constant during the episode."""
 
     model = Drawn.model
     obs = {"x": 1, "wind": 1}
@@ -147,10 +144,10 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     for _ in range(3):
         env.step(torch.full((3, 3), 0.5))
     qpos = env.field("qpos")
-    assert torch.equal(qpos[0, 1], qpos[2, 1])  # the robot is still in the air
+    assert torch.equal(qpos[0, 1], qpos[2, 1])
     assert not torch.equal(qpos[0], qpos[1])
     env.rand_reset()
-    assert torch.equal(env.field("body_mass"), masses)  # resets do not randomize this field again
+    assert torch.equal(env.field("body_mass"), masses)
     state = env.get_state()
     assert torch.equal(state[:, env.state_space.parts["body_mass"]].float(), masses)
     other = env.replicate(nworld=3)
@@ -189,7 +186,7 @@ def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
         assert env.done_reason.tolist() == [0, int(reason), 0]
         assert env.truncated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
         for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
-            assert torch.isfinite(obs).all()  # learners never receive non-finite values, not even after the reset
+            assert torch.isfinite(obs).all()
         if reason == lw.Done.OBSERVATION:
             assert torch.equal(env.final_obs[1], good)
         assert torch.equal(env.get_state()[others], fine.get_state()[others])
@@ -200,7 +197,7 @@ def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
     assert torch.isfinite(judged).all()
     env.set_params(**{name: value})
     assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
-    assert env.get_reward(before, action, after)[1] != 0  # the fault does not persist after its episode
+    assert env.get_reward(before, action, after)[1] != 0
 
 
 def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
@@ -208,7 +205,7 @@ def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
     tip = env.field("site_xpos")[:, 0, 0]
     for count in range(2, 12):
         env.rand_reset()
-        assert (tip >= 0.2).all()  # the task rejects half of the initial states
+        assert (tip >= 0.2).all()
         assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
@@ -402,17 +399,14 @@ class Tiny"""),
 
 
 def line(text: str) -> tuple[str, str]:
-    """Add a line to the class."""
     return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
 
 
 def field(text: str) -> tuple[str, str]:
-    """Add a field to World."""
     return "    qpos: Row[float]", f"    qpos: Row[float]\n    {text}"
 
 
 def function(text: str) -> tuple[str, str]:
-    """Add a Warp function before the class."""
     return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 

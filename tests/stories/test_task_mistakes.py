@@ -1,8 +1,4 @@
-"""Test that mistakes in a task file raise one-line errors that suggest a fix, and that the corrected file is loaded.
-
-Tests in tests/binding check the same messages, module by module. New users of the package made the mistakes in this
-file.
-"""
+"""New users of the package made the mistakes in this file."""
 
 from pathlib import Path
 
@@ -36,7 +32,6 @@ OWN_WORLD = "@wp.struct\nclass World:\n    qpos: Row[float]\n"
 
 
 def function(text: str) -> tuple[str, str]:
-    """Add a Warp function before the class."""
     return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 

@@ -1,5 +1,3 @@
-"""Test a user's task file that uses every feature of tasks, on both engines."""
-
 import importlib.util
 import sys
 from pathlib import Path
@@ -219,10 +217,9 @@ def test_user_task_with_scaled_actions_and_rk4_passes_check_task(module: ModuleT
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_fields_equal_mj_forward_of_the_state(module: ModuleType, engine: str) -> None:
-    """All fields are current after a step, an automatic reset, set_state and rand_reset, even if the task does not read
-    them.
+    """The fields are current after a step, an automatic reset, set_state and rand_reset.
 
-    The accelerometer's value is from the start of the last substep, and matches the state only after a reset.
+    The accelerometer's value is from the last substep, and matches the state only after a reset.
     """
     env = lw.make("follow_target", engine=engine, nworld=3, horizon=5, fields=["xipos"])
     centers = env.field("xipos")

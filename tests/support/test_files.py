@@ -29,7 +29,7 @@ def test_an_exception_while_writing_leaves_the_old_file_intact(tmp_path: Path) -
 def test_replacing_a_file_is_tried_again_after_a_failure(
     failures: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A network drive, or a program that has the file open, may cause the first failure."""
+    """The first failure may come from a network drive, or from a program that has the file open."""
     path, replace = tmp_path / "file.txt", os.replace
     errors = [PermissionError(13, "Permission denied", str(path)) for _ in range(failures)]
 

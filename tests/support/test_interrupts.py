@@ -8,7 +8,7 @@ from lyceum_warp.support.interrupts import Interrupted, obeyed, postponed, signa
 
 @pytest.fixture(autouse=True)
 def default_handlers() -> Iterator[None]:
-    """Set the default handlers, because a shell that starts the tests in the background makes them ignore SIGINT."""
+    """Set the default handlers, because programs in a shell's background ignore SIGINT."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -37,7 +37,7 @@ def test_postponed_signal_raises_interrupted_at_the_end_of_the_context() -> None
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signals_are_ignored_after_the_caller_has_raised_interrupted() -> None:
+def test_signals_are_ignored_after_interrupted_was_raised() -> None:
     with signals():
         with pytest.raises(Interrupted), postponed() as noted:
             signal.raise_signal(signal.SIGTERM)

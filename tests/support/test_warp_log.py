@@ -1,5 +1,3 @@
-"""Test that Warp starts without printing that a CUDA driver is missing."""
-
 import subprocess
 import sys
 
@@ -16,7 +14,7 @@ def printed(program: str) -> tuple[str, str]:
 
 @pytest.mark.long
 @WITHOUT_GPU
-def test_missing_driver_prints_nothing_for_a_cpu_environment_and_one_line_for_a_gpu() -> None:
+def test_missing_driver_prints_one_line_only_for_a_gpu() -> None:
     program = """
 from lyceum_warp import Row
 import lyceum_warp as lw

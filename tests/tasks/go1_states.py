@@ -24,7 +24,7 @@ STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": 
 
 
 class State:
-    """The parts of all worlds' states in float64, and the heights and contacts of feet from MuJoCo's kinematics."""
+    """All worlds' states in float64, and the heights and contacts of feet from MuJoCo's kinematics."""
 
     def __init__(self, env: lw.Env) -> None:
         parts = env.state_space.split(env.get_state())

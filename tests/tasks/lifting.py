@@ -1,4 +1,4 @@
-"""Script a lift: inverse kinematics for waypoints, and actions that move a robot's servos to them."""
+"""Script a lift: find joint positions for waypoints, and move a robot's servos to them."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ import lyceum_warp as lw
 def joints_at(
     model: mujoco.MjModel, qpos: np.ndarray, site: str, place: np.ndarray, axes: np.ndarray, joints: Sequence[str]
 ) -> np.ndarray:
-    """Return joint positions (nq,) that give a site a position and axes (as columns), by damped least squares."""
+    """Return joint positions (nq,) that give a site a position and axes (as columns)."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]
@@ -35,7 +35,6 @@ def joints_at(
 
 
 def follow(env: lw.Env, targets: np.ndarray, steps: int) -> None:
-    """Move the servos' targets to the given targets (nworld, nu) at maximum speed."""
     speed = torch.tensor(env.model.actuator_ctrlrange[:, 1])
     for _ in range(steps):
         act = env.state_space.split(env.get_state())["act"]

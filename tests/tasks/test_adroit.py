@@ -1,7 +1,4 @@
-"""Test parameters and metrics of adroit_hammer, adroit_door and adroit_relocate.
-
-The tests in oracles/test_gymnasium_robotics.py compare these tasks with the original ones.
-"""
+"""oracles/test_gymnasium_robotics.py compares these tasks with the original ones."""
 
 from typing import Any
 
@@ -13,7 +10,6 @@ from conftest import SharedEnv
 import lyceum_warp as lw
 
 GOALS = {"adroit_hammer": "success_distance", "adroit_door": "success_angle", "adroit_relocate": "success_distance"}
-"""The success threshold of each task."""
 
 
 @pytest.fixture(params=sorted(GOALS))
@@ -22,7 +18,6 @@ def task(request: pytest.FixtureRequest) -> str:
 
 
 def steps(env: lw.Env, n: int = 5) -> None:
-    """Take random actions with a fixed seed."""
     rng = torch.Generator().manual_seed(0)
     for _ in range(n):
         env.step(2 * torch.rand(env.action.shape, generator=rng) - 1)
@@ -36,8 +31,7 @@ def test_sum_of_the_metrics_equals_the_reward(shared_env: SharedEnv, task: str) 
 
 
 def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: SharedEnv, task: str) -> None:
-    """With the settings for planners, the reward rises as the palm approaches. In the task itself, the reward rises
-    with the palm's distance, as in the original task."""
+    """With the settings for planners, the reward rises as the palm approaches. In the original tasks, it falls."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
     for each in (env, turned):
@@ -51,7 +45,7 @@ def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: Sh
 
 
 def test_task_succeeds_if_a_distance_is_below_its_threshold(task: str) -> None:
-    """Each threshold is above the distance in some worlds, and below the distance in others."""
+    """Each threshold is above the distance in some worlds only."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)
     assert not env.success.any()

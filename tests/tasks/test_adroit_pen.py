@@ -1,7 +1,4 @@
-"""Test the adroit_pen task's parameters and memory.
-
-The tests in oracles/test_gymnasium_robotics.py compare this task with the original one.
-"""
+"""oracles/test_gymnasium_robotics.py compares this task with the original one."""
 
 import numpy as np
 import torch
@@ -32,7 +29,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
     parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
     env.set_state(state)
     assert not env.reward.any()
-    # set_state restores the lagged fields, so the new positions have an effect only after a step
+    # set_state restores the lagged fields, so new positions have an effect only after a step
     counts, terms = np.zeros(n), set()
     for _ in range(6):
         env.step(torch.zeros(n, 24))
@@ -49,7 +46,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
 
 
 def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
-    """The count of steps at the goal is part of the state, and a reset clears it."""
+    """The count of steps at the goal is part of the state. A reset clears it."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
     still = torch.zeros(3, 24)
     for i in range(25):
@@ -72,17 +69,16 @@ def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
 
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
-    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of the cosines of both angles
+    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of both angles' cosines
     assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
     assert 0.7 < upright.min() < 0.95
 
 
 def test_target_has_no_contacts() -> None:
-    """A pen inside the target moves as if the target were far away."""
     env = lw.make("adroit_pen", engine="mujoco", nworld=2, nthread=1)
     state = env.get_state()
     parts = env.state_space.split(state)
-    parts["qpos"][:, 26] = 0.2  # move the pen along x, into the target
+    parts["qpos"][:, 26] = 0.2
     parts["mocap_pos"][1, 3:] = 5.0
     env.set_state(state)
     for _ in range(10):

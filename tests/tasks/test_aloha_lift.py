@@ -1,7 +1,4 @@
-"""Test the aloha_lift task: its model, a scripted lift, and resets.
-
-The tests in test_panda_lift.py check the reward terms.
-"""
+"""test_panda_lift.py checks the reward terms of aloha_lift."""
 
 import mujoco
 import numpy as np
@@ -28,8 +25,7 @@ def test_simple_shapes_replace_colliding_meshes_without_changing_masses(shared_e
 
 
 def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) -> None:
-    """The grippers move to the handles, close and rise, and the task succeeds within an episode with a reward of nearly
-    6.5."""
+    """The grippers move to the handles, close and rise. The task succeeds with a reward of nearly 6.5."""
     env = shared_env("aloha_lift", nworld=3, autoreset=False)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))
@@ -61,7 +57,7 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) ->
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("place", [None, (0.05, 0.01, 0.1)])
 def test_random_resets_change_the_position_and_yaw_of_the_pot(place: tuple[float, ...] | None) -> None:
-    """Both handles stay within reach, because the yaw is a random angle around 90 degrees."""
+    """The yaw is a random angle around 90 degrees, so both handles stay within reach."""
     env = lw.make("aloha_lift", engine="mujoco", nworld=1000, **({} if place is None else {"place": place}))
     env.rand_reset(0)
     qpos, qvel = positions(env)

@@ -1,5 +1,3 @@
-"""Test the arm_hand_pickup task: Lyceum's formulas with the corrected goal distance, and a scripted grasp."""
-
 import importlib.util
 
 import mujoco
@@ -17,7 +15,6 @@ GOAL = np.array([0.0, 0.2, 0.5])
 
 
 def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarray]:
-    """Return the positions of ball, palm and fingers, from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in positions(env, state)[0]:
         data.qpos[:] = row
@@ -29,7 +26,7 @@ def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarr
 
 
 def reward(place: dict[str, np.ndarray]) -> np.ndarray:
-    """Return Lyceum's reward, with the corrected distance to the goal in its second stage."""
+    """Return Lyceum's reward, with a corrected goal distance in its second stage."""
     ball = place["ball"]
     palm = np.minimum(np.linalg.norm(place["palm"] - ball, axis=1), 0.5) / 0.5
     goal = np.minimum(np.linalg.norm(GOAL - ball, axis=1), 0.5) / 0.5
@@ -38,7 +35,6 @@ def reward(place: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def put_balls(env: lw.Env, place: np.ndarray) -> torch.Tensor:
-    """Return the current states, with the ball at a given position in each world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:12] = torch.from_numpy(place)
     return state
@@ -60,7 +56,7 @@ def test_arm_starts_above_the_ball_and_stands_still_with_zero_actions(shared_env
 
 
 def test_observation_and_reward_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """In the compared states, the ball is in the hand, at the hand's edge, or far away."""
+    """The ball is in the hand, at the hand's edge, or far away."""
     env = shared_env("arm_hand_pickup", nworld=64, autoreset=False)
     rng = np.random.default_rng(0)
     state = env.get_state()
@@ -87,7 +83,7 @@ def test_random_resets_change_the_position_of_the_ball() -> None:
 
 
 def test_task_succeeds_after_a_fifth_of_a_second_at_the_goal(shared_env: SharedEnv) -> None:
-    """The test moves the ball back before each step, because a step moves the ball by millimetres."""
+    """A step moves the ball by millimetres, so the test moves it back before each step."""
     env = shared_env("arm_hand_pickup", nworld=2, autoreset=False)
     for i in range(10):
         assert not env.success.any(), i
@@ -99,7 +95,7 @@ def test_task_succeeds_after_a_fifth_of_a_second_at_the_goal(shared_env: SharedE
 
 
 def test_scripted_hand_picks_up_the_ball_and_holds_it_at_the_goal(shared_env: SharedEnv) -> None:
-    """The scripted hand descends and closes; inverse kinematics with the hand's Jacobian then moves it to the goal."""
+    """The hand descends and closes. Inverse kinematics then moves it to the goal."""
     model = shared_env("arm_hand_pickup").model
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

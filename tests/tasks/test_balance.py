@@ -1,5 +1,3 @@
-"""Test the balance tasks: servos, pushes, the capture point, the G1's gait, and plans that keep robots upright."""
-
 import mujoco
 import numpy as np
 import pytest

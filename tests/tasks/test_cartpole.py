@@ -1,7 +1,4 @@
-"""Test the cartpole task: resets, success and the end of an episode.
-
-The tests in oracles/test_dm_control.py compare the rewards with dm_control's.
-"""
+"""oracles/test_dm_control.py compares cartpole's rewards with dm_control's."""
 
 import numpy as np
 import torch
@@ -12,7 +9,6 @@ import lyceum_warp as lw
 
 
 def put(env: lw.Env, qpos: np.ndarray) -> None:
-    """Put each world at rest with given positions of cart and pole."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qpos"].copy_(torch.from_numpy(qpos))

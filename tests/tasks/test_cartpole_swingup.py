@@ -1,5 +1,4 @@
-"""Test the cartpole_swingup task: Lyceum's formulas and resets. The tests in oracles/test_dm_control.py compare the
-model with dm_control's."""
+"""oracles/test_dm_control.py compares the model with dm_control's."""
 
 import mujoco
 import numpy as np
@@ -12,17 +11,14 @@ import lyceum_warp as lw
 
 NWORLD = 256
 
-# Lyceum's formulas in NumPy; the pole's direction comes from MuJoCo's rotation matrix, not from its angle
-
 
 def tolerance(x: np.ndarray, margin: float, value_at_margin: float = 0.1) -> np.ndarray:
-    """Compute dm_control's tolerance around zero with the quadratic sigmoid, as used in Lyceum."""
+    """Compute dm_control's tolerance around zero with the quadratic sigmoid."""
     scaled = np.abs(x) / margin * np.sqrt(1.0 - value_at_margin)
     return np.where(scaled < 1.0, 1.0 - scaled**2, 0.0)
 
 
 def pole_direction(model: mujoco.MjModel, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the zz and xz elements of the pole's rotation matrix in each world."""
     data, matrices = mujoco.MjData(model), []
     for row in qpos:
         data.qpos[:] = row
@@ -40,7 +36,7 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
 
 
 def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """The states are random, and some lie beyond the rail and the margins; some actions exceed the control range.
+    """Some states lie beyond the rail and the margins, and some actions exceed the control range.
 
     The reward receives the given action, not the clipped control.
     """
@@ -65,7 +61,6 @@ def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_e
         check_formula(env.obs, np.stack([qpos[:, 0], zz, xz, qvel[:, 0], qvel[:, 1]], axis=1))
         assert not env.terminated.any()
 
-    # the reward of a transition depends on the state after the transition
     after = put_at_random(env, rng, position=3.0, velocity=6.0)
     check_formula(
         env.get_reward(before, action, after),

@@ -1,5 +1,3 @@
-"""Test the gait clock of walking robots."""
-
 import numpy as np
 import pytest
 import torch

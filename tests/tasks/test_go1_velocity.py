@@ -1,7 +1,4 @@
-"""Test the contact timers, commands, pushes, randomization and curriculum of the go1_velocity task.
-
-The tests in tests/oracles/test_mjlab.py compare observations, rewards and terminations with mjlab's.
-"""
+"""oracles/test_mjlab.py compares observations, rewards and terminations with mjlab's."""
 
 import itertools
 
@@ -19,7 +16,6 @@ NWORLD = 64
 
 
 def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
-    """Take random steps, and return the last action."""
     actions = random_steps(env, steps, size)
     for action in actions:
         env.step(action)
@@ -79,7 +75,7 @@ def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: Shared
     assert landings > 20
 
 
-def test_peak_heights_of_feet_grow_in_the_air_and_are_cleared_at_landings_but_not_at_resets(
+def test_peak_heights_of_feet_are_cleared_only_at_landings(
     shared_env: SharedEnv,
 ) -> None:
     env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
@@ -116,7 +112,7 @@ def test_commands_have_the_distribution_of_mjlab() -> None:
 
 
 def command_of(env: lw.Env) -> torch.Tensor:
-    """Return the random velocity, the heading and the timer of each world's command, (nworld, 5)."""
+    """Return each world's random velocity, heading and command timer, (nworld, 5)."""
     parts = env.state_space.split(env.get_state())
     return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 

@@ -1,5 +1,3 @@
-"""Test the published numbers, formulas, resets, reachable targets and success of the herb_reach task."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -12,8 +10,7 @@ import lyceum_warp as lw
 NWORLD = 64
 SIDES = ("left", "right")
 
-# masses in kg; Barrett D1005 AC-02 gives the arm's masses, and Barrett's mass properties give the masses of the BH280
-# hand
+# masses in kg: the arm from Barrett D1005 AC-02, the hand from Barrett's mass properties of the BH280
 MASSES = {
     "wam_base": 9.97059584,
     "wam1": 10.76768767,
@@ -44,7 +41,7 @@ ARM = {  # ranges in rad and peak torques in N m (Barrett D1001, tables 5 and 6;
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames, whose z axes are the axes of the next joints
+# inertias (xx, yy, zz, xy, xz, yz) of the WAM's links in Barrett's frames; their z axes are the next joints' axes
 INERTIAS = {
     "wam1": (0.13488033, 0.11328369, 0.09046330, -0.00213041, -0.00012485, 0.00068555),
     "wam2": (0.02140958, 0.01377875, 0.01558906, 0.00027172, 0.00002461, -0.00181920),
@@ -64,7 +61,6 @@ def matrix(values: tuple[float, ...]) -> np.ndarray:
 
 
 def turn(angle: float) -> np.ndarray:
-    """Return the rotation by an angle about x."""
     return np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
 
 
@@ -86,7 +82,7 @@ def test_model_has_the_published_masses_limits_and_torques(shared_env: SharedEnv
 
 @pytest.mark.parametrize("side", SIDES)
 def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> None:
-    """Relative to the model's frames, Barrett's frames are rotated about x by +90 and -90 degrees alternately."""
+    """Barrett's frames are rotated about x by +90 and -90 degrees alternately."""
     model = shared_env("herb_reach").model
     for i, (name, values) in enumerate(INERTIAS.items()):
         body = model.body(f"{side}/{name}")
@@ -100,7 +96,6 @@ def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> N
 
 
 def test_palms_have_the_positions_of_the_published_kinematics(shared_env: SharedEnv) -> None:
-    """The expected positions are products of Denavit-Hartenberg transforms at random angles."""
     model = shared_env("herb_reach").model
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     for _ in range(20):
@@ -129,7 +124,7 @@ def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
 
 
 def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
-    """The fingertip turns by 45 degrees when the finger turns by 140 degrees, and both spread joints move together."""
+    """The fingertip turns by 45 degrees when the finger turns by 140 degrees. Both spread joints move together."""
     env = shared_env("herb_reach", nworld=1, autoreset=False)
     env.reset()
     action = torch.zeros(1, 22)
@@ -143,7 +138,6 @@ def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
 
 
 def palms(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Return both palms in each world (nworld, 2, 3) from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -157,8 +151,7 @@ def targets(env: lw.Env) -> np.ndarray:
 
 
 def put_targets(env: lw.Env, offset: np.ndarray) -> None:
-    """Place each target at an offset from its palm along x, and stop the arms. Offsets have the shape (nworld, 2), in
-    metres."""
+    """Stop the arms, and place each target at an offset along x from its palm. Offsets are in metres, (nworld, 2)."""
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qvel"][:] = 0.0
@@ -169,7 +162,7 @@ def put_targets(env: lw.Env, offset: np.ndarray) -> None:
 
 
 def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: SharedEnv) -> None:
-    """The states after a step, far from the targets and close to them, cover every reward term."""
+    """The states are far from the targets and close to them, so every reward term is covered."""
     env = shared_env("herb_reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for near in (False, True):
@@ -214,8 +207,7 @@ def test_random_resets_place_targets_in_front_of_each_shoulder_and_arms_near_hom
 
 
 def test_both_hands_can_reach_their_targets_at_the_same_time(shared_env: SharedEnv) -> None:
-    """Inverse kinematics finds joint angles within limits and without contacts, for random targets and the corners of
-    their boxes."""
+    """Inverse kinematics solves random targets and the corners of their boxes, within limits and without contacts."""
     env = shared_env("herb_reach", nworld=16)
     model, rng = env.model, np.random.default_rng(0)
     corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)
@@ -226,7 +218,6 @@ def test_both_hands_can_reach_their_targets_at_the_same_time(shared_env: SharedE
 
 
 def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bool:
-    """Return whether damped least squares moves both palms from given angles to their targets without contacts."""
     data, jacobian = mujoco.MjData(model), np.zeros((3, 30))
     arms = np.r_[0:7, 15:22]
     data.qpos[arms] = start[arms]
@@ -245,9 +236,8 @@ def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bo
     return False
 
 
-def test_task_succeeds_after_both_hands_are_at_their_targets_for_ten_steps() -> None:
-    """Both hands must be at their targets. A reset clears the count of steps, and so does a step in which a hand is off
-    its target."""
+def test_task_succeeds_after_ten_steps_with_both_hands_at_their_targets() -> None:
+    """A reset clears the count of steps, and so does a step with a hand off its target."""
     env = lw.make("herb_reach", engine="mujoco", nworld=4, autoreset=False, horizon=0)
     offset = np.array([[0.0, 0.0], [0.06, 0.0], [0.0, 0.06], [0.045, -0.045]])
     put_targets(env, offset)
@@ -264,5 +254,5 @@ def test_task_succeeds_after_both_hands_are_at_their_targets_for_ten_steps() -> 
     assert env.success.tolist() == [False, False, False, True]
     env.rand_reset(0)
     assert not env.success.any()
-    env.set_state(state)  # the count of steps at the targets is part of the state
+    env.set_state(state)
     assert env.success.tolist() == [True, False, False, True]

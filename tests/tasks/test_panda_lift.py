@@ -1,4 +1,4 @@
-"""Test the robot, a scripted grasp, reward terms (also of aloha_lift), resets and success of the panda_lift task."""
+"""The tests of reward terms also cover aloha_lift."""
 
 import mujoco
 import numpy as np
@@ -18,7 +18,6 @@ def cube(env: lw.Env) -> np.ndarray:
 
 
 def put_cube(env: lw.Env, height: float) -> None:
-    """Place the cube in the air beside the hand in every world."""
     state = env.get_state()
     env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
     env.set_state(state)
@@ -45,7 +44,7 @@ def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
 
 
 def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
-    """The servos compensate gravity, and an action of 1 moves a servo target by 1 rad/s."""
+    """Gravity is compensated, and an action of 1 moves a servo target by 1 rad/s."""
     env = shared_env("panda_lift", nworld=2, autoreset=False)
     before = positions(env)[0][:, :9]
     for _ in range(50):
@@ -58,13 +57,13 @@ def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
 
 
 def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -> None:
-    """The gripper descends, closes and rises, and the lift succeeds within an episode with a reward of nearly 6.5."""
+    """The gripper descends, closes and rises. The task succeeds with a reward of nearly 6.5."""
     env = shared_env("panda_lift", nworld=4, autoreset=False)
     start, at = positions(env)[0], cube(env)
     waypoints = np.zeros((3, 4, 8))
     for world in range(4):
         yaw = 2.0 * np.arctan2(at[world, 6], at[world, 3])
-        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi  # the yaw of the edge that is nearest to the fingers
+        yaw -= np.round(yaw / (0.5 * np.pi)) * 0.5 * np.pi
         y, z = np.array([-np.sin(yaw), np.cos(yaw), 0.0]), np.array([0.0, 0.0, -1.0])
         axes = np.stack([np.cross(y, z), y, z], axis=1)
         for i, height in enumerate((0.12, 0.02, 0.2)):
@@ -98,8 +97,7 @@ def test_reward_is_a_weighted_sum_of_terms_between_0_and_1(
 
 
 def test_task_succeeds_after_ten_consecutive_steps_above_the_goal() -> None:
-    """A cube that falls from 0.5 m is above the goal for 7 steps, and a cube that falls from 1.6 m for 13 steps. The
-    count is part of the state."""
+    """A cube is above the goal for 7 steps if it falls from 0.5 m, and for 13 steps from 1.6 m."""
     env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
     for height, steps in ((0.5, 0), (1.6, 4)):
         env.rand_reset(0)

@@ -39,7 +39,7 @@ def test_reward_evaluation_observation_and_success_equal_the_formulas_of_lyceum(
 
 
 def test_action_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
-    """The acceleration is gear / (mass + armature); the target does not move."""
+    """The acceleration is gear / (mass + armature)."""
     env = shared_env("point_mass", nworld=2, autoreset=False)
     env.reset()
     assert env.model.opt.timestep == env.timestep == 0.02

@@ -1,5 +1,3 @@
-"""Test the published arm, Lyceum's formulas, resets and success of the reach task."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -67,8 +65,8 @@ def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
     assert model.site("target").size[0] == 0.05
 
 
-def test_arm_has_the_position_of_the_original_arm_after_three_seconds_of_controls(shared_env: SharedEnv) -> None:
-    """Smooth controls push one joint against its limit. The expected numbers were computed with the original arm."""
+def test_arm_moves_like_the_original_arm_for_three_seconds(shared_env: SharedEnv) -> None:
+    """The controls push one joint against its limit. The expected numbers come from the original arm."""
     model = shared_env("reach").model
     data = mujoco.MjData(model)
     for i in range(300):
@@ -79,7 +77,6 @@ def test_arm_has_the_position_of_the_original_arm_after_three_seconds_of_control
 
 
 def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
-    """Return the finger's position in each world, from MuJoCo's kinematics in float64."""
     data, found = mujoco.MjData(env.model), []
     for row in qpos:
         data.qpos[:] = row
@@ -89,7 +86,6 @@ def finger(env: lw.Env, qpos: np.ndarray) -> np.ndarray:
 
 
 def errors(env: lw.Env, state: torch.Tensor | None = None) -> np.ndarray:
-    """Return vectors from the target to the hand, (nworld, 3)."""
     state = env.get_state() if state is None else state
     target = env.state_space.split(state)["mocap_pos"].numpy()
     return finger(env, positions(env, state)[0]) - target
@@ -100,7 +96,7 @@ def reward(error: np.ndarray) -> np.ndarray:
 
 
 def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """The test compares states after steps and states from set_state; each world has a different target."""
+    """Each world has a different target. States come from steps and from set_state."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)
@@ -126,7 +122,7 @@ def targets(env: lw.Env) -> np.ndarray:
 @pytest.mark.usefixtures("freed")
 @pytest.mark.parametrize("scale", [None, (0.1, 0.5, 0.0)])
 def test_random_resets_place_the_target_within_its_box(scale: tuple[float, float, float] | None) -> None:
-    """The arm starts at rest with all joints at zero, and each world has another random target."""
+    """Each world has another random target. The arm starts at rest with all joints at zero."""
     env = lw.make("reach", engine="mujoco", nworld=2000, **({} if scale is None else {"target_range": scale}))
     env.rand_reset(0)
     size = np.array(scale or (0.3, 0.2, 0.25))
@@ -142,20 +138,18 @@ def test_random_resets_place_the_target_within_its_box(scale: tuple[float, float
 
 @pytest.mark.usefixtures("freed")
 def test_random_start_places_every_joint_within_its_range() -> None:
-    """The arm starts at rest."""
     env = lw.make("reach", engine="mujoco", nworld=2000, random_start=True)
     qpos, qvel = positions(env)
     assert not qvel.any()
     low, high = RANGES.T.astype(np.float32).astype(np.float64)
     middle = np.concatenate([(2.0 * qpos - low - high) / (high - low), targets(env) / (0.3, 0.2, 0.25)], axis=1)
     check_uniform(middle / (1.0 + 1e-6))
-    for _ in range(20):  # some episodes start with the palm inside the table
+    for _ in range(20):
         env.step(torch.zeros(2000, 7))
     assert not env.done.any()
 
 
 def put_targets(env: lw.Env, distance: np.ndarray) -> None:
-    """Move each world's target to a distance from its hand, along x."""
     state = env.get_state()
     parts = env.state_space.split(state)
     hand = finger(env, parts["qpos"].numpy())
@@ -164,8 +158,8 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_task_succeeds_after_ten_steps_at_the_target() -> None:
-    """Even with a larger success distance, success takes ten steps. The count of steps at the target is part of the
-    state, and a reset clears it."""
+    """Success takes ten steps even with a larger success distance. The count of steps is part of the state, and a reset
+    clears it."""
     env = lw.make("reach", engine="mujoco", nworld=3, success_distance=np.array([0.05, 0.05, 0.99]), horizon=0)
     put_targets(env, np.array([0.0, 0.06, 0.0]))
     still = torch.zeros(3, 7)
@@ -181,7 +175,7 @@ def test_task_succeeds_after_ten_steps_at_the_target() -> None:
     assert env.success.tolist() == [False, False, True]
     env.reset()
     assert not env.success.any()
-    env.set_state(state)  # the state includes task memory
+    env.set_state(state)
     assert env.success.tolist() == [True, False, True]
 
 

@@ -1,6 +1,3 @@
-"""Test velocity tasks on rough ground: compare foot heights and scans with MuJoCo, and check levels and the field's
-edge."""
-
 from collections.abc import Mapping
 
 import mujoco
@@ -28,14 +25,12 @@ def parts(env: lw.Env, group: str) -> Mapping[str, torch.Tensor]:
 
 
 def ray_height(model: mujoco.MjModel, data: mujoco.MjData, x: float, y: float) -> float:
-    """Measure the height of the field by a ray."""
     (field,) = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)
     start, down = np.array([x, y, 9.0]), np.array([0.0, 0.0, -1.0])
     return 9.0 - float(mujoco.mj_rayHfield(model, data, field, start, down, None))
 
 
 def put(env: lw.Env, world: int, x: float, y: float) -> None:
-    """Place an upright robot on the ground at a point."""
     data = mujoco.MjData(env.model)
     mujoco.mj_forward(env.model, data)
     around = np.linspace(-0.4, 0.4, 9)
@@ -82,7 +77,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_those_of_mujoco
 
 @pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
-def test_robots_start_on_the_patch_of_their_level_and_rise_a_level_by_walking(task: str, env: lw.Env) -> None:
+def test_robots_start_at_their_level_and_rise_by_walking(task: str, env: lw.Env) -> None:
     def memory(name: str) -> torch.Tensor:
         return env.state_space.split(env.get_state())[name][:, 0].int()
 
@@ -118,7 +113,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 def test_falling_robot_on_rough_ground_has_bounded_velocities_under_mujoco_warp(
     task: str, shared_env: SharedEnv
 ) -> None:
-    """The soles of the original G1 are boxes, for which MuJoCo Warp finds contacts with normals that point down."""
+    """The soles of the original G1 are boxes. MuJoCo Warp finds contacts for them with normals that point down."""
     env = shared_env(task, engine="warp", nworld=24)
     rng = np.random.default_rng(0)
     for _ in range(60):

@@ -1,5 +1,3 @@
-"""Test the soft_ball task: squeezing and lifting the ball, observations, rewards, resets and terminations."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ LOW = -1.0  # height at which the gripper surrounds the ball on the floor
 
 
 def vertices(env: lw.Env) -> np.ndarray:
-    """Return the ball's vertices in each world, from MuJoCo's kinematics in float64, (nworld, n, 3)."""
     data, found = mujoco.MjData(env.model), []
     for qpos in positions(env)[0]:
         data.qpos[:] = qpos
@@ -34,7 +31,7 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_gripper_squeezes_the_ball_and_lifts_it_to_the_target(shared_env: SharedEnv, engine: str) -> None:
-    """The fingers compress the ball by millimetres, and the ball bulges upwards."""
+    """The fingers compress the ball by millimetres, and it bulges upwards."""
     env = shared_env("soft_ball", engine=engine, nworld=1, autoreset=False)
     env.reset()
     hold(env, 20, 0.0, LOW, OPEN)
@@ -74,7 +71,7 @@ def test_observation_and_reward_equal_formulas_of_the_ball_vertices(shared_env: 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: int) -> None:
-    """The test scales the ball to 80 % and 60 % of its width along an axis, and moves it by 0.3 and 0.45 m."""
+    """The ball gets 80 % and 60 % of its width along an axis, or moves by 0.3 and 0.45 m."""
     env = shared_env("soft_ball", nworld=4, autoreset=False)
     env.reset()
     corners = np.array([env.model.body(f"ball_{i // 4}_{i // 2 % 2}_{i % 2}").pos for i in range(8)])
@@ -101,7 +98,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_constraint_buffers_of_a_flex_model_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Fingers that press into the ball cause more than twice as many constraints as the states that the probe tries."""
+    """Fingers that press into the ball cause twice as many constraints as the probed states."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

@@ -1,5 +1,3 @@
-"""Compare the feet, contacts and forces of every velocity task with MuJoCo's."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -26,7 +24,6 @@ def random_steps(env: lw.Env, steps: int, size: float) -> None:
 
 
 def feet(env: lw.Env, world: int) -> tuple[mujoco.MjData, list[bool]]:
-    """Compute a world's kinematics with MuJoCo, and find the feet that touch the ground."""
     model, data = env.model, mujoco.MjData(env.model)
     data.qpos, data.qvel = env.field("qpos")[world], env.field("qvel")[world]
     mujoco.mj_forward(model, data)
@@ -83,7 +80,7 @@ def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> Non
 @pytest.mark.quick("g1_velocity")
 @pytest.mark.parametrize("task", ROBOTS)
 def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
-    """At rest, the sum of the forces on a robot's feet is its weight, and joints without actions keep the home pose."""
+    """The sum of the forces on the feet is the weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))

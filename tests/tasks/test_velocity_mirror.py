@@ -1,5 +1,3 @@
-"""Test that mirrored walking robots have mirrored physics and observations."""
-
 import copy
 from types import SimpleNamespace
 
@@ -28,7 +26,7 @@ def bound(task: str) -> BoundTask:
 
 
 def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
-    """Make a model symmetric: average its masses, gains and ranges with their mirror images.
+    """Average masses, gains and ranges with their mirror images.
 
     Published models are not symmetric: centres of mass differ by up to 6 mm, and both hips of the G1 have the left
     hip's range.

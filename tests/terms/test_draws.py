@@ -1,5 +1,3 @@
-"""Check the distributions of random numbers and of randomized model fields."""
-
 import numpy as np
 from checks import check_uniform
 from term_calls import N, call
@@ -8,7 +6,6 @@ RNG = np.random.default_rng(0)
 
 
 def centred(x: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Map numbers from (low, high) to (-1, 1); the ends may be off by a rounding error."""
     scaled = (x - (low + high) / 2) / ((high - low) / 2)
     assert np.abs(scaled).max() < 1.0 + 1e-4
     return np.clip(scaled, -1.0, 1.0)

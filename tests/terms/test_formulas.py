@@ -1,5 +1,3 @@
-"""Compare terms that only return a value with their formulas in NumPy."""
-
 import inspect
 from collections.abc import Callable
 from typing import Any
@@ -60,7 +58,6 @@ def total(rows: np.ndarray) -> np.ndarray:
 
 
 def matrix(qpos: np.ndarray) -> np.ndarray:
-    """Compute the rotation matrix of the base."""
     w, x, y, z = qpos[:, 3:7].T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -83,7 +80,6 @@ def posture(qpos: np.ndarray, joint_qpos: Any, default_pose: np.ndarray, std: np
 
 
 def vectors(sensordata: np.ndarray, at: Any) -> np.ndarray:
-    """Gather the three numbers of each sensor, (N, sensors, 3)."""
     return np.stack([sensordata[:, i : i + 3] for i in at], axis=1)
 
 

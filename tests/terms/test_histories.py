@@ -1,5 +1,3 @@
-"""Compare a ring buffer in task memory with a list."""
-
 import numpy as np
 import pytest
 from term_calls import N, call
@@ -13,7 +11,7 @@ def test_history_contains_the_last_values_and_repeats_the_first_value_until_full
     history = np.zeros((N, 1 + length * WIDTH))
     assert call("history_length", history=history, width=WIDTH).result[0] == length
     assert not call("put_history", target=np.ones(length * WIDTH), history=history, width=WIDTH).after["target"].any()
-    for _ in range(3 * length + 2):  # the number of values is large enough for the counter to wrap around
+    for _ in range(3 * length + 2):  # enough values for the counter to wrap around
         values.append(rng.standard_normal((N, WIDTH)).astype(np.float32))
         history = call("push_history", history=history, value=values[-1]).after["history"]
         kept = [values[max(len(values) - 1 - age, max(len(values) - length, 0))] for age in range(length + 1)]

@@ -1,5 +1,3 @@
-"""Compare changed inertias with clouds of point masses that are changed in the same way."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -9,8 +7,10 @@ RNG = np.random.default_rng(0)
 
 
 def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Compute mass, centre of mass and inertia of point masses (k,) at (k, 3), about their centre and in the body's
-    axes."""
+    """Compute mass, centre of mass and inertia of point masses (k,) at (k, 3).
+
+    The inertia is about their centre, in the body's axes.
+    """
     centre = mass @ points / mass.sum()
     x = points - centre
     second = np.einsum("k,ki,kj->ij", mass, x, x)
@@ -18,7 +18,6 @@ def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, 
 
 
 def fields(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the model fields of a body that consists of point masses."""
     total, centre, inertia = of_points(mass, points)
     moments, axes = np.linalg.eigh(inertia)
     quat = np.zeros(4)
@@ -27,7 +26,6 @@ def fields(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.
 
 
 def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
-    """Compute an inertia tensor in the body's axes."""
     axes = np.zeros(9)
     mujoco.mju_quat2Mat(axes, quat.astype(float))
     axes = axes.reshape(3, 3)
@@ -35,8 +33,7 @@ def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[str, np.ndarray]]:
-    """Draw a flat cloud of six point masses per world, and make the fields of two bodies; the second body consists of
-    these masses."""
+    """Draw a flat cloud of six point masses per world. The second of two bodies consists of these masses."""
     clouds = [
         (RNG.uniform(0.1, 2.0, 6), RNG.standard_normal((6, 3)) * [1.0, 0.3, thickness] + RNG.standard_normal(3))
         for _ in range(N)

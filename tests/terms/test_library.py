@@ -1,5 +1,3 @@
-"""Check the arguments of all library functions, and use the library in a task."""
-
 from collections import defaultdict
 
 import numpy as np
@@ -21,9 +19,6 @@ def test_argument_name_has_one_type_and_one_documented_meaning_in_all_functions(
                 kinds[argument].add(str(kind))
     assert {argument for argument, found in kinds.items() if len(found) > 1} == {"row"}  # numbers or vectors
     assert {*kinds} == {*terms.ARGUMENTS}
-
-
-# the library functions in these tests write the fields that the caller passes
 
 
 @wp.struct

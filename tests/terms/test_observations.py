@@ -1,5 +1,3 @@
-"""Check observations of listed joints, and observation noise."""
-
 import numpy as np
 import pytest
 from checks import check_normal, check_uniform
@@ -24,7 +22,7 @@ def test_positions_are_relative_to_the_default_pose_with_or_without_a_bias() -> 
 
 
 @pytest.mark.parametrize("overload", [0, 1], ids=["numbers", "vectors"])
-def test_noise_is_independent_in_every_number(overload: int) -> None:
+def test_noise_of_every_number_is_independent(overload: int) -> None:
     row = np.arange(6.0).reshape((6,) if overload == 0 else (2, 3))
     uniform = call("add_uniform_noise", overload, row=row, noise=0.3).after["row"]
     check_uniform(np.clip((uniform - row).reshape(N, 6) / 0.3, -1.0, 1.0))

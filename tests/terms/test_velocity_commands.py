@@ -1,4 +1,4 @@
-"""Check the timers and headings of velocity commands; test_go1_velocity.py checks their distributions."""
+"""test_go1_velocity.py checks the distributions of velocity commands."""
 
 import numpy as np
 import pytest

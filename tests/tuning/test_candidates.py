@@ -1,5 +1,3 @@
-"""Test the physics settings that ``tune`` tries, and the flags and Python lines that it prints for them."""
-
 import mujoco
 import pytest
 import tyro
@@ -10,7 +8,7 @@ from lyceum_warp.cli.arguments import Physics, given
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 
 
-def test_settings_to_try_for_hopper_have_lower_limits_and_the_same_control_time_step(shared_env: SharedEnv) -> None:
+def test_settings_for_hopper_have_lower_limits_and_the_same_time_step(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", solver={"iterations": 3})  # hopper uses RK4 and 4 substeps of 2 ms
     settings = candidates(env)
     names = [setting.name for setting in settings]
@@ -25,11 +23,11 @@ def test_settings_to_try_for_hopper_have_lower_limits_and_the_same_control_time_
         if setting.group == "substeps"
     )
     limited = next(setting for setting in settings if setting.name == "ls_iterations=10")
-    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}  # the given limit stays unchanged
+    assert limited.physics == {"solver": {"iterations": 3, "ls_iterations": 10}}
     assert not {"noslip", "impratio", "room"} & {setting.group for setting in settings}
 
 
-def test_settings_to_try_include_those_for_an_elliptic_cone_and_for_noslip(shared_env: SharedEnv) -> None:
+def test_settings_include_the_elliptic_cone_and_noslip(shared_env: SharedEnv) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10
     spec.option.noslip_iterations = 5

@@ -1,5 +1,3 @@
-"""Test intervals of differences between returns, and verdicts on settings."""
-
 import math
 from typing import Any
 

@@ -1,5 +1,3 @@
-"""Test rank correlations of samples between the physics of planner and plant."""
-
 import pytest
 import torch
 
@@ -18,7 +16,7 @@ def test_rank_correlations_are_spearman_correlations_with_mean_ranks_for_ties() 
     found = rank_correlations(first, second)
     assert found.tolist() == pytest.approx(
         [0.8, 0.9487, -1.0, 0.0], abs=1e-4
-    )  # states in which all samples have equal returns are omitted
+    )  # states with equal returns of all samples are omitted
 
 
 @pytest.fixture(scope="module")

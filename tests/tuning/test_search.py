@@ -1,5 +1,3 @@
-"""Test the results of lw.tune, resumption from the file of results, and errors."""
-
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,8 +15,6 @@ QUICK = {"short": True, "episodes": 8, "nworld": 8, "nthread": 1}
 
 @pytest.fixture
 def no_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make every further measurement raise an error."""
-
     def measure(own: Trials, setting: Any) -> Any:
         raise AssertionError(f"{setting.name} was measured")
 
@@ -27,7 +23,6 @@ def no_measuring(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def brief() -> Iterator[None]:
-    """Limit speed measurements to milliseconds."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))
         yield
@@ -53,7 +48,6 @@ def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: 
         file.write('{"name": "cut off by a ki')
     again = lw.tune("half_cheetah", out=tuned.path, tolerance="loose", **QUICK)
     assert again == tuned
-    # the results get new verdicts without new measurements
     rows = lw.tune("half_cheetah", out=tuned.path, tolerance="strict", **QUICK).rows
     assert len(rows) <= len(tuned.rows)
 

@@ -1,5 +1,3 @@
-"""Test measurements of physics settings on real tasks."""
-
 import pytest
 import torch
 
@@ -16,12 +14,10 @@ CRUDE = Setting("crude", "", {"frame_skip": 1, "timestep": 0.05, "solver": {"ite
 
 @pytest.fixture(autouse=True)
 def judge_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compare the returns of every setting, independently of measured speeds."""
     monkeypatch.setattr(trial, "buys", lambda speedup, memory: True)
 
 
 def lean(obs: torch.Tensor) -> torch.Tensor:
-    """A fixed policy for half_cheetah."""
     return torch.sin(3.0 * obs[:, :6])
 
 
@@ -30,7 +26,7 @@ def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | 
     return Trials(env, lean if policy else None, effort=BRIEF, episodes=episodes)
 
 
-def test_returns_of_the_unchanged_task_differ_by_exactly_zero() -> None:
+def test_unchanged_task_gives_unchanged_returns() -> None:
     row = trials(policy=True).measure(SAME)
     assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
     assert set(row["returns"]) == {"random", "policy"}

@@ -1,5 +1,3 @@
-"""Test the viewer of a run that is training."""
-
 import contextlib
 import importlib
 import re
@@ -59,7 +57,6 @@ def test_a_run_that_does_not_start_is_reported(tmp_path: Path) -> None:
 
 
 def trained(folder: Path, callback: Callable[[lw.Iteration], object] | None = None) -> tuple[list[Any], list[Any]]:
-    """Return a run's metrics without measured times, and its policy."""
     env = lw.make("point_mass", nworld=2, engine="mujoco", seed=3)
     npg = lw.NPG(env, config=lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,)), seed=3)
     run = lw.train(npg, folder, iterations=4, callback=callback)
@@ -99,14 +96,13 @@ time.sleep(60)
 
 
 def runs(process: int) -> bool:
-    """Return whether a process is running; a zombie does not count."""
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{process}/cmdline").read_bytes() != b""
     return False
 
 
 @pytest.mark.long
-def test_viewer_that_waits_for_a_run_ends_with_the_program_that_opened_it(tmp_path: Path) -> None:
+def test_viewer_of_a_waiting_run_ends_with_its_program(tmp_path: Path) -> None:
     command = [sys.executable, "-c", PROGRAM, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
         assert program.stdout is not None
@@ -126,7 +122,7 @@ def test_viewer_ends_if_it_is_closed_right_after_its_start(tmp_path: Path) -> No
 
 def test_train_with_view_opens_a_viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    # import_module is necessary because the package also has a function with this name
+    # the package also has a function with this name
     training = importlib.import_module("lyceum_warp.cli.train")
     monkeypatch.setattr(
         training, "RunViewer", lambda *given, **words: made.append((given, words)) or contextlib.nullcontext()

@@ -1,5 +1,3 @@
-"""Test the view in a notebook."""
-
 import re
 import sys
 import time

@@ -1,5 +1,3 @@
-"""Test pages that contain episodes."""
-
 import base64
 import json
 import re

@@ -1,5 +1,3 @@
-"""Test the curves for TensorBoard by reading them with TensorBoard's own reader."""
-
 import dataclasses
 import inspect
 import math
@@ -21,7 +19,6 @@ pytest.importorskip("tensorboard")
 
 @pytest.fixture(scope="module")
 def first() -> lw.Iteration:
-    """Return an iteration of a real run, with an evaluation of the mean policy."""
     config = lw.NPGConfig(samples=96, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
     return next(lw.NPG(lw.make("point_mass", nworld=4, horizon=12), config=config))
 
@@ -95,7 +92,7 @@ def test_resumed_run_replaces_points_after_its_checkpoint(first: lw.Iteration, t
     with TensorBoard(tmp_path) as board:
         for i in (1, 2, 3, 4):
             board(numbered(first, i))
-    with TensorBoard(tmp_path) as board:  # the checkpoint is from iteration 2
+    with TensorBoard(tmp_path) as board:
         for i in (3, 4, 5):
             board(numbered(first, i, return_mean=100.0))
     assert curve(tmp_path, "policy/kl") == [(i - 1, 0.01 * i) for i in (1, 2, 3, 4, 5)]

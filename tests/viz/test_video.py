@@ -1,5 +1,3 @@
-"""Test videos of states and of single shots."""
-
 import os
 import signal
 import subprocess
@@ -33,12 +31,10 @@ def env() -> lw.Env:
 
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
-    """A red ball on a rail, seen from the front."""
     return ball().compile()
 
 
 def drawable(make: Callable[[], Path]) -> Path:
-    """Return the result of a function that renders; skip the test on a machine that cannot render."""
     pytest.importorskip("imageio_ffmpeg")
     try:
         return make()
@@ -139,11 +135,10 @@ def test_invalid_video_argument_raises_an_error(
     assert not list(tmp_path.iterdir())
 
 
-# tests of videos from single shots
+# single shots
 
 
 def shot(x: float, **changes: Any) -> Shot:
-    """Return a state with the ball at a position on its rail."""
     none = np.zeros((0, 3)), np.zeros((0, 4))
     values: dict[str, Any] = dict(pose=(np.array([x]), *none), model_fields={}, ghosts=[], lines=[], frames=1)
     return Shot(**values | changes)
@@ -153,7 +148,7 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
     return video.Recorder(model, out, size=SMALL, fps=fps, most_waiting=most_waiting)
 
 
-def test_video_of_single_shots_shows_model_fields_ghosts_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_video_of_single_shots_shows_fields_transparent_copies_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
 
     def write() -> Path:
@@ -172,12 +167,10 @@ def test_video_of_single_shots_shows_model_fields_ghosts_and_lines(model: mujoco
     plain, shrunk, again, _, ghost, line = result["red"]
     assert shrunk < 0.3 * plain and again == pytest.approx(plain, rel=0.05)
     assert ghost > 1.5 * plain and line > plain + 20
-    assert result["columns"][3] > result["columns"][2] + 0.5  # the ball has moved to the right
+    assert result["columns"][3] > result["columns"][2] + 0.5
 
 
-def test_shots_are_dropped_if_rendering_is_too_slow_and_the_video_keeps_its_length(
-    model: mujoco.MjModel, tmp_path: Path
-) -> None:
+def test_slow_rendering_drops_shots_but_keeps_the_video_length(model: mujoco.MjModel, tmp_path: Path) -> None:
     def write() -> Path:
         mp4 = video_of(model, tmp_path / "video.mp4", most_waiting=2)
         for i in range(10):

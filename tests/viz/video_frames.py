@@ -6,8 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-# this runs in a small subprocess, because imageio forks, and this process may be too large for a fork after all other
-# tests
+# in a subprocess, because imageio forks, and this process may be too large for a fork
 PROGRAM = """
 import json, sys
 import imageio.v2 as imageio
@@ -25,7 +24,6 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Return the rate, shape and number of frames, and for each frame the brightest pixel and the red pixels' count and
-    mean column."""
+    """Return a video's rate, shape and number of frames, and each frame's brightest and red pixels."""
     done = subprocess.run([sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))

@@ -1,5 +1,3 @@
-"""Test the session's main loop, with real worlds and a window in memory."""
-
 import socket
 import threading
 import time

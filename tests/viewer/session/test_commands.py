@@ -1,5 +1,3 @@
-"""Check the effect of each command of the viewer."""
-
 from collections.abc import Callable
 
 import numpy as np
@@ -33,7 +31,7 @@ def test_push_ends_when_the_viewer_shows_another_world(shared_env: SharedEnv) ->
 
 @pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
                                     SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
-def test_push_that_stepping_back_restored_ends_at_the_next_change_of_the_world(
+def test_push_restored_by_stepping_back_ends_at_the_next_change_of_the_world(
     shared_env: SharedEnv, branch: protocol.Command
 ) -> None:
     env = shared_env("hopper", nworld=2)
@@ -45,7 +43,7 @@ def test_push_that_stepping_back_restored_ends_at_the_next_change_of_the_world(
     assert not pushed(env, 0)
 
 
-def test_push_that_is_released_in_a_past_step_does_not_act_in_the_newest_state(shared_env: SharedEnv) -> None:
+def test_push_released_in_a_past_step_does_not_act_in_the_newest_state(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
@@ -102,7 +100,7 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)
     total = torch.zeros(4, dtype=torch.float64)
-    for _ in range(60):  # some episodes end during these steps
+    for _ in range(60):
         session.stage.advance()
         total += env.reward
         total[env.done] = 0.0

@@ -1,5 +1,3 @@
-"""Test that a user's velocity command replaces the random command of the task."""
-
 import numpy as np
 import torch
 from conftest import SharedEnv
@@ -21,9 +19,7 @@ def test_command_of_the_user_is_observed_until_it_is_released(shared_env: Shared
         status = stage.frame().status
         assert status.driven and np.allclose(status.command, command)
         np.testing.assert_allclose(env.obs[0, 45:], command)
-        session.obey(
-            protocol.Reset(random=True)
-        )  # the task chooses a random command, and the next frame replaces it by the user's command
+        session.obey(protocol.Reset(random=True))
         stage.frame()
     for end in (protocol.Drive(None), protocol.SetWorld(1)):
         session.obey(protocol.Drive(command))
@@ -43,7 +39,7 @@ def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedE
     stage.live.set_row(state)
     stage.frame()
     ways = [arrow.end - arrow.start for arrow in stage.frame().arrows]
-    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]  # the robot faces along y
+    expected = [[0, 0.4, 0], [0, 0.2, 0], [0, 0, 0.2], [0, 0, -0.4]]
     np.testing.assert_allclose(ways, expected, atol=1e-6)
 
 

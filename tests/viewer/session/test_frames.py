@@ -1,5 +1,3 @@
-"""Check the contents of frames."""
-
 import math
 
 import numpy as np
@@ -12,7 +10,7 @@ from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.session.clock import Session
 
 
-def test_other_worlds_and_past_states_are_shown_as_ghosts(shared_env: SharedEnv) -> None:
+def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, paused=True, seed=0)
     session.stage.advance(10)
@@ -65,7 +63,7 @@ def test_frames_contain_every_point_of_the_curves(shared_env: SharedEnv) -> None
     np.testing.assert_array_equal(points[:, 2], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
     session.obey(protocol.StepBy(-5))
-    session.obey(protocol.StepBy(6))  # one new step after five restored steps
+    session.obey(protocol.StepBy(6))
     np.testing.assert_allclose(session.stage.frame().samples[:, 0], [env.timestep * 21])
 
 

@@ -1,5 +1,3 @@
-"""Check steps, the history of worlds, and their returns."""
-
 import pytest
 import torch
 from conftest import SharedEnv
@@ -18,7 +16,7 @@ def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedE
     env = shared_env("hopper", engine=engine, nworld=3)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]
-    for k in range(40):  # some episodes end during these steps
+    for k in range(40):
         if k == 20:
             session.obey(protocol.Reset(random=True))
             states[-1] = env.get_state()
@@ -34,7 +32,7 @@ def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedE
     assert session.stage.live.past.behind == 41
     session.obey(StepBy(-5))
     restored = env.get_state()
-    session.obey(protocol.SetMode("passive"))  # a new step removes the later steps from the history
+    session.obey(protocol.SetMode("passive"))
     session.obey(StepBy(1))
     assert session.stage.live.past.ahead == 0 and not torch.equal(env.get_state(), restored)
 

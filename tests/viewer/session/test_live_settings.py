@@ -1,5 +1,3 @@
-"""Change a planner's settings and a task's parameters while a session runs."""
-
 import torch
 
 import lyceum_warp as lw

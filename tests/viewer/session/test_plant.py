@@ -1,5 +1,3 @@
-"""Test the real-time control of one world, even with controllers that are slow or fail."""
-
 import threading
 import time
 
@@ -34,7 +32,7 @@ def test_plant_runs_in_real_time_and_the_viewer_draws_the_plan() -> None:
     assert frame.status.time < 4 * (time.monotonic() - begun)
     assert frame.traces.shape == (7, 9, 3) and frame.best == 0 and len(frame.ghosts) == 1
     assert frame.status.plan_ms > 0 and session.stage.paused is False
-    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)  # the paths begin at the same point
+    np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)
     assert np.isfinite(np.concatenate([frame.samples for frame in window.frames])).all()
 
 
@@ -50,7 +48,7 @@ def test_planner_controls_a_copy_of_the_world_in_view(shared_env: SharedEnv) -> 
     assert not torch.equal(moved, before[1])
     session.obey(protocol.SetGhosts(worlds=1))
     np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[2, qpos].numpy())
-    session.obey(protocol.SetWorld(2))  # world 1 gets the state of the copy
+    session.obey(protocol.SetWorld(2))
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
     session.obey(SetMode("controller", "own"))
@@ -71,7 +69,7 @@ def test_plant_starts_another_episode_after_the_end_of_an_episode() -> None:
 
 
 class Slow:
-    """A controller that logs its calls and resets in order, and blocks from the seventh call on."""
+    """A controller that logs its calls, and blocks from the seventh call on."""
 
     def __init__(self) -> None:
         self.inside, self.log, self.release = 0, [], threading.Event()
@@ -104,7 +102,7 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
         lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
-    assert slow.inside == 1  # the controller has not returned from the call yet
+    assert slow.inside == 1
     slow.release.set()
     while slow.inside:
         time.sleep(0.01)

@@ -1,5 +1,3 @@
-"""Play back episodes."""
-
 import numpy as np
 import pytest
 import torch
@@ -34,7 +32,7 @@ def test_playback_can_seek_reverse_and_loop(shared_env: SharedEnv, trajectories:
     assert session.stage.frame().status.step == 5
     session.obey(protocol.SetBackwards(True))
     session.stage.advance(6)
-    assert session.stage.frame().status.step == 20  # during reverse playback, the last step follows the first
+    assert session.stage.frame().status.step == 20
     session.obey(protocol.SetMode("playback", episode=1))
     frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1

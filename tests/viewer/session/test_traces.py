@@ -1,5 +1,3 @@
-"""Test the traces of a planner's samples."""
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,5 +1,3 @@
-"""Test the videos that the viewer writes."""
-
 import os
 import signal
 import threading
@@ -64,7 +62,6 @@ def taker(shared_env: SharedEnv, tmp_path: Path) -> VideoTaker:
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make a video on a machine that renders two poses per second, until one pose is rendered and others wait."""
     drawn, draw = threading.Event(), drawing.Drawing.draw
 
     def slow(self: drawing.Drawing, shot: Any) -> None:
@@ -73,7 +70,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         time.sleep(0.5)
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
-    monkeypatch.setattr(videos, "FPS", 5)  # the video has only some poses, because rendering without a GPU is slow
+    monkeypatch.setattr(videos, "FPS", 5)  # the video omits some poses, because rendering without a GPU is slow
     try:
         taker.begin(CAMERA)
         while not drawn.is_set():

@@ -1,5 +1,3 @@
-"""Test the files that the window process serves, and how the process ends."""
-
 import contextlib
 import os
 import signal
@@ -34,7 +32,6 @@ def shared_window() -> Iterator[Window]:
 
 
 def page(window: Window, path: str = "") -> bytes:
-    """Return the response that a browser gets after opening the viewer's address."""
     browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     with browser.open(window.address, timeout=10) as first:
         address = urllib.parse.urljoin(first.url, path)
@@ -57,13 +54,13 @@ def wait_until(done: object) -> bool:
 
 
 def is_alive(pid: int) -> bool:
-    """Return whether a process is running; a zombie does not count."""
+    """A zombie does not count as running."""
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return False
 
 
-# a window that runs
+# a running window
 
 
 def test_page_and_model_are_served_and_a_second_window_gets_another_port(shared_window: Window) -> None:
@@ -111,7 +108,7 @@ def test_show_does_not_wait_for_a_window_that_hangs(shared_window: Window) -> No
         began = time.monotonic()
         for _ in range(2000):
             shared_window.show(frame)
-        assert time.monotonic() - began < 20  # the pipe stays full
+        assert time.monotonic() - began < 20
     finally:
         os.kill(process_of(shared_window), signal.SIGCONT)
 
@@ -152,7 +149,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 def test_sending_frames_to_a_process_that_ends_raises_an_error(number: signal.Signals) -> None:
-    """The sending thread is the first to notice that the process has ended."""
+    """The sending thread notices first that the process has ended."""
     with Window(scene_of(MODEL)) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))

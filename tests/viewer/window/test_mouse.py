@@ -16,7 +16,6 @@ def bench() -> Bench:
 
 
 def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
-    """Drag the mouse by half a metre in MuJoCo Studio, and return the messages that are sent to the session."""
     perturb, data = bench.viewer.perturb, bench.viewer.data
     perturb.select = bench.model.body(body).id
     perturb.flexselect = perturb.skinselect = -1

@@ -1,5 +1,3 @@
-"""Test the panel in a viewer without a screen: frames, windows, keys and cameras."""
-
 import mujoco
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ def bench() -> Bench:
 
 
 def pressed(bench: Bench, key: str, **status: object) -> list[object]:
-    """Return the commands that a key causes."""
     bench.show(status_of(**status))
     KEYS[key].action(bench.panel.actions)
     return list(bench.sent)
@@ -65,11 +62,11 @@ def ghost_beside(data: mujoco.MjData) -> Ghost:
 
 
 @pytest.mark.parametrize(("limit", "drawn"), [(100, 10), (3, 1)])
-def test_ghosts_and_traces_are_drawn_up_to_a_limit(limit: int, drawn: int) -> None:
+def test_transparent_copies_and_traces_are_drawn_up_to_a_limit(limit: int, drawn: int) -> None:
     model = robot()
     bench = Bench(model, scene_of(model), limit=limit)
     bench.draw(frame_of(model, bench.data, ghosts=(ghost_beside(bench.data),) * 2, traces=np.zeros((2, 5, 3))))
-    assert len(bench.viewer.extra_geoms) == drawn  # the goal body does not move
+    assert len(bench.viewer.extra_geoms) == drawn
 
 
 # keys
@@ -110,7 +107,7 @@ def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
 # cameras and videos
 
 
-def test_default_camera_of_window_and_videos_tracks_the_body_of_a_tracking_camera(bench: Bench) -> None:
+def test_default_camera_tracks_the_body_of_a_tracking_camera(bench: Bench) -> None:
     ball = bench.model.body("ball").id
     (command,) = pressed(bench, "Ctrl+V")
     assert isinstance(command, SetVideo) and command.camera is not None
@@ -124,9 +121,6 @@ def test_user_can_choose_a_fixed_camera_of_the_model(bench: Bench) -> None:
     bench.draw()
     assert bench.panel.actions.cameras.view()["fixedcamid"] == 0
     assert bench.viewer.camera_index == 0
-
-
-# these models differ between worlds
 
 
 def test_world_with_other_geom_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,3 @@
-"""Test that the proxy forwards valid requests and rejects attacks."""
-
 import contextlib
 import http.client
 import http.cookiejar
@@ -81,7 +79,6 @@ def token(proxy: Proxy) -> str:
 
 
 def answer_to(proxy: Proxy, lines: list[str], *, rest: bytes = b"") -> bytes:
-    """Return the proxy's complete response to the lines of a request head."""
     with socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client:
         if not any("Connection: " in line for line in lines):
             lines = [*lines, "Connection: close"]
@@ -97,7 +94,6 @@ def status(answer: bytes) -> int:
 
 
 def entered(proxy: Proxy) -> tuple[str, str]:
-    """Exchange the token for a cookie; return the cookie and its path."""
     answer = answer_to(proxy, [f"GET /?token={token(proxy)} HTTP/1.1", "Host: 127.0.0.1"]).decode()
     found = re.search(r"\r\nSet-Cookie: ([^;]*); Path=(/[^;]*)/;", answer)
     assert found is not None
@@ -108,8 +104,7 @@ def get(
     proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
     method: str = "GET", rest: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """Return the response to a request; words in capitals are placeholders for the proxy's port, path, cookie and
-    token."""
+    """Return the response to a request. Words in capitals stand for the proxy's port, path, cookie and token."""
     own, below = entered(proxy)
     words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
              "VALUE": own.partition("=")[2]}  # fmt: skip
@@ -147,8 +142,7 @@ def test_token_is_exchanged_for_a_cookie_and_removed_from_the_address(proxy: Pro
 
 
 class Jar(http.cookiejar.CookieJar):
-    """A cookie jar that behaves like a browser: it sends cookies to every port of their host, for addresses below their
-    path."""
+    """A cookie jar that, like a browser, sends cookies to every port of their host, below their path."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
@@ -223,10 +217,10 @@ def test_proxy_rejects_an_attack(
     assert not upstream.received
 
 
-# contents of Studio's responses that the proxy allows
+# Studio's responses
 
 
-def test_other_sites_cannot_read_or_embed_the_page_and_studio_sets_no_cookies(proxy: Proxy) -> None:
+def test_other_sites_cannot_read_or_embed_the_page(proxy: Proxy) -> None:
     for answer in (get(proxy, "/PATH/model"), get(proxy, cookie=""), get(proxy, host="x")):
         head = answer.partition(b"\r\n\r\n")[0].decode().lower()
         for line in ("content-security-policy: frame-ancestors http://localhost:* http://127.0.0.1:*\r\n",
@@ -309,7 +303,7 @@ def test_second_request_on_a_connection_is_also_checked(proxy: Proxy, upstream: 
     assert len(upstream.received) == 1
 
 
-# slow clients, and many clients
+# slow clients
 
 
 def test_slow_request_head_closes_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -319,7 +313,7 @@ def test_slow_request_head_closes_the_connection(monkeypatch: pytest.MonkeyPatch
         socket.create_connection(("127.0.0.1", proxy.port), timeout=10) as client,
         pytest.raises(ConnectionError),
     ):
-        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":  # the complete head takes too long
+        for byte in b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + 600 * b"a":
             client.send(bytes([byte]))
             time.sleep(0.02)
 
@@ -330,7 +324,7 @@ def test_silent_connections_do_not_block_other_connections(proxy: Proxy, monkeyp
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", proxy.port))) for _ in range(40)]
         assert status(get(proxy)) == 200
         silent[0].settimeout(5)
-        assert silent[0].recv(1) == b""  # the oldest connections were closed
+        assert silent[0].recv(1) == b""
 
 
 def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -355,8 +349,7 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
 
 @pytest.fixture
 def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
-    """Run a proxy in front of a WebSocket server of Studio's library; yield the proxy, the open connections, and the
-    times at which silence was reported."""
+    """Run a proxy of a WebSocket server; yield the proxy, the connections, and the times of reported silence."""
     opened: list[ServerConnection] = []
     quiet: list[float] = []
 
@@ -404,7 +397,7 @@ def test_proxy_serves_two_tabs_at_the_same_time_and_one_may_close(echo: Echo) ->
 def test_page_receives_the_reason_for_a_closed_websocket(echo: Echo) -> None:
     with open_tab(echo[0]) as tab:
         tab.send("close")
-        with pytest.raises(ConnectionClosed, match="4001.*control taken"):  # a close code that Studio defines
+        with pytest.raises(ConnectionClosed, match="4001.*control taken"):
             tab.recv(timeout=10)
     with open_tab(echo[0]) as tab, pytest.raises(ConnectionClosed):
         tab.send(bytes(2**20 + 1))  # too large
@@ -412,11 +405,11 @@ def test_page_receives_the_reason_for_a_closed_websocket(echo: Echo) -> None:
     wait_until(lambda: not echo[1])
 
 
-def test_private_server_notices_a_tab_that_disappears(echo: Echo) -> None:
+def test_private_server_notices_a_lost_tab(echo: Echo) -> None:
     proxy, opened, _ = echo
     tab = open_tab(proxy)
     wait_until(lambda: len(opened) == 1)
-    tab.socket.shutdown(socket.SHUT_RDWR)  # the system closes the connection of a killed browser in the same way
+    tab.socket.shutdown(socket.SHUT_RDWR)  # a killed browser's connection is closed in the same way
     wait_until(lambda: not opened)
 
 
@@ -425,7 +418,7 @@ def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytes
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
         tab.send(b"input")
-        wait_until(lambda: len(quiet) == 1)  # the browser's tab may be hidden, or its connection may be lost
+        wait_until(lambda: len(quiet) == 1)  # the tab may be hidden, or the connection may be lost
         tab.send(b"input")
     wait_until(lambda: len(quiet) == 2)  # closed
     time.sleep(1.0)

@@ -20,7 +20,7 @@ def ghost(x: float, opacity: float = 0.3) -> Ghost:
     return Ghost(pose(x), (0.2, 0.4, 0.6, opacity))
 
 
-def test_ghost_draws_the_moving_geoms_of_the_model_in_its_own_colour() -> None:
+def test_transparent_copy_draws_the_moving_geoms_in_its_own_colour() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
     assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
@@ -28,12 +28,12 @@ def test_ghost_draws_the_moving_geoms_of_the_model_in_its_own_colour() -> None:
     assert geoms[0].transparent
 
 
-def test_geom_groups_that_are_hidden_have_no_ghosts() -> None:
+def test_hidden_geom_groups_have_no_transparent_copies() -> None:
     groups = np.zeros(6, np.uint8)
     assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
 
 
-def test_ghost_omits_geoms_that_coincide_with_those_of_the_world_in_view() -> None:
+def test_copies_that_coincide_with_the_world_in_view_are_omitted() -> None:
     geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 
@@ -44,14 +44,12 @@ def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, bes
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(pose(0), traces=traces, best=best)
-    assert len(geoms) <= min(
-        limit, 160
-    )  # traces use only some of the available geoms, so that the others remain for ghosts
+    assert len(geoms) <= min(limit, 160)
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
     assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
 
 
-# the tests below check the model of the world in view
+# model values
 
 
 def test_model_values_of_a_world_are_set_and_reset() -> None:

@@ -1,5 +1,3 @@
-"""Check that mujoco.studio has the interface that the viewer uses."""
-
 import ast
 import socket
 from pathlib import Path
@@ -17,7 +15,6 @@ NAMES = {"imgui": studio.imgui, "implot": studio.implot, "ux": studio.ux, "input
 
 
 def used_names(path: Path) -> set[str]:
-    """List the attributes of Studio's modules that a file reads, such as "ux.GuiTheme.LIGHT"."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Attribute):
@@ -37,7 +34,7 @@ def test_studio_has_every_name_that_the_window_uses(name: str) -> None:
 
 
 def test_screen_does_not_listen_on_a_public_socket_of_studio(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test simulates a later version of Studio that no longer calls bind_public_socket."""
+    """The test simulates a later version of Studio that does not call bind_public_socket."""
 
     def start(config: object, endpoint: object, plugins: list[object]) -> None:
         plugin_registry.PluginRegistry(plugins).dispatch(studio.Started(viewer=None))
