@@ -5,7 +5,7 @@ from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# rules of check_task that depend on the model; slow engines and models run only these
+# rules that depend on the model; slow engines and models check only these
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,

@@ -61,7 +61,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
     """With less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts.
 
-    The sizes depend on the MuJoCo version, so the test tries many.
+    The memory sizes depend on the MuJoCo version, so the test tries many.
     """
     found = Done(0)
     for memory in range(3000, 14_000, 1000):

@@ -219,7 +219,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 @pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # a substep of the Warp engine has hundreds of launches on the CPU, so two must suffice
+    # a substep of the Warp engine has hundreds of launches on the CPU, so the test takes only two
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)

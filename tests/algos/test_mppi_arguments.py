@@ -190,7 +190,7 @@ def test_omitted_settings_get_the_defaults_of_the_update() -> None:
         return config.include_plan, config.elites, config.min_noise
 
     assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
-    assert chosen(samples=1)[0] is False  # a single sample would be the plan itself, and nothing new would be tried
+    assert chosen(samples=1)[0] is False  # a single sample would be the plan itself
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 

@@ -357,7 +357,7 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 @pytest.mark.gpu
 def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every other synchronizing call raises an error."""
+    """All synchronizing calls except one raise an error."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 

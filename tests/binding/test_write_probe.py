@@ -22,7 +22,7 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""For each function: the parameter value that selects it, size and name of its array, and words of the error."""
+"""For each function: value of the parameter, size and name of the array, and words of the error."""
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -35,7 +35,7 @@ def settled_again() -> None:
 def options(task: str, engine: str) -> dict[str, int]:
     """Return how many steps the long rules take.
 
-    For hopper, they suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
+    For hopper, the steps suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
     milliseconds.
     """
     every = task in EVERY_RULE[engine]

@@ -375,7 +375,7 @@ SLIDERS = """<mujoco><worldbody>
 
 
 def test_inverse_weights_equal_those_of_a_compiled_model() -> None:
-    """If a body cannot move in a direction, MuJoCo's inverse weight is 0. MuJoCo Warp's ``set_const`` differs."""
+    """If a body cannot move in a direction, MuJoCo sets its inverse weight to 0. MuJoCo Warp does not."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

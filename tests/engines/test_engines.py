@@ -151,7 +151,7 @@ def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: st
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_do_not_change_the_simulation(file: Path, engine: str) -> None:
-    """Only the size of the state changes, by the field of the acceleration stage."""
+    """The state only grows by an acceleration field."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)

@@ -284,7 +284,7 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
-    """Worlds that share an MjData run each stage one after another. Other fields then hold values of another world."""
+    """Worlds that share an MjData run each stage in turn. Fields of other stages then belong to another world."""
     model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]

@@ -160,7 +160,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Fields that need other levels to have an effect. All other factors have the levels in ``DRAWN``."""
+"""Levels that a field needs to have an effect, by field. All other factors have the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

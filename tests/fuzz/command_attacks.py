@@ -52,7 +52,7 @@ FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict
 )
 
 _OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
-"""Omitted flags: they print, start other processes, or lead to native calls of hours."""
+"""These flags are omitted: they print, start other processes, or make native calls run for hours."""
 
 
 @functools.cache

@@ -42,7 +42,7 @@ def each(names: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
 def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Return ``outcomes(program, random)``, which runs random cases or all minimal cases.
 
-    The folder of the cases has a constant path.
+    The cases run in a folder at a constant path.
     """
     cache = getattr(pytestconfig, "cache", None)
     parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")

@@ -88,7 +88,7 @@ def test_threads_divide_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.M
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # first calls launch for all worlds, second calls capture, and later calls split the worlds if the phase allows it
+    # launch for all worlds, then capture, then split the worlds in phases that allow it
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 

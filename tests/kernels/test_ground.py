@@ -134,7 +134,7 @@ def levels(level: int, walked: float, commanded: float, rng: wp.array2d[wp.uint3
 
 
 def next_levels(level: int, walked: float, commanded: float) -> np.ndarray:
-    """Return the next level for different random numbers. The terrain has five levels of 8 m patches."""
+    """Return the next terrain levels for different random numbers. The terrain has five levels of 8 m patches."""
     rng = wp.array(np.arange(2000, dtype=np.uint32).reshape(-1, 1), dtype=wp.uint32, device="cpu")
     out = wp.zeros(len(rng), dtype=int, device="cpu")
     wp.launch(levels, len(rng), [level, walked, commanded, rng, out], device="cpu")

@@ -1,6 +1,6 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-The C engine uses float64, and the Warp engine float32. The tests use elliptic friction cones: for pyramidal cones,
+The C engine uses float64, and the Warp engine float32. The tests use elliptic friction cones. With pyramidal cones,
 trajectories differ, because MuJoCo and MuJoCo Warp use different contact frames for a capsule on a plane.
 """
 

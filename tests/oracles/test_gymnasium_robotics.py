@@ -76,7 +76,7 @@ class Pair:
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps of the episode in which Gymnasium-Robotics reported the goal as achieved."""
+        """Number of steps in which Gymnasium-Robotics reported that the goal was achieved."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
@@ -304,7 +304,7 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
 
 
 def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv, task: str) -> None:
-    """Only bodies that a reset moves, duplicate pairs, and the order of sensor sites may differ."""
+    """The order of sensor sites, duplicate pairs, and bodies that a reset moves may differ."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
     others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}

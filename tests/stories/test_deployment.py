@@ -80,7 +80,7 @@ def test_control_loop_in_the_documentation_equals_the_environment(
 
 
 def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
-    """The program in the documentation walks for the given time with these names."""
+    """The program in the documentation uses these names."""
     env = lw.make("go1_velocity")
     policy, model = walking_policy(env), copy.copy(env.model)
     robot = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), model)
