@@ -66,14 +66,13 @@ if TYPE_CHECKING:
     from lyceum_warp.terrain import Terrain, height_field, scan_grid
     from lyceum_warp.training import train
     from lyceum_warp.tuning.search import Tuning, tune
-    from lyceum_warp.viewer.follow import RunViewer
     from lyceum_warp.viewer.show import view
 
 __all__ = [
     "CEM", "MPPI", "NPG", "PPO", "SAC", "ControlProgress", "ControlReport", "Controller", "Done", "Env", "EnvOptions",
     "Episodes", "GaussianPolicy", "Iteration", "Learner", "MPPIConfig", "Mirror", "ModelFile", "NPGConfig", "OpenLoop",
     "PPOConfig", "PhysicsOptions", "PlanSamples", "PlanUpdate", "Planner", "Planning", "PlanningController",
-    "PredictiveSampling", "Replay", "Rollout", "Row", "RunViewer", "SACConfig", "Sigmoid", "SquashedPolicy", "Task",
+    "PredictiveSampling", "Replay", "Rollout", "Row", "SACConfig", "Sigmoid", "SquashedPolicy", "Task",
     "Terrain", "Training", "Trajectory", "Transfer", "Transitions", "Tuning", "TwinCritic", "ValueFunction", "act",
     "actuator", "actuators", "all_inside", "angle_between", "bodies", "body", "body_velocity", "camera", "control",
     "control_async", "control_report", "ctrl", "dof", "dofs", "equality", "evaluate", "export_policy",
@@ -142,7 +141,6 @@ _NAMES = {
     "terrain": "Terrain height_field scan_grid",
     "training": "train",
     "tuning.search": "Tuning tune",
-    "viewer.follow": "RunViewer",
     "viewer.show": "view",
 }
 """Public names by module."""

@@ -1,6 +1,5 @@
 """Train a policy: lyceum-warp train."""
 
-import contextlib
 import dataclasses
 import datetime
 import json
@@ -34,7 +33,6 @@ from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.task import Training
 from lyceum_warp.training import train
-from lyceum_warp.viewer.follow import RunViewer
 from lyceum_warp.viz.cameras import parsed_camera
 from lyceum_warp.viz.learning_curve import learning_curve
 from lyceum_warp.viz.long_work import LongWork
@@ -78,7 +76,7 @@ class Train:
     """
 
     USUAL = (
-        "algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "view", "device",
+        "algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device",
     )  # fmt: skip
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
@@ -141,10 +139,6 @@ class Train:
     trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
-    view: bool = False
-    """Whether to show the newest policy during training, like lyceum-warp view FOLDER --follow in another shell."""
-    port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Port of the viewer with --view; by default the first free port from 8080 on."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
@@ -170,8 +164,6 @@ class Train:
             raise ValueError("--trust has no effect without --resume or --from: omit it")
         if self.take_over and self.resume is None:
             raise ValueError("--take-over has no effect without --resume: omit it")
-        if self.port is not None and not self.view:
-            raise ValueError(f"--port {self.port} has no effect without --view: omit it")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings, defaults = {}, _SETTINGS if source else _SETTINGS | {"iterations": self._suggestion().iterations}
@@ -186,12 +178,11 @@ class Train:
                 learner, folder, entries = self._learner(source, team)
             leads, total = learner.team.leads, settings["iterations"]
             try:
-                with RunViewer(folder, port=self.port) if self.view and leads else contextlib.nullcontext():
-                    run = train(
-                        learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                        take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
-                        display=Display(console), **settings,
-                    )  # fmt: skip
+                run = train(
+                    learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
+                    take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
+                    display=Display(console), **settings,
+                )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
                     done = read_checkpoint(path, parts=("iteration",))["iteration"]

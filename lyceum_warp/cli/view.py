@@ -1,12 +1,6 @@
 """Show a task, a policy, a planner or saved episodes: lyceum-warp view."""
 
-import contextlib
 import dataclasses
-import json
-import os
-import signal
-import sys
-import threading
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,22 +14,17 @@ from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
-from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
-from lyceum_warp.support.interrupts import Interrupted, signals
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.viewer.follow import Follower, wait_for_run
+from lyceum_warp.viewer.follow import Follower
 from lyceum_warp.viewer.session.clock import Watcher
 from lyceum_warp.viewer.show import view
 
 _RUN_WORLDS = 16
-_WAIT = 10.0  # seconds that --follow waits until the run starts
-_LONG = 1e9
-_NICE = 10  # low priority of the subprocess of `lw.RunViewer`
 
 
 class Place(
@@ -101,16 +90,12 @@ class View:
     planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
 
     def run(self) -> int:
-        """Run the command, and return the exit code."""
-        return self.show(_WAIT)
-
-    def show(self, seconds: float) -> int:
         """Run the command until the viewer is closed, and return the exit code."""
         _check(self)
         if self.pretrained:
             folder = pretrained_run(" ".join(self.what))
             note(pretrained_text(Run.open(folder)))
-            return dataclasses.replace(self, what=(str(folder),), pretrained=False).show(seconds)
+            return dataclasses.replace(self, what=(str(folder),), pretrained=False).run()
         torch.set_num_threads(1)
         kind = _kind(self.what)
         for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
@@ -119,31 +104,35 @@ class View:
                     f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: omit the flag"
                 )
         shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
-        watchers: list[Watcher] = []
+        params, words = parameters(self.param, self), given(self.place) | given(self.physics)
         if kind == "episodes":
+            if self.nworld is not None and self.nworld > 1:
+                raise ValueError(f"--nworld {self.nworld} has no effect for episodes: omit it")
             episodes = load_episodes(self.what)
-            env = _episodes_env(self, episodes)
             unique = len({file.name for file in episodes}) == len(episodes)
             named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
-            view(env, episodes=named, **shown)
+            view(episode_env(episodes, task=self.task, **params), episodes=named, **shown)
             return 0
         controllers: dict[str, Any] = {}
+        watchers: list[Watcher] = []
         if kind == "run":
-            run = _run(self, seconds)
-            env = _run_worlds(self, run)
+            if self.follow and self.which != "last":
+                raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit one of them")
+            run, nworld = Run.open(self.what[0]), self.nworld or _RUN_WORLDS
+            env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
+            policy = load(run, which=self.which, device=env.obs.device)
+            check_sizes(policy, env, run.policy_file(self.which))
+            controllers["policy"] = policy
             if self.follow:
-                follower = Follower(run, device=env.obs.device)
-                check_sizes(follower.policy, env, run.policy_file())
-                controllers["policy"] = follower
-                watchers.append(follower.update)
-            else:
-                policy = load(run, which=self.which, device=env.obs.device)
-                check_sizes(policy, env, run.policy_file(self.which))
-                controllers["policy"] = policy
+                watchers.append(Follower(run, policy))
+        elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
+            env = Env(self.what[0], autoreset=False, nthread=1, **params)
         else:
-            env = _task_worlds(self)
+            env = Env(self.what[0], nworld=self.nworld or 1, **words, **params)
         if self.mppi:
-            controllers["mppi"] = _planner(self, env)
+            config = self.planner.on_top_of(task_config(env.task.task))
+            words |= {} if env.options.model is None else {"model": env.options.model}
+            controllers["mppi"] = MPPI(env.task.task, config, seed=self.seed, params=env.given_params, **words)
         view(env, controllers, seed=self.seed, watchers=watchers, **shown)
         return 0
 
@@ -174,64 +163,3 @@ def _kind(what: tuple[str, ...]) -> str:
     if len(what) > 1 and kind != "episodes":
         raise ValueError(f"one {kind} can be shown at a time, not {len(what)}: {', '.join(what)}")
     return kind
-
-
-def _episodes_env(options: View, episodes: dict[Path, Trajectory]) -> Env:
-    if options.nworld is not None and options.nworld > 1:
-        raise ValueError(f"--nworld {options.nworld} has no effect for episodes: omit it")
-    return episode_env(episodes, task=options.task, **parameters(options.param, options))
-
-
-def _task_worlds(options: View) -> Env:
-    params = parameters(options.param, options)
-    nworld = options.nworld or 1
-    if options.mppi and nworld == 1:  # the planner controls this world itself instead of a copy
-        return Env(options.what[0], autoreset=False, nthread=1, **params)
-    return Env(options.what[0], nworld=nworld, **_words(options), **params)
-
-
-def _planner(options: View, env: Env) -> MPPI:
-    config = options.planner.on_top_of(task_config(env.task.task, None))
-    words = _words(options) | ({} if env.options.model is None else {"model": env.options.model})
-    return MPPI(env.task.task, config, seed=options.seed, params=env.given_params, **words)
-
-
-def _words(options: View) -> dict[str, Any]:
-    return given(options.place) | given(options.physics)
-
-
-def _run(options: View, seconds: float) -> Run:
-    folder = Path(options.what[0])
-    if not options.follow:
-        return Run.open(folder)
-    if options.which != "last":
-        raise ValueError(f"--follow shows the newest policy, not {options.which!r}: omit one of them")
-    return wait_for_run(folder, seconds=seconds)
-
-
-def _run_worlds(options: View, run: Run) -> Env:
-    nworld = options.nworld or _RUN_WORLDS
-    params = parameters(options.param, options)
-    return run_worlds(run, _words(options), params, nworld=nworld, task=options.task, trust=options.trust)
-
-
-def attached() -> None:
-    """Run the subprocess of ``lw.RunViewer``. It reads its arguments from stdin and ends with its parent process."""
-    with contextlib.suppress(OSError, AttributeError):  # not on Windows
-        os.nice(_NICE)
-    job = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        with signals():
-            View(what=(job["folder"],), follow=True, **job["options"]).show(_LONG)
-    except (ValueError, OSError, RuntimeError, ImportError) as error:
-        note(f"the viewer of {job['folder']} ended: {' '.join(str(error).split())}")
-    except Interrupted:
-        pass
-
-
-def _end_with_parent() -> None:
-    """End this process at EOF on stdin. The parent process has then ended, perhaps by SIGKILL."""
-    with contextlib.suppress(OSError, ValueError):
-        sys.stdin.read()
-    os.kill(os.getpid(), signal.SIGTERM)

@@ -51,7 +51,7 @@ FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict
     ("train --resume good", "train --from good"), ""
 )
 
-_OMIT = ("--help", "--video", "--video-every", "--view", "--frame-skip")
+_OMIT = ("--help", "--video", "--video-every", "--frame-skip")
 """These flags are omitted: they print, start other processes, or make native calls run for hours."""
 
 
