@@ -19,7 +19,7 @@ from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.policy_videos import one_line
 
 _TABLE_ROWS = 15

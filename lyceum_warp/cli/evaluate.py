@@ -25,8 +25,8 @@ from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
-from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.policy_videos import policy_video
 from lyceum_warp.viz.video import check_video
 

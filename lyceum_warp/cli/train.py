@@ -31,11 +31,11 @@ from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_netw
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted, obeyed
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.task import Training
 from lyceum_warp.training import train
 from lyceum_warp.viz.cameras import parsed_camera
 from lyceum_warp.viz.learning_curve import learning_curve
-from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.policy_videos import policy_video
 
 _FINAL_EPISODES = 32

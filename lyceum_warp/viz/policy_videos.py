@@ -15,8 +15,8 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.env import Env
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.long_work import LongWork
 from lyceum_warp.viz.video import Progress, write_video
 
 log = logging.getLogger(__name__)

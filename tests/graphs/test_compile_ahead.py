@@ -37,8 +37,7 @@ def launches():
     wp.launch(two, 4, [a])
     wp.launch(never, 0, [a])
 
-built = compile_ahead(launches, wp.get_device("cpu"), "a test")
-print(built.modules, built.known)
+print(len(compile_ahead(launches, wp.get_device("cpu"), "a test")))
 """
 
 
@@ -52,15 +51,13 @@ def test_kernels_are_compiled_once_with_progress_messages(
     env = {**os.environ, "WARP_CACHE_PATH": str(cache)}
     done = subprocess.run([sys.executable, script], env=env, capture_output=True, text=True, check=True)
     lines = [line for line in done.stderr.splitlines() if "CUDA" not in line]
-    assert done.stdout.strip() == "2 0"
-    assert lines[0].startswith("compiling kernels of a test for cpu: 2 modules on ")
-    assert len(lines) == 3 and all(line.strip().startswith(f"{i}/2 ") for i, line in enumerate(lines[1:], 1))
-    assert {line.split()[1].rsplit("_", 1)[0] for line in lines[1:]} == {"one", "two"}
+    assert done.stdout.strip() == "2"
+    assert lines[0] == "compiling kernels of a test for cpu: 0 of 2 modules, 0 s"
     (folder,) = {path.parent.parent for path in cache.rglob("*.o")}
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
     runpy.run_path(str(script))
     said = capsys.readouterr()
-    assert (said.out.strip(), said.err) == ("0 2", "")
+    assert (said.out.strip(), said.err) == ("0", "")
 
 
 @pytest.mark.long
@@ -72,8 +69,7 @@ def test_c_engine_also_reports_compilation_for_a_new_task(
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", "class Compiled")), "compiled.py")
     env = lw.make(str(file), engine="mujoco")
     lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("compiling kernels of compiled for cpu: ") and lines[0].endswith(", needed only once")
-    assert any("Compiled" in line for line in lines[1:]), lines
+    assert lines[0].startswith("compiling kernels of compiled for cpu: 0 of ")
     modules = len(list(tmp_path.rglob("*.o")))
     env.step()
     lw.make(str(file), engine="mujoco")

@@ -7,22 +7,23 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class LongWork:
-    """Shows the progress of long work: a temporary bar on a terminal, otherwise a line after 3 s and then every 10 s.
+    """Shows the progress of long work: a temporary bar on a terminal, otherwise a line every 10 s.
 
     Args:
         text: The name of the work.
         unit: The name of the counted units, such as "frames".
         console: The output; by default stderr.
+        wait: Seconds until the first line.
     """
 
-    def __init__(self, text: str, unit: str, console: Console | None = None) -> None:
+    def __init__(self, text: str, unit: str, console: Console | None = None, *, wait: float = 3.0) -> None:
         self.text, self.unit, self.console = text, unit, console or Console(highlight=False, stderr=True)
         self.progress = Progress(
             TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
             TimeElapsedColumn(), console=self.console, transient=True, disable=not self.console.is_terminal,
         )  # fmt: skip
         self.bar = self.progress.add_task(text, total=None)
-        self.start, self.next = time.monotonic(), 3.0
+        self.start, self.next = time.monotonic(), wait
 
     def __enter__(self) -> "LongWork":
         self.progress.start()

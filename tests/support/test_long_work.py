@@ -2,7 +2,7 @@ import io
 
 from rich.console import Console
 
-from lyceum_warp.viz.long_work import LongWork
+from lyceum_warp.support.long_work import LongWork
 
 
 def test_long_work_prints_its_progress_regularly() -> None:
