@@ -8,6 +8,7 @@ fixed length in the Fisher metric.
 import copy
 import functools
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -17,17 +18,10 @@ from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
-from lyceum_warp.algos.npg_statistics import (
-    NPGIteration,
-    ProcessNumbers,
-    UpdateNumbers,
-    ValueSums,
-    prediction_sums,
-    summary,
-)
+from lyceum_warp.algos.npg_statistics import NPGIteration, prediction_sums, value_statistics
 from lyceum_warp.algos.on_policy import OnPolicyLearner
 from lyceum_warp.algos.policy import GaussianPolicy, divergence
-from lyceum_warp.algos.rollout_statistics import finished, metric_sums
+from lyceum_warp.algos.rollout_statistics import gathered
 from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
 from lyceum_warp.algos.value_fit import ValueFit
@@ -167,20 +161,21 @@ class NPG(OnPolicyLearner):
             fitted = fit_result()
 
         # one copy to the host
-        update = UpdateNumbers(
-            finite=finite, kl=kl, step_norm=step.norm(), step_fraction=fraction, gradient_norm=gradient.norm(),
-            std_mean=self.policy.log_std.detach().exp().mean(), reward=rollout.reward.double().mean(),
-            faults=rollout.faults.sum(), outliers=outliers, fitted=fitted,
-        )  # fmt: skip
-        packed = ProcessNumbers(update, prediction, finished(rollout), metric_sums(rollout)).pack()
-        processes = [ProcessNumbers.unpack(numbers) for numbers in team.gather(packed[None]).tolist()]
-        self._check_updates(processes[0].update)
+        update = {
+            "kl": kl, "step_norm": step.norm(), "step_fraction": fraction, "gradient_norm": gradient.norm(),
+            "std_mean": self.policy.log_std.detach().exp().mean(),
+        }  # fmt: skip
+        rest = {"finite": finite, "fitted": fitted, "outliers": outliers, **prediction}
+        statistics, processes = gathered(rollout, team, update | rest)
+        statistics |= {name: processes[0][name] for name in update} | value_statistics(processes, len(obs))
+        statistics["outliers"] = round(sum(process["outliers"] for process in processes))
+        statistics["skipped_updates"] = self._check_updates(processes[0])
         timer.mark()
 
         # 7. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
-        statistics = self._with_mean_policy(summary(processes, len(obs), self.env.task.metrics))
+        statistics = self._with_mean_policy(statistics)
         timer.mark()
 
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
@@ -196,8 +191,9 @@ class NPG(OnPolicyLearner):
             samples_per_second=self.count / time_sample,
         )
 
-    def _check_updates(self, update: UpdateNumbers) -> None:
-        parts = {"the step of the policy": update.finite, "the fit of the value function": update.fitted}
+    def _check_updates(self, update: Mapping[str, float]) -> int:
+        """Count skipped updates, and raise an error after too many consecutive iterations with a skipped update."""
+        parts = {"the step of the policy": update["finite"], "the fit of the value function": update["fitted"]}
         skipped = [part for part, finite in parts.items() if not finite]
         self._skipping = self._skipping + 1 if skipped else 0
         if self._skipping >= _PATIENCE:
@@ -207,6 +203,7 @@ class NPG(OnPolicyLearner):
                 f"in the {_PATIENCE - 1} iterations before; all these updates were skipped. "
                 f"{self.rollout.explain_not_finite()}"
             )
+        return len(skipped)
 
     def sample(self) -> None:
         """Fill the rollout buffer with samples of the current policy."""
@@ -217,7 +214,7 @@ class NPG(OnPolicyLearner):
             self.env.update_shared(self.team.sum)
 
     @torch.no_grad()
-    def advantages(self) -> tuple[torch.Tensor, torch.Tensor, ValueSums, torch.Tensor]:
+    def advantages(self) -> tuple[torch.Tensor, torch.Tensor, dict[str, torch.Tensor], torch.Tensor]:
         """Compute generalised advantages and discounted returns of the rollout.
 
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have

@@ -1,21 +1,11 @@
-"""Collect the statistics of an NPG iteration in each process, and summarise them over all processes."""
+"""Compute the statistics of an NPG iteration that concern the value function."""
 
 import dataclasses
-import itertools
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
 
 import torch
 
-from lyceum_warp.algos.rollout_statistics import (
-    EpisodeSums,
-    Moments,
-    OnPolicyIteration,
-    Scalar,
-    episode_statistics,
-    metric_means,
-    pooled,
-)
+from lyceum_warp.algos.rollout_statistics import Moments, OnPolicyIteration, pooled
 from lyceum_warp.support.docstrings import document_attributes
 
 
@@ -51,91 +41,21 @@ class NPGIteration(OnPolicyIteration):
     ``time_solve``."""
 
 
-class UpdateNumbers(NamedTuple):
-    """Statistics of one update of the policy, named as in ``NPGIteration``."""
-
-    finite: Scalar  # whether the step is finite
-    kl: Scalar
-    step_norm: Scalar
-    step_fraction: Scalar
-    gradient_norm: Scalar
-    std_mean: Scalar
-    # of this process only
-    reward: Scalar
-    faults: Scalar
-    outliers: Scalar
-    fitted: Scalar  # whether the value function's fit is finite
-
-
-class ValueSums(NamedTuple):
-    """Moments of one process's discounted returns, and of the value function's errors (return minus prediction)."""
-
-    return_mean: Scalar
-    return_square: Scalar  # sum of squared deviations
-    error_mean: Scalar
-    error_square: Scalar
-
-
-class ProcessNumbers(NamedTuple):
-    """One process's part of the statistics of an iteration."""
-
-    update: UpdateNumbers
-    values: ValueSums
-    episodes: EpisodeSums
-    metrics: tuple[Scalar, ...] = ()
-
-    def pack(self) -> torch.Tensor:
-        """Pack all numbers into one float64 tensor."""
-        return torch.stack([number.double() for part in self for number in part])
-
-    @classmethod
-    def unpack(cls, numbers: Iterable[float]) -> "ProcessNumbers":
-        """Unpack the result of ``pack``."""
-        rest = iter(numbers)
-        return cls(
-            update=UpdateNumbers(*itertools.islice(rest, len(UpdateNumbers._fields))),
-            values=ValueSums(*itertools.islice(rest, len(ValueSums._fields))),
-            episodes=EpisodeSums(*itertools.islice(rest, len(EpisodeSums._fields))),
-            metrics=tuple(rest),
-        )
-
-
-def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> ValueSums:
-    """Compute the moments of returns and of prediction errors."""
+def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Compute the mean of returns and of prediction errors, and the sums of squared deviations, as scalar tensors."""
     target, error = returns.double(), (returns - predicted).double()
-    return ValueSums(
-        return_mean=(return_mean := target.mean()),
-        return_square=(target - return_mean).square().sum(),
-        error_mean=(error_mean := error.mean()),
-        error_square=(error - error_mean).square().sum(),
-    )
-
-
-def summary(processes: Sequence[ProcessNumbers], samples: int, metrics: Sequence[str] = ()) -> dict[str, Any]:
-    """Combine the numbers of all processes, as floats, into fields of ``NPGIteration``."""
-    update = processes[0].update
     return {
-        "reward_mean": sum(process.update.reward for process in processes) / len(processes),
-        **episode_statistics([process.episodes for process in processes]),
-        "kl": update.kl,
-        "step_norm": update.step_norm,
-        "step_fraction": update.step_fraction,
-        "gradient_norm": update.gradient_norm,
-        "std_mean": update.std_mean,
-        **value_statistics([process.values for process in processes], samples),
-        "faults": round(sum(process.update.faults for process in processes)),
-        "outliers": round(sum(process.update.outliers for process in processes)),
-        "skipped_updates": (not update.finite) + (not update.fitted),
-        **metric_means(
-            sum(process.episodes.episodes for process in processes), [process.metrics for process in processes], metrics
-        ),
+        "target_mean": (target_mean := target.mean()),
+        "target_square": (target - target_mean).square().sum(),
+        "error_mean": (error_mean := error.mean()),
+        "error_square": (error - error_mean).square().sum(),
     }
 
 
-def value_statistics(sums: Sequence[ValueSums], samples: int) -> dict[str, float]:
-    """Compute the statistics of the value function, with ``samples`` samples from each process."""
-    n, mean, square = pooled([Moments(samples, part.return_mean, part.return_square) for part in sums])
-    _, error_mean, error_square = pooled([Moments(samples, part.error_mean, part.error_square) for part in sums])
+def value_statistics(sums: Sequence[Mapping[str, float]], samples: int) -> dict[str, float]:
+    """Compute ``value_error`` and ``explained_variance`` from each process's sums over its ``samples`` samples."""
+    n, mean, square = pooled([Moments(samples, part["target_mean"], part["target_square"]) for part in sums])
+    _, error_mean, error_square = pooled([Moments(samples, part["error_mean"], part["error_square"]) for part in sums])
     error, size = error_square + n * error_mean**2, square + n * mean**2
     return {
         "value_error": error / max(size, 1e-20 * n),

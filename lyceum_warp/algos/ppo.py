@@ -20,14 +20,7 @@ from lyceum_warp.algos.networks import LIMIT
 from lyceum_warp.algos.on_policy import OnPolicyLearner
 from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.rollout_statistics import (
-    EpisodeSums,
-    OnPolicyIteration,
-    episode_statistics,
-    finished,
-    metric_means,
-    metric_sums,
-)
+from lyceum_warp.algos.rollout_statistics import OnPolicyIteration, gathered
 from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
@@ -184,19 +177,13 @@ class PPO(OnPolicyLearner):
         # one copy to the host
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
-        numbers = [
-            *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(),
-            finite, kl, self.policy.log_std.detach().exp().mean(), self.rate, *losses,
-        ]  # fmt: skip
-        processes = team.gather(torch.stack([number.double() for number in numbers])[None]).tolist()
+        statistics, (update, *_) = gathered(rollout, team, {
+            "finite": finite, "kl": kl, "std_mean": self.policy.log_std.detach().exp().mean(),
+            "learning_rate": self.rate, "value_loss": losses[0], "surrogate_loss": losses[1], "entropy": losses[2],
+        })  # fmt: skip
         self._recent.extend(self._returns()[-RECENT:])
         timer.mark()
-        split = len(EpisodeSums._fields)
-        end = split + 2 * len(self.env.metrics)
-        episodes = [EpisodeSums(*process[:split]) for process in processes]
-        metrics, sums = [process[split:end] for process in processes], [process[end:] for process in processes]
-        _, _, finite, kl, std, rate, value_loss, surrogate, entropy = sums[0]
-        if not finite:
+        if not update.pop("finite"):
             raise FloatingPointError(
                 f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards, "
                 "smaller"
@@ -205,28 +192,20 @@ class PPO(OnPolicyLearner):
         # 4. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
-        statistics = self._with_mean_policy(episode_statistics(episodes))
+        statistics = self._with_mean_policy(statistics)
         timer.mark()
 
         time_sample, time_update, time_mean = timer.seconds()
         return PPOIteration(
             iteration=self.iteration,
             samples=self.samples,
-            reward_mean=sum(process[0] for process in sums) / len(sums),
             **statistics,
-            kl=kl,
-            std_mean=std,
+            **update,
             return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
-            learning_rate=rate,
-            surrogate_loss=surrogate,
-            entropy=entropy,
-            value_loss=value_loss,
-            faults=round(sum(process[1] for process in sums)),
             time_sample=time_sample,
             time_update=time_update,
             time_mean=time_mean,
             samples_per_second=self.count / time_sample,
-            **metric_means(sum(part.episodes for part in episodes), metrics, list(self.env.metrics)),
         )
 
     @torch.no_grad()

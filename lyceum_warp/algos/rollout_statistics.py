@@ -2,11 +2,12 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
 
+from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.learner import NESTED, Iteration
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
@@ -73,6 +74,34 @@ class Moments(NamedTuple):
     n: float
     mean: float
     square: float
+
+
+def gathered(
+    rollout: Rollout, team: Team, numbers: Mapping[str, torch.Tensor]
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """Gather the statistics of all processes in one copy to the host.
+
+    Args:
+        rollout: This process's samples.
+        team: The processes.
+        numbers: Further numbers of this process, scalar tensors by name.
+
+    Returns:
+        The fields of ``SampledIteration`` that describe samples and episodes, by name; and ``numbers`` of each process.
+    """
+    samples = [rollout.reward.double().mean(), rollout.faults.sum()]
+    scalars = [*samples, *finished(rollout), *metric_sums(rollout), *numbers.values()]
+    processes = team.gather(torch.stack([scalar.double() for scalar in scalars])[None]).tolist()
+    split = len(samples) + len(EpisodeSums._fields)
+    end = split + 2 * len(rollout.metrics)
+    rewards, faults = ([process[i] for process in processes] for i in range(len(samples)))
+    episodes = [EpisodeSums(*process[len(samples) : split]) for process in processes]
+    sums, count = [process[split:end] for process in processes], sum(part.episodes for part in episodes)
+    statistics = {
+        "reward_mean": sum(rewards) / len(processes), "faults": round(sum(faults)), **episode_statistics(episodes),
+        **metric_means(count, sums, list(rollout.metrics)),
+    }  # fmt: skip
+    return statistics, [dict(zip(numbers, process[end:], strict=True)) for process in processes]
 
 
 def finished(rollout: Rollout) -> EpisodeSums:

@@ -21,14 +21,7 @@ from lyceum_warp.algos.minibatches import precision, room
 from lyceum_warp.algos.networks import trainable
 from lyceum_warp.algos.replay import Replay, Transitions, default_capacity
 from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.rollout_statistics import (
-    EpisodeSums,
-    SampledIteration,
-    episode_statistics,
-    finished,
-    metric_means,
-    metric_sums,
-)
+from lyceum_warp.algos.rollout_statistics import SampledIteration, gathered
 from lyceum_warp.algos.sac_config import SACConfig
 from lyceum_warp.algos.squashed_policy import SquashedPolicy
 from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
@@ -221,49 +214,35 @@ class SAC(Learner):
 
         # one copy to the host
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
-        numbers = [
-            *finished(rollout), *metric_sums(rollout), rollout.reward.double().mean(), rollout.faults.sum(), finite,
-            self.log_temperature.detach().exp(), *self._sums,
-        ]  # fmt: skip
-        processes = team.gather(torch.stack([number.double() for number in numbers])[None]).tolist()
+        sums = dict(zip(("critic_loss", "q_mean", "actor_loss", "entropy"), self._sums, strict=True))
+        numbers = {"finite": finite, "temperature": self.log_temperature.detach().exp(), **sums}
+        statistics, (update, *_) = gathered(rollout, team, numbers)
         times = timer.seconds()
-        split = len(EpisodeSums._fields)
-        end = split + 2 * len(self.env.metrics)
-        episodes = [EpisodeSums(*process[:split]) for process in processes]
-        metrics, sums = [process[split:end] for process in processes], [process[end:] for process in processes]
-        _, _, finite, temperature, *losses = sums[0]
-        if not finite:
+        if not update.pop("finite"):
             raise FloatingPointError(
                 f"the updates of iteration {self.iteration + 1} are not finite: make learning_rate, or the rewards, "
                 "smaller"
             )
-        critic_loss, q_mean, actor_loss, entropy = (number / updates if updates else math.nan for number in losses)
+        update |= {name: update[name] / updates if updates else math.nan for name in sums}
 
         # 3. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
         timer, every = PhaseTimer(self.env.obs.device), config.mean_every
         due = every > 0 and self.iteration % every == 0
-        statistics = self._evaluate_mean.added(episode_statistics(episodes), self.policy, due=due)
+        statistics = self._evaluate_mean.added(statistics, self.policy, due=due)
         timer.mark()
 
         time_sample, time_update = sum(times[::2]), sum(times[1::2])
         return SACIteration(
             iteration=self.iteration,
             samples=self.samples,
-            reward_mean=sum(process[0] for process in sums) / len(sums),
             **statistics,
-            critic_loss=critic_loss,
-            q_mean=q_mean,
-            actor_loss=actor_loss,
-            entropy=entropy,
-            temperature=temperature,
-            faults=round(sum(process[1] for process in sums)),
+            **update,
             time_sample=time_sample,
             time_update=time_update,
             time_mean=timer.seconds()[0],
             samples_per_second=self.count / (time_sample + time_update),
-            **metric_means(sum(part.episodes for part in episodes), metrics, list(self.env.metrics)),
         )
 
     @torch.no_grad()

@@ -7,18 +7,12 @@ import torch
 from metered_task import Metered
 
 import lyceum_warp as lw
-from lyceum_warp.algos.npg_statistics import (
-    ProcessNumbers,
-    UpdateNumbers,
-    ValueSums,
-    prediction_sums,
-    summary,
-    value_statistics,
-)
+from lyceum_warp.algos.npg_statistics import prediction_sums, value_statistics
 from lyceum_warp.algos.rollout_statistics import (
     EpisodeSums,
     episode_statistics,
     finished,
+    metric_means,
     metric_sums,
 )
 
@@ -68,7 +62,10 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
 
 def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     returns, predicted = 3.0 + torch.randn(2, 50, dtype=torch.float64), 2.0 + torch.randn(2, 50, dtype=torch.float64)
-    sums = [ValueSums(*(x.item() for x in prediction_sums(r, p))) for r, p in zip(returns, predicted, strict=True)]
+    sums = [
+        {name: number.item() for name, number in prediction_sums(*pair).items()}
+        for pair in zip(returns, predicted, strict=True)
+    ]
     error = returns - predicted
     assert value_statistics(sums, 50) == pytest.approx(
         {
@@ -84,21 +81,18 @@ def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
     expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
     assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
 
-    def numbers(worlds: slice) -> ProcessNumbers:
-        part = part_of(rollout, worlds)
-        zeros = [kind(*torch.zeros(len(kind._fields))) for kind in (UpdateNumbers, ValueSums)]
-        sums = ProcessNumbers(*zeros, finished(part), metrics=metric_sums(part))  # type: ignore[arg-type]
-        return ProcessNumbers.unpack(sums.pack().tolist())
+    def means(*shares: slice) -> dict[str, Any]:
+        parts = [part_of(rollout, worlds) for worlds in shares]
+        sums = [[number.item() for number in metric_sums(part)] for part in parts]
+        return metric_means(sum(finished(part).episodes.item() for part in parts), sums, list(expected))
 
-    parts = [numbers(slice(0, 1)), numbers(slice(1, None))]
-    for processes in ([numbers(slice(None))], parts):
-        assert summary(processes, 10, list(expected))["metrics"] == pytest.approx(expected, rel=1e-5)
+    for shares in ([slice(None)], [slice(0, 1), slice(1, None)]):
+        assert means(*shares)["metrics"] == pytest.approx(expected, rel=1e-5)
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
     for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
-        shares = [numbers(slice(k, k + count)) for k in range(0, rollout.env.nworld, count)]
-        assert summary(shares, 10, list(steps))["step_metrics"] == pytest.approx(steps, rel=1e-5)
-    none = [part._replace(episodes=EpisodeSums(*[0.0] * 9), metrics=(0.0,) * 4) for part in parts]
-    assert all(math.isnan(mean) for mean in summary(none, 10, list(expected))["metrics"].values())
+        shares = [slice(k, k + count) for k in range(0, rollout.env.nworld, count)]
+        assert means(*shares)["step_metrics"] == pytest.approx(steps, rel=1e-5)
+    assert all(math.isnan(mean) for mean in metric_means(0.0, [[0.0] * 4], list(expected))["metrics"].values())
 
 
 def test_metrics_row_has_a_column_for_each_metric() -> None:
