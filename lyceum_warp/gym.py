@@ -7,8 +7,9 @@ task of your own.
 import re
 from pathlib import Path
 
+import gymnasium
+
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
-from lyceum_warp.adapters.gymnasium_spaces import gymnasium
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
 from lyceum_warp.binding.registry import find_task, task_name, task_names
 from lyceum_warp.task import Task

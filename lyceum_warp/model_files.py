@@ -166,7 +166,7 @@ class PlaygroundFile(ModelFile):
 
 def gymnasium_model(file: str) -> ModelFile:
     """Refer to a model of the package gymnasium, such as "hopper.xml"."""
-    return PackageFile(file, "gymnasium", "gymnasium", "envs/mujoco/assets", "gymnasium>=1.0,<2")
+    return PackageFile(file, "gymnasium", "gymnasium", "envs/mujoco/assets", "gymnasium>=1.1,<2")
 
 
 def gymnasium_robotics_model(file: str) -> ModelFile:

@@ -6,15 +6,15 @@ import numpy as np
 import torch
 
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
-from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.step_results import HostArrays, Observations
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 
-check_library("dm-env", low="1.5", below="2", install="dm-env>=1.5,<2")
-
-import dm_env  # noqa: E402
-from dm_env import specs  # noqa: E402
+try:
+    import dm_env
+    from dm_env import specs
+except ImportError as error:
+    raise ImportError("this adapter needs the package dm-env: pip install 'dm-env>=1.5,<2'") from error
 
 
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]

@@ -2,11 +2,12 @@
 
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 import torch
 
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, pictures_of
-from lyceum_warp.adapters.gymnasium_spaces import box, gymnasium, observation_space
+from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
 from lyceum_warp.adapters.step_results import HostArrays, Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task

@@ -1,16 +1,10 @@
 """Convert an environment's spaces to Gymnasium's spaces."""
 
+import gymnasium
 import numpy as np
 
-from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.env import Env
 from lyceum_warp.spaces import Space
-
-check_library("gymnasium", low="1.1", below="2", install="gymnasium>=1.1,<2")
-
-import gymnasium  # noqa: E402 (after the check)
-
-__all__ = ["box", "gymnasium", "observation_space"]
 
 
 def box(space: Space) -> gymnasium.spaces.Box:

@@ -2,11 +2,12 @@
 
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
 
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
-from lyceum_warp.adapters.gymnasium_spaces import box, gymnasium, observation_space
+from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
 from lyceum_warp.adapters.step_results import HostArrays, Observations, StepResults
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_tensor, described

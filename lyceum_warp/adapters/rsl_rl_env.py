@@ -5,16 +5,16 @@ from typing import Any
 import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
-from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 from lyceum_warp.task import Task
 
-check_library("rsl-rl-lib", low="5.4.2", below="6", install="lyceum-warp[rsl-rl]")
-
-from rsl_rl.env import VecEnv  # noqa: E402 (after the check)
-from tensordict import TensorDict  # noqa: E402
+try:
+    from rsl_rl.env import VecEnv
+    from tensordict import TensorDict
+except ImportError as error:
+    raise ImportError("this adapter needs the package rsl-rl-lib: pip install 'lyceum-warp[rsl-rl]'") from error
 
 RECENT = 100
 """Logged metrics are averages over about this number of recent episodes."""

@@ -9,16 +9,17 @@ import torch
 
 from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
 from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
-from lyceum_warp.adapters.libraries import check_library
 from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
 
-check_library("stable-baselines3", low="2.9", below="3", install="lyceum-warp[stable-baselines3]")
-
-from stable_baselines3.common.monitor import Monitor  # noqa: E402 (after the check)
-from stable_baselines3.common.vec_env import VecEnv  # noqa: E402
+try:
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.vec_env import VecEnv
+except ImportError as error:
+    install = "pip install 'lyceum-warp[stable-baselines3]'"
+    raise ImportError(f"this adapter needs the package stable-baselines3: {install}") from error
 
 
 class StableBaselines3VecEnv(VecEnv):
