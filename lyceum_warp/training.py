@@ -271,7 +271,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
     if learner.team.leads:
         cut_rows(run.metrics, done)  # a killed run may have unsaved rows
         now = versions(run.config["device"])
-        then = run.config.get("versions", now)  # earlier releases wrote no versions
+        then = run.config.get("versions", now)
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:
             text = ", ".join(f"{name} {then.get(name)} then, {value} now" for name, value in changed.items())
             note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
@@ -287,7 +287,6 @@ def _check_equal(run: Run, learner: Learner) -> None:
     # these options may differ, and note_changes compares the model
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | dict(then.params)
-    # earlier releases lack the newest hyperparameters
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
     for before, after in (
         ({"task": run.config.get("kept", {}).get("name", env.task.name)}, {"task": env.task.name}),

@@ -32,7 +32,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ImportError: rsl_rl is missing or not supported (on importing this module).
+        ImportError: rsl_rl is missing (on importing this module).
     """
 
     num_envs: int

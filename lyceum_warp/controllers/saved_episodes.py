@@ -1,6 +1,8 @@
 """Load saved episodes, and make an environment that accepts their states."""
 
+import grp
 import os
+import pwd
 import stat
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -147,8 +149,6 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 def _foreign(file: Path) -> str:
     """Return a reason why a file may have foreign code, such as "it can be written by other users", or ""."""
-    if not hasattr(os, "getuid"):
-        return "this system does not say who can write it"
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
         status = place.stat()
         if status.st_uid not in (os.getuid(), 0):
@@ -160,9 +160,6 @@ def _foreign(file: Path) -> str:
 
 def _is_private(group: int) -> bool:
     """Return whether a group has only root or this user."""
-    import grp
-    import pwd
-
     if group == 0:
         return True
     try:

@@ -1,6 +1,7 @@
 """Lock a run folder, so that only one process writes to it."""
 
 import contextlib
+import fcntl
 import json
 import os
 import platform
@@ -15,7 +16,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
 
     The process locks this file by flock. The system releases the lock when the process ends, even after ``kill -9``.
     On some network file systems, other hosts do not see the lock. A lock file that names another host therefore counts
-    as locked. On systems without flock, every lock file counts as locked until it is deleted.
+    as locked. On file systems without flock, every lock file counts as locked until it is deleted.
 
     Yields:
         A function that raises ValueError if another process has taken over the lock, or OSError if the lock file is
@@ -36,13 +37,11 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
     while True:
         with path.open("a+") as file:
             try:
-                import fcntl
-
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 held = False
             except BlockingIOError:
                 held = True
-            except (ImportError, OSError):  # Windows and some file systems have no flock
+            except OSError:  # some file systems have no flock
                 held = os.path.getsize(path) > 0
             file.seek(0)
             text = file.read()

@@ -215,7 +215,6 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
 def _model_changed(run: Run, env: Env) -> bool:
     """Check whether the model has changed since the run started. With another version of MuJoCo, the answer is no."""
     known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
-    # runs of earlier releases have no versions in config.json
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
     return same_version and known not in (None, _model_hash(env))
 

@@ -41,5 +41,4 @@ def _after_fork() -> None:
             setattr(thing, name, LeftInParent())
 
 
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_after_fork)
+os.register_at_fork(after_in_child=_after_fork)

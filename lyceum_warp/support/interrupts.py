@@ -5,8 +5,7 @@ import signal
 from collections.abc import Callable, Iterator
 from typing import Any
 
-_NUMBERS = [int(getattr(signal, name)) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-"""SIGINT, SIGTERM and, except on Windows, SIGHUP."""
+_NUMBERS: list[int] = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 class Interrupted(BaseException):

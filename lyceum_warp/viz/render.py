@@ -136,7 +136,7 @@ def main(folder: str) -> int:
         import mujoco
 
         job = pickle.load(source)
-        if job["background"] and hasattr(os, "nice"):
+        if job["background"]:
             os.nice(10)
         model = mujoco.MjModel.from_binary_path(str(Path(folder, "model.mjb")))
         painter = Painter(mujoco, model, job["size"], job["camera"])

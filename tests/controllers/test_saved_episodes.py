@@ -129,7 +129,6 @@ def test_missing_damaged_and_newer_files_raise_a_one_line_error(folder: Path, tm
         load_episodes([])
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
 def test_task_file_that_other_users_can_write_is_not_executed(
     episodes: list[lw.Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

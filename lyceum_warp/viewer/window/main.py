@@ -72,8 +72,7 @@ class WindowEnd:
 def main(descriptor: int) -> None:
     """Draw until the session or the user ends the window. ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
-    if hasattr(os, "nice"):  # not on Windows
-        os.nice(NICE)
+    os.nice(NICE)
     connection = Connection(descriptor)
     end = WindowEnd(connection)
     try:
