@@ -17,7 +17,7 @@ from rich.markup import escape
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.mppi_config import MPPIConfig
 from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.binding.registry import file_name, find_task, snake_case, spelled_task, task_name
+from lyceum_warp.binding.registry import file_name, find_task, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     OptionFlags,
@@ -154,10 +154,12 @@ class Plan:
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
                 "break: omit one of them"
             )
-        if self.value is not None:
-            _check_value_task(self.value, self.task)
-        name = file_name(task_name(find_task(self.task)))
-        out = self.out or Path("runs", f"plan-{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+        task = task_name(find_task(self.task))
+        if self.value is not None and (found := Run.open(self.value).task_name) != task:
+            raise ValueError(
+                f"--value {self.value} is a run of the task {found!r}, not of {task!r}: use a run of {task}"
+            )
+        out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
         Run.check_free(out)
         # check all options before the folder is created
         camera = parsed_camera(self.camera)
@@ -185,22 +187,6 @@ class Plan:
         }  # fmt: skip
         run = Run.create(out, config, device=self.planner.device)
         return _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
-
-
-def _check_value_task(run: Path, task: str) -> None:
-    try:
-        config = Run.open(run.parent if run.is_file() else run).config
-    except FileNotFoundError:
-        return  # a policy file need not be in a run folder; load_value reports missing files
-    found = str(config.get("task"))
-    names = {_stem(found), snake_case(found.partition(":")[2]), str(config.get("kept", {}).get("name"))}
-    if not names & {_stem(task), task_name(find_task(task))}:
-        raise ValueError(f"--value {run} is a run of the task {found!r}, not of {task!r}: use a run of {task}")
-
-
-def _stem(task: str) -> str:
-    name = task.partition(":")[0]
-    return Path(name).stem if name.endswith(".py") else name
 
 
 def _worlds(
