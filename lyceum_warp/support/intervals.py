@@ -33,12 +33,12 @@ def student_quantile(probability: float, freedom: float) -> float:
     return math.sqrt(freedom) * math.tan(low)
 
 
-def mean_interval(values: Sequence[float] | np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
-    """Compute the mean and the half-width of its confidence interval (Student's t), which is NaN for a single value."""
+def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """Compute the mean and the half-width of its 95 % confidence interval (Student's t); NaN for a single value."""
     array = np.asarray(values, float)
     if len(array) < 2:
         return float(array.mean()), math.nan
-    quantile = student_quantile(0.5 + confidence / 2, len(array) - 1)
+    quantile = student_quantile(0.975, len(array) - 1)
     return float(array.mean()), quantile * float(array.std(ddof=1)) / math.sqrt(len(array))
 
 

@@ -10,7 +10,7 @@ from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
-def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str | None = None) -> Path:
+def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
     """Draw episodes of a controller as PNG.
 
     The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
@@ -20,7 +20,6 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     Args:
         episodes: Episodes of the same task, at least one. The first one's control period is the deadline.
         out: The PNG file.
-        title: The title of the plot; by default task, engine and mode.
 
     Raises:
         ImportError: matplotlib is not installed.
@@ -38,7 +37,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path, *, title: str 
     histogram.xaxis.set_minor_formatter(LogFormatter())
     finish_axes((reward, evaluation, planning, age, histogram))
     first = episodes[0]
-    figure.suptitle(title or f"{first.task}, {first.engine}, {first.mode}", x=0.01, ha="left")
+    figure.suptitle(f"{first.task}, {first.engine}, {first.mode}", x=0.01, ha="left")
     return save_png(figure, out)
 
 

@@ -10,14 +10,13 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
-def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path:
-    """Draw a run's learning curve as PNG: returns, the evaluation metric and the task's own metrics against samples.
+def learning_curve(run: str | Path | Run) -> Path:
+    """Draw a run's returns, evaluation metric and own metrics against samples, as ``curve.png`` in the run's folder.
 
     If no episode has a return, the plot shows the mean reward per step instead.
 
     Args:
         run: A run, or its folder.
-        out: The PNG file; by default ``curve.png`` in the run's folder.
 
     Raises:
         FileNotFoundError: The run does not exist.
@@ -63,7 +62,7 @@ def learning_curve(run: str | Path | Run, out: str | Path | None = None) -> Path
     panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
     finish_axes(panels)
     top.set_title(f"{run.config['task']}, seed {run.config['seed']}", loc="left")
-    return save_png(figure, out if out is not None else run.folder / "curve.png")
+    return save_png(figure, run.folder / "curve.png")
 
 
 def _column(rows: Sequence[dict[str, float | None]], name: str) -> list[float]:

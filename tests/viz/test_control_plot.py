@@ -33,7 +33,7 @@ def test_episodes_are_plotted_as_png(case: str, episode: Trajectory, env: lw.Env
             episodes = [simulated_run(env, seconds=2.5, steps=9)]
         case "one step":
             episodes = [control(env, towards, steps=1)]
-    path = control_plot(episodes, tmp_path / "new" / "control.png", title="a title")
+    path = control_plot(episodes, tmp_path / "new" / "control.png")
     assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
 
 
