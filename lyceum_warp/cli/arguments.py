@@ -1,6 +1,6 @@
 """Define the arguments that commands share: flags generated from options, and NAME=VALUE arguments."""
 
-import ast
+import contextlib
 import dataclasses
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -181,12 +181,7 @@ def _value(part: str, text: str) -> bool | int | float:
     part = part.strip()
     if part.lower() in ("true", "false"):
         return part.lower() == "true"
-    try:
-        value = ast.literal_eval(part)
-        return value if isinstance(value, (bool, int)) else float(part)
-    except (ValueError, SyntaxError, TypeError):
-        pass
-    try:
-        return float(part)  # inf
-    except ValueError:
-        raise ValueError(f"the value in {text!r} must be a number, true or false") from None
+    for number in (int, float):
+        with contextlib.suppress(ValueError):
+            return number(part)
+    raise ValueError(f"the value in {text!r} must be a number, true or false")

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import shutil
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,11 +31,7 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
                 os.link(path, previous)
             except OSError:  # the file system may not support hard links
                 shutil.copyfile(path, previous)
-        try:
-            os.replace(temporary, path)
-        except OSError:  # the file may be open in another program
-            time.sleep(0.1)
-            os.replace(temporary, path)
+        os.replace(temporary, path)
     except OSError as error:
         if error.filename is None:  # the disk may be full
             error.filename = str(path)
