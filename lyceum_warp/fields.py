@@ -1,12 +1,13 @@
 """Describe the fields of MjData: their Warp types, and the stages that compute them."""
 
 import dataclasses
-import difflib
 import enum
 
 import mujoco
 import numpy as np
 import warp as wp
+
+from lyceum_warp.support.suggestions import did_you_mean
 
 quat = wp.vec4
 """A quaternion in MuJoCo's order w, x, y, z. Do not pass a ``quat`` to Warp's quaternion functions, which expect the
@@ -172,13 +173,8 @@ class Field:
         return int(np.prod(self.shape, dtype=int)) * max(1, wp.types.type_size_in_bytes(self.dtype) // 4)
 
 
-_KNOWN = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
+DATA_FIELDS = (*STATE_FIELDS, *DERIVED_FIELDS, "sensordata")
 """MjData fields that an environment can keep."""
-
-
-def similar_data_fields(name: str) -> list[str]:
-    """List MjData fields with similar names, the closest first."""
-    return difflib.get_close_matches(name, _KNOWN, 3)
 
 
 def is_data_field(name: str) -> bool:
@@ -218,8 +214,7 @@ def describe(
         snapshot = lagged or reset == Stage.ACCELERATION
         refresh = Stage.NONE if snapshot else reset
     else:
-        close = similar_data_fields(name)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"the fields are {', '.join(sorted(_KNOWN))}"
+        hint = did_you_mean(name, DATA_FIELDS, f"the fields are {', '.join(sorted(DATA_FIELDS))}")
         raise ValueError(f"there is no field {name!r}: {hint}")
     if cleared:
         if not snapshot or refresh > Stage.NONE:

@@ -1,7 +1,6 @@
 """Describe the model fields that can differ between worlds, and the constants that follow from them."""
 
 import dataclasses
-import difflib
 import enum
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import described
 
 
@@ -35,7 +35,7 @@ _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
-_FIELDS = (
+VARYING_FIELDS = (
     dict.fromkeys(
         # contacts
         "geom_friction geom_solmix geom_solref geom_solimp "
@@ -176,33 +176,27 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
             raise ValueError(f"{name} must be numbers of shape {shapes}, not {described(value)}") from None
 
 
-def similar_model_fields(name: str) -> list[str]:
-    """List similar names of fields that can differ between worlds, the closest first."""
-    return difflib.get_close_matches(name, _FIELDS, 3)
-
-
 def is_model_field(name: str) -> bool:
     """Return whether MjModel or MjModel.opt has an attribute of this name."""
-    return name in _FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
+    return name in VARYING_FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
 def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
     """Describe a field of a model."""
-    if not varies and name not in _FIELDS:
+    if not varies and name not in VARYING_FIELDS:
         value: Any = getattr(model, name, None)
         numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
         if not numbers or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
             reason = _REASONS[name] if name == "timestep" else "it has no rows of real numbers; make it a parameter"
             raise ValueError(f"the model field {name!r} cannot be read in World: {reason}")
         return _described(name, value.shape, Constants.NONE)
-    if name not in _FIELDS:
+    if name not in VARYING_FIELDS:
         if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
-            close = similar_model_fields(name)
-            hint = f"did you mean {' or '.join(close)}?" if close else f"those are {', '.join(sorted(_FIELDS))}"
+            hint = did_you_mean(name, VARYING_FIELDS, f"those are {', '.join(sorted(VARYING_FIELDS))}")
             raise ValueError(f"there is no model field {name!r} that can differ between worlds: {hint}")
         reason = _REASONS.get(name, "the engines share it between all worlds")
         raise ValueError(f"the model field {name!r} cannot differ between worlds: {reason}")
-    constants = _FIELDS[name]
+    constants = VARYING_FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
     # a task can write a scalar only as an array of one element

@@ -5,7 +5,6 @@ The arguments of ``make``, ``replicate`` and MPPI, the command line and the help
 """
 
 import dataclasses
-import difflib
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from pathlib import Path
@@ -15,6 +14,7 @@ import mujoco
 
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
@@ -243,8 +243,9 @@ _OTHER_WORDS = {
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
     """Return "did you mean ...?" for an unknown name, or "" if no name is similar."""
-    close = [_OTHER_WORDS[word]] if word in _OTHER_WORDS else difflib.get_close_matches(word, [*others, *OPTIONS], 3)
-    return f"did you mean {' or '.join(close)}?" if close else ""
+    if word in _OTHER_WORDS:
+        return f"did you mean {_OTHER_WORDS[word]}?"
+    return did_you_mean(word, [*others, *OPTIONS])
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:

@@ -1,6 +1,5 @@
 """Bind a task to its model and its parameters, and make its kernels."""
 
-import difflib
 import keyword
 import math
 from collections.abc import Collection, Mapping
@@ -18,10 +17,11 @@ from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.sources import is_struct, overloads
 from lyceum_warp.binding.writes import Rights, check_writes, written_fields
-from lyceum_warp.fields import INITIAL, INPUTS, Field, describe, is_data_field, similar_data_fields, vec10
-from lyceum_warp.model_fields import describe_model_field, is_model_field, similar_model_fields
+from lyceum_warp.fields import DATA_FIELDS, INITIAL, INPUTS, Field, describe, is_data_field, vec10
+from lyceum_warp.model_fields import VARYING_FIELDS, describe_model_field, is_model_field
 from lyceum_warp.options import ModelSource, PhysicsOptions
 from lyceum_warp.spaces import OWN_PARTS
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Row, Task, TaskFunction, observer_name
 
@@ -71,8 +71,7 @@ def check_field_name(name: str) -> None:
     """Refuse a name that neither MjData nor MjModel has."""
     if is_data_field(name) or is_model_field(name):
         return
-    close = difflib.get_close_matches(name, [*similar_data_fields(name), *similar_model_fields(name)], 3)
-    hint = f"did you mean {' or '.join(close)}?" if close else "fields have MuJoCo's names, of MjData and MjModel"
+    hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
     raise ValueError(f"there is no field {name!r}: {hint}")
 
 

@@ -1,6 +1,5 @@
 """Load a task's model, and edit it before compilation, so that both engines simulate the same physics."""
 
-import difflib
 import logging
 import sys
 import textwrap
@@ -16,6 +15,7 @@ from lyceum_warp.model_fields import MOVED_INERTIA
 from lyceum_warp.model_files import ModelFile, gymnasium_model, read_spec
 from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
 from lyceum_warp.support.mujoco_log import quiet
+from lyceum_warp.support.suggestions import did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -63,8 +63,8 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
     try:
         shipped.path()
     except FileNotFoundError as error:
-        close = difflib.get_close_matches(path.name, [file.name for file in path.parent.glob("*.xml")], 3)
-        hint = f" (did you mean {' or '.join(close)}?)" if close else ""
+        hint = did_you_mean(path.name, [file.name for file in path.parent.glob("*.xml")])
+        hint = f" ({hint})" if hint else ""
         raise FileNotFoundError(f"there is no model file {path}{hint}; among Gymnasium's models, {error}") from None
     return shipped
 

@@ -1,7 +1,6 @@
 """Find tasks by name, by file or by class, and register users' tasks."""
 
 import ast
-import difflib
 import functools
 import importlib
 import importlib.util
@@ -20,6 +19,7 @@ from types import ModuleType
 from typing import Any
 
 from lyceum_warp.binding.local_modules import Stamps, importable, local_modules, stamps
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
@@ -161,8 +161,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     if task not in _tasks and (module := _package_modules().get(task)) is not None:
         importlib.import_module(module)
     if task not in _tasks:
-        close = difflib.get_close_matches(task, task_names(), 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(task_names())}"
+        hint = did_you_mean(task, task_names(), f"there are {', '.join(task_names())}")
         raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
     source_files(_tasks[task])
     return _tasks[task]

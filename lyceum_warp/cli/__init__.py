@@ -1,6 +1,5 @@
 """Run the command line: import a command's module by name, parse its options, print errors."""
 
-import difflib
 import importlib
 import importlib.metadata
 import os
@@ -12,6 +11,7 @@ import tyro
 
 from lyceum_warp.cli.parsing import parse
 from lyceum_warp.support.interrupts import Interrupted, signals
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.viz import NoVideoError
 
 _COMMANDS = {
@@ -86,8 +86,7 @@ def _run(argv: list[str]) -> int:
         raise ValueError(f"which command? The commands are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
     name, *words = argv
     if name not in _COMMANDS:
-        close = difflib.get_close_matches(name, _COMMANDS, 1)
-        hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(_COMMANDS)}"
+        hint = did_you_mean(name, _COMMANDS, f"there are {', '.join(_COMMANDS)}")
         raise ValueError(f"there is no command {name!r}: {hint}")
     module, kind, _ = _COMMANDS[name]
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)

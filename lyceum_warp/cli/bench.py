@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import difflib
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.support.interrupts import Interrupted
+from lyceum_warp.support.suggestions import did_you_mean
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
 
@@ -37,8 +37,7 @@ class Bench:
             raise FileNotFoundError(f"the experiments need a checkout of the repository, and {FOLDER} does not exist")
         programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
         if self.name not in programs:
-            close = difflib.get_close_matches(self.name, programs, 1)
-            hint = f"did you mean {close[0]}?" if close else "lyceum-warp bench lists the experiments"
+            hint = did_you_mean(self.name, programs, "lyceum-warp bench lists the experiments")
             raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
         # the subprocess must import the package from this checkout, not an installed one
         path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -1,7 +1,6 @@
 """Check that a task follows the rules of an environment: lyceum-warp check."""
 
 import dataclasses
-import difflib
 from collections.abc import Callable
 from typing import Annotated
 
@@ -9,6 +8,7 @@ import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
 from lyceum_warp.cli.display import console
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.testing import CHECKS, Context, check_task
 
 
@@ -57,7 +57,6 @@ class Check:
 def _check(rule: str) -> Callable[[Context], None]:
     checks = {check.__name__.removeprefix("check_"): check for check in CHECKS}
     if rule not in checks:
-        close = difflib.get_close_matches(rule, checks, 3)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(checks)}"
+        hint = did_you_mean(rule, checks, f"there are {', '.join(checks)}")
         raise ValueError(f"there is no rule {rule!r}: {hint}")
     return checks[rule]

@@ -1,10 +1,10 @@
 """Find the package's pretrained policies, which are run folders with float16 weights and without training state."""
 
-import difflib
 from pathlib import Path
 
 from lyceum_warp.binding.registry import file_name
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.support.suggestions import did_you_mean
 
 _FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 
@@ -31,11 +31,8 @@ def pretrained_run(task: str) -> Path:
     """
     tasks = pretrained_tasks()
     if task not in tasks:
-        close = difflib.get_close_matches(task, tasks, 1)
-        hint = f"did you mean {close[0]}? " if close else ""
-        raise ValueError(
-            f"there is no pretrained policy of {task!r}: {hint}the tasks with a policy are {', '.join(tasks)}"
-        )
+        hint = did_you_mean(task, tasks, f"the tasks with a policy are {', '.join(tasks)}")
+        raise ValueError(f"there is no pretrained policy of {task!r}: {hint}")
     return _FOLDER / file_name(task)
 
 

@@ -1,7 +1,6 @@
 """Find the camera of a video: a camera of the model by name or index, or a free camera by its pose."""
 
 import dataclasses
-import difflib
 import math
 import textwrap
 from collections.abc import Iterable
@@ -11,6 +10,7 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import positive_number
 
 
@@ -156,9 +156,8 @@ def _body(model: mujoco.MjModel, body: str | int) -> int:
     index = int(body) if isinstance(body, str) and body.isdecimal() else body
     if _is_index(index) and 0 <= int(index) < len(names):
         return int(index)
-    close = difflib.get_close_matches(body, names, 3) if isinstance(body, str) else []
     given = ", ".join(name for name in names if name)
-    hint = f"did you mean {' or '.join(close)}?" if close else f"its bodies are {textwrap.shorten(given, 200)}"
+    hint = did_you_mean(str(body), names, f"its bodies are {textwrap.shorten(given, 200)}")
     raise ValueError(f"the camera cannot track the body {body!r}, which the model does not have: {hint}")
 
 
