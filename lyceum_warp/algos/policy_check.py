@@ -1,5 +1,7 @@
 """Check policies and value functions that a user passes to an algorithm."""
 
+from typing import Any
+
 import torch
 
 from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
@@ -7,7 +9,7 @@ from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_group, described
+from lyceum_warp.support.validate import check_group, described, first_sentence
 
 _ROWS = 4
 
@@ -27,12 +29,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
         fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one from your own network"
         raise ValueError(f"policy must be a GaussianPolicy, not {kind}: {fix}")
     policy = moved(policy, env)
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
-        raise ValueError(
-            f"the policy takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} "
-            f"has {wanted[0]} observations and {wanted[1]} actions"
-        )
+    check_sizes(policy, env)
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
         raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
@@ -40,6 +37,20 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     obs = obs + 0.1 * noise.to(obs.device)
     _check_output(policy, obs)
     _check_derivatives(policy, obs, twice=twice)
+
+
+def check_sizes(policy: Any, env: Env, name: str = "the policy") -> None:
+    """Check that a policy fits an environment's observations and actions; errors call the policy ``name``.
+
+    Raises:
+        ValueError: The sizes of the policy and the environment differ.
+    """
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"{name} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} has "
+            f"{wanted[0]} observations and {wanted[1]} actions"
+        )
 
 
 @torch.no_grad()
@@ -65,7 +76,7 @@ def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
     try:
         mean: object = policy(obs)
     except Exception as error:  # a user's network may raise any error
-        reason = f"{type(error).__name__}: {_first_line(error)}"
+        reason = f"{type(error).__name__}: {first_sentence(error)}"
         raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
     if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
         wanted = f"a {str(obs.dtype).removeprefix('torch.')} tensor of shape {shape}"
@@ -96,7 +107,7 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool
         except RuntimeError as error:
             raise ValueError(
                 "the policy cannot be differentiated twice, which NPG needs for the Fisher information "
-                f"({_first_line(error)}): use other layers"
+                f"({first_sentence(error)}): use other layers"
             ) from error
     if not product.isfinite().all():
         raise ValueError("the policy's derivatives are not finite")
@@ -121,7 +132,3 @@ def check_value(value: ValueFunction, env: Env) -> None:
             raise ValueError(
                 f"the value function's {part!r} is not finite: omit the value function to get a new value function"
             )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]

@@ -16,7 +16,7 @@ import torch
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import described
+from lyceum_warp.support.validate import described, first_sentence
 
 EXTRA = "pip install 'lyceum-warp[export]'"
 
@@ -69,8 +69,8 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
                     metadata = deployment_metadata(policy, env)
                     program.model.metadata_props.update({name: json.dumps(value) for name, value in metadata.items()})
     except Exception as error:  # torch raises many types of errors
-        first = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-        raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({first})") from error
+        reason = first_sentence(error)
+        raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({reason})") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     with replaced(path) as temporary:
         if path.suffix == ".onnx":

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
@@ -19,7 +20,6 @@ from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
@@ -105,7 +105,7 @@ class Eval:
         if env.horizon == 0:
             env = evaluation_worlds(env, nworld)
         policy = load(run, which=self.which, device=env.obs.device)
-        check_sizes(policy, env, path)
+        check_sizes(policy, env, f"the policy in {path}")
         try:
             with LongWork("evaluating the policy", "steps", console) as work:
                 episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)

@@ -9,6 +9,7 @@ import tyro
 
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
+from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import run_worlds
@@ -16,7 +17,6 @@ from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.support.validate import whole_number
@@ -121,7 +121,7 @@ class View:
             run, nworld = Run.open(self.what[0]), self.nworld or _RUN_WORLDS
             env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
             policy = load(run, which=self.which, device=env.obs.device)
-            check_sizes(policy, env, run.policy_file(self.which))
+            check_sizes(policy, env, f"the policy in {run.policy_file(self.which)}")
             controllers["policy"] = policy
             if self.follow:
                 watchers.append(Follower(run, policy))

@@ -14,6 +14,7 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
+from lyceum_warp.support.validate import first_sentence
 from lyceum_warp.support.versions import versions
 
 FORMAT = 1
@@ -196,8 +197,8 @@ class Trajectory:
         except OSError:
             raise
         except Exception as error:  # numpy and zipfile raise many types of errors
-            text = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({text[:200]})") from error
+            reason = first_sentence(error)
+            raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({reason})") from error
         raise unknown_format(path, info["format"], FORMAT)
 
 

@@ -12,8 +12,8 @@ from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced, unknown_format
+from lyceum_warp.support.validate import first_sentence
 
 FORMAT = 1
 """Format of run folders. The number increases when older releases cannot read new files."""
@@ -77,7 +77,7 @@ def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | No
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     except (KeyError, TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"{path} contains no {name} of lyceum_warp ({_first_sentence(error)}): {_FIX}") from error
+        raise ValueError(f"{path} contains no {name} of lyceum_warp ({first_sentence(error)}): {_FIX}") from error
     return module
 
 
@@ -93,16 +93,6 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
             raise ValueError(f"the {name} has a custom class, {own}{fix}")
     module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
     return module
-
-
-def check_sizes(policy: Any, env: Env, path: Path) -> None:
-    """Check that a policy fits an environment's observations and actions."""
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
-        raise ValueError(
-            f"the policy in {path} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task "
-            f"{env.task.name!r} has {wanted[0]} and {wanted[1]}: use a task with the policy's sizes"
-        )
 
 
 def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
@@ -139,7 +129,7 @@ def read_checkpoint(
         raise
     except Exception as error:  # zipfile and torch raise many types of errors
         raise ValueError(
-            f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({_first_sentence(error)}): {_FIX}"
+            f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({first_sentence(error)}): {_FIX}"
         ) from error
     if not isinstance(content, dict) or "lyceum_warp" not in content:
         raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
@@ -160,9 +150,3 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
-
-
-def _first_sentence(error: BaseException) -> str:
-    """Get the first sentence of an error message, because torch's messages can fill a page."""
-    text = str(error).strip() or type(error).__name__
-    return text.splitlines()[0].split(". ")[0][:200]

@@ -81,6 +81,11 @@ def described(value: Any) -> str:
     return f"{type(value).__name__} {value!r}"
 
 
+def first_sentence(error: BaseException) -> str:
+    """Get the first sentence of an error message; torch's whole messages can fill a page."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0].split(". ")[0][:200]
+
+
 def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float = math.inf) -> float:
     """Convert a finite number of any type to a float within bounds."""
     if not isinstance(value, bool) and isinstance(value, numbers.Real):

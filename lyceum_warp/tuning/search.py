@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos.policy import acting
+from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.support.docstrings import document_attributes
@@ -144,7 +144,7 @@ def _trials(
     env, policy = Env(task, options.changed({"autoreset": False}), **{**known, **params}), None
     if run is not None:
         own = load(run, which=which, device=env.obs.device)
-        check_sizes(own, env, Run.open(run).policy_file(which))
+        check_sizes(own, env, f"the policy of {run}")
         policy = acting(own)
     return Trials(env, policy, effort=effort, seed=seed, episodes=episodes)
 

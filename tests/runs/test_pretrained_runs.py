@@ -7,9 +7,9 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.binding.registry import task_names
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.runs.checkpoints import check_sizes
 from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_tasks, pretrained_text
 
@@ -25,7 +25,7 @@ def test_pretrained_policy_matches_its_task_and_reaches_its_return(task: str) ->
     first = run.config["evaluated"]["first_steps"]
     env = run_worlds(run, {}, {}, nworld=first["worlds"], task=None, trust=False)
     policy = load(run)
-    check_sizes(policy, env, run.policy)
+    check_sizes(policy, env)
     env.rand_reset(run.config["evaluated"]["seed"])
     total = torch.zeros(env.nworld)
     for _ in range(first["steps"]):
