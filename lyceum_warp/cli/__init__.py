@@ -62,18 +62,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with signals():
             return _run(argv)
-    except (ValueError, FileNotFoundError, FloatingPointError, ImportError, NoVideoError) as error:
-        text = "; ".join([str(error), *getattr(error, "__notes__", [])])
-        print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
-        return 2
     except Interrupted as signalled:
         return 128 + signalled.number
     except BrokenPipeError:  # the reader of a pipe may end early, as in lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except OSError as error:  # the disk may be full, or a folder may be read-only
-        text = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        print(f"lyceum-warp: {'; '.join([text, *getattr(error, '__notes__', [])])}", file=sys.stderr)
+    except (ValueError, OSError, FloatingPointError, ImportError, NoVideoError) as error:
+        text = str(error)
+        if isinstance(error, OSError) and error.filename:  # the disk may be full, or a folder may be read-only
+            text = f"{error.filename}: {error.strerror}"
+        text = "; ".join([text, *getattr(error, "__notes__", [])])
+        print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
         return 2
 
 
