@@ -86,7 +86,7 @@ class Worlds(WorldArrays):
     def step_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step in order."""
         return [
-            *self._transition_phases(substeps),
+            *self.transition_phases(substeps),
             *self._restart_phases(self.restarting, randomly=True),
             *self._event_phases(),
             *self._moved_phases(),
@@ -101,10 +101,10 @@ class Worlds(WorldArrays):
         restart = self._restart_phases(self.restarting, randomly=True)
         show = self._refresh_phases(self.restarting), self._observe_phases()
         if not (events := self._event_phases()):
-            return [*self._transition_phases(), self._only_for(self.restarting, restart, *show)]
+            return [*self.transition_phases(), self._only_for(self.restarting, restart, *show)]
         moved = self._moved_phases()
         return [
-            *self._transition_phases(),
+            *self.transition_phases(),
             self._only_for(self.restarting, restart),
             *events,
             *([self._only_for(self._physics_changed, moved)] if moved else []),
@@ -122,7 +122,7 @@ class Worlds(WorldArrays):
 
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
-    def _transition_phases(self, substeps: int | None = None) -> list[Phase]:
+    def transition_phases(self, substeps: int | None = None) -> list[Phase]:
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),

@@ -63,11 +63,11 @@ def control_async(
     step old if every plan takes less than a period.
 
     With ``predict``, the controller plans from the state that is expected one step later, when the plan can first
-    apply. A copy of the plant predicts this state with the action that the plant is applying. The first action of a
-    plan that takes less than a period is then applied to the state for which it was planned. Without ``predict``, this
-    action comes too late, and only the rest of the plan applies. If the copy's episode ends in the predicted step, the
-    controller plans from the measured state. The copy has the plant's random stream, so it foresees an event of the
-    task, such as a push, by one step.
+    apply. A copy of the plant predicts this state with the action that the plant is applying. The copy runs no events
+    of the task, such as pushes, and draws other random numbers than the plant. The first action of a plan that takes
+    less than a period is then applied to the state for which it was planned. Without ``predict``, this action comes too
+    late, and only the rest of the plan applies. If the copy's episode ends in the predicted step, the controller plans
+    from the measured state.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -117,13 +117,10 @@ def control_async(
     checked = CheckedController(controller, env)
     limit, first = begin_episode(env, checked, steps, seed, reset=reset)
     _capture_graphs(env)
-    copy = env.replicate() if predict else None
-    if copy is not None:
-        copy.set_state(env.get_state())
-        _capture_graphs(copy)
+    predictor = Predictor(env) if predict else None
     clock = Clock() if clock is None else clock
     episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
-    planner = PlannerThread(checked, clock, seed, first, reset=reset, copy=copy)
+    planner = PlannerThread(checked, clock, seed, first, reset=reset, predictor=predictor)
     with _frequent_thread_switches():
         try:
             planner.publish(0, episode.states[0], episode.obs[0], None)
@@ -201,6 +198,38 @@ def _capture_graphs(env: Env) -> None:
     env.set_state(before)
 
 
+class Predictor:
+    """Predicts the plant's next states, in a copy of the plant.
+
+    As in planners' rollouts, no events run, and the random numbers are not those of the plant.
+
+    Args:
+        env: The plant; its state is used to capture graphs.
+    """
+
+    def __init__(self, env: Env) -> None:
+        self._env = env.replicate()
+        worlds, self._key = self._env.worlds, env.state_space.parts["key"]
+        self._transition = worlds.programs.graphs.sequence(worlds.transition_phases())
+        for _ in range(3):
+            self(env.get_state()[0], env.action[0])
+
+    def __call__(self, state: torch.Tensor, action: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """Return the next state and its observation, or None if the episode ends.
+
+        Args:
+            state: The plant's state, (state_space.size,).
+            action: The action applied in this state, (nact,).
+        """
+        env, start = self._env, state[None].clone()
+        start[:, self._key] = (start[:, self._key] + 1) % 2**32  # the streams of different keys are independent
+        env.set_state(start)
+        env.action[0] = action
+        for call in self._transition:
+            call()
+        return None if env.done.item() else (env.get_state()[0], env.obs[0].clone())
+
+
 @contextlib.contextmanager
 def _frequent_thread_switches() -> Iterator[None]:
     before = sys.getswitchinterval()
@@ -220,14 +249,14 @@ class PlannerThread:
         seed: Seed of the run.
         first: Number of steps between the reset and the start of the run.
         reset: Whether the run started with a reset.
-        copy: A copy of the plant that predicts the initial states of plans, or None to plan from measured states.
+        predictor: Predicts the initial states of plans; None to plan from measured states.
     """
 
     def __init__(
         self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool,
-        copy: Env | None = None,
+        predictor: Predictor | None = None,
     ) -> None:  # fmt: skip
-        self._copy = copy
+        self._predictor = predictor
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
         self._qualities: list[tuple[float, float]] = []  # quality of each plan, appended after the plan itself
@@ -314,13 +343,11 @@ class PlannerThread:
             controller(state, obs, 0, step)
             if self._reset:
                 controller.reset(self._seed)
-        begun, ahead, copy = self._clock.now(), 0, self._copy
-        if copy is not None and action is not None:
-            copy.set_state(state[None])
-            copy.action[0] = action
-            copy.step()
-            if not copy.done.item():
-                state, obs, ahead = copy.get_state()[0], copy.obs[0].clone(), 1
+        begun, ahead = self._clock.now(), 0
+        if self._predictor is not None and action is not None:
+            predicted = self._predictor(state, action)
+            if predicted is not None:
+                (state, obs), ahead = predicted, 1
         start = step + ahead
         actions = controller(state, obs, controller.passed(self._first + last, self._first + start), step)
         self._plans.append(TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead))

@@ -64,20 +64,38 @@ def test_slow_step_does_not_delay_later_steps(env: lw.Env) -> None:
     assert report.tick_jitter_ms == pytest.approx(np.std([0, 0, 1250, 250, 0, 0], ddof=1))
 
 
-def test_predicted_states_equal_the_next_states_of_the_plant(env: lw.Env) -> None:
+def predicted_and_measured(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
+    """Run a controller with predicted states; return the predicted and the measured states, with observations."""
     planned = []
 
     def controller(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         planned.append(torch.cat([state, obs.double()]))
-        return towards(state, obs)
+        return 0.1 * obs[: env.action_space.size].clamp(-1, 1)
 
     episode = control_async(env, controller, period=0.01, steps=12, seed=3, predict=True)
     measured = torch.cat([episode.states, episode.obs.double()], dim=1)
     first, *others = planned[2:]  # the warm-up makes two plans
     assert len(others) == len(episode.plan_steps) - 1 > 0
     torch.testing.assert_close(first, measured[0])
-    torch.testing.assert_close(torch.stack(others), measured[episode.plan_steps[1:] + 1])
     assert episode.age_steps[0] == 0 and (episode.age_steps[1:] >= 1).all()
+    return torch.stack(others), measured[episode.plan_steps[1:] + 1]
+
+
+def test_predicted_states_equal_the_next_states_of_the_plant_except_for_the_random_stream(env: lw.Env) -> None:
+    predicted, measured = predicted_and_measured(env)
+    key = env.state_space.parts["key"]
+    assert (predicted[:, key] != measured[:, key]).all()
+    predicted[:, key] = measured[:, key]
+    torch.testing.assert_close(predicted, measured)
+
+
+def test_predicted_states_do_not_contain_the_pushes_of_events() -> None:
+    times = [0.015 * k for k in range(1, 13)]  # after every step
+    env = lw.make("humanoid_stand", autoreset=False, push_times=times, push_impulse=[10.0, 10.0])
+    predicted, measured = predicted_and_measured(env)
+    x_and_y = slice(start := env.state_space.parts["qvel"].start, start + 2)
+    change = (measured - predicted)[:, x_and_y].norm(dim=1)
+    torch.testing.assert_close(change, torch.full_like(change, 10.0 / env.model.body_mass.sum()), rtol=1e-3, atol=0.0)
 
 
 def planner_threads() -> list[threading.Thread]:
