@@ -123,6 +123,7 @@ class Worlds(WorldArrays):
         return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def transition_phases(self, substeps: int | None = None) -> list[Phase]:
+        """List the phases of a step that advance and judge the worlds, without resets and events."""
         return [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),

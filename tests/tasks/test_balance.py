@@ -81,6 +81,17 @@ def test_upper_body_of_the_g1_is_rigid_in_the_pose_of_the_keyframe(shared_env: S
     assert np.allclose(*(one.subtree_com[0] for one in data.values()), atol=0.01)
 
 
+def test_g1_without_visual_geoms_moves_in_the_same_way(shared_env: SharedEnv) -> None:
+    env, bare = (shared_env("g1_stand", nworld=2, autoreset=False, discardvisual=value) for value in (False, True))
+    assert (env.model.ngeom, bare.model.ngeom) == (48, 3)
+    state = env.get_state()
+    for each in (env, bare):
+        each.set_state(state)
+        for k in range(5):
+            each.step(torch.full((2, 12), 0.1 * k))
+    assert torch.equal(env.get_state(), bare.get_state()) and torch.equal(env.reward, bare.reward)
+
+
 def test_g1_walk_lifts_the_feet_in_turn_without_actions(shared_env: SharedEnv) -> None:
     env = shared_env("g1_walk", autoreset=False, fields=["ctrl"])
     env.reset()

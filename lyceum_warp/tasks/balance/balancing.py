@@ -7,6 +7,7 @@ At each of ``push_times``, a horizontal impulse in a random direction changes al
 do not foresee pushes.
 """
 
+import mujoco
 import warp as wp
 
 import lyceum_warp as lw
@@ -20,7 +21,7 @@ class World:
     qvel: Row[float]
     time: float
     subtree_com: Row[wp.vec3]
-    geom_xpos: Row[wp.vec3]
+    site_xpos: Row[wp.vec3]
 
 
 @wp.struct
@@ -29,8 +30,8 @@ class Params:
     joint_qpos: wp.array[int] = lw.qposes()
     joint_dof: wp.array[int] = lw.dofs()
     motors: wp.array[int] = lw.actuators()
-    right_foot: int = lw.geom("right_foot")
-    left_foot: int = lw.geom("left_foot")
+    right_foot: int = lw.site("right_foot")
+    left_foot: int = lw.site("left_foot")
     default_pose: wp.array[float] = [0.0]  # rad
     action_scale: wp.array[float] = [1.0]  # rad
     # reward terms
@@ -80,7 +81,7 @@ def velocity_l2(velocity: wp.vec2) -> float:
 @wp.func
 def capture_l2(velocity: wp.vec2, s1: World, p: Params) -> float:
     """Return the capture point's squared distance from the middle 60 % of the line between the feet, at most 1 m^2."""
-    com, a, b = s1.subtree_com[0], s1.geom_xpos[p.right_foot], s1.geom_xpos[p.left_foot]
+    com, a, b = s1.subtree_com[0], s1.site_xpos[p.right_foot], s1.site_xpos[p.left_foot]
     seconds = wp.sqrt(wp.max(com[2], 0.1) / 9.81)  # the time constant of a linear inverted pendulum
     point = wp.vec2(com[0] - a[0], com[1] - a[1]) + seconds * velocity
     line = wp.vec2(b[0] - a[0], b[1] - a[1])
@@ -140,7 +141,7 @@ def event(s: World, p: Params, rng: Row[wp.uint32]):
 class Balance(lw.Task):
     """A robot keeps its balance when it is pushed."""
 
-    lagged = ("subtree_com", "geom_xpos")
+    lagged = ("subtree_com", "site_xpos")
     rewards = {
         "alive": 1.0,
         "height_l2": -10.0,
@@ -153,3 +154,10 @@ class Balance(lw.Task):
         "action_l2": -0.02,
     }
     terminations = ("too_low",)
+
+    @staticmethod
+    def edit_model(spec: mujoco.MjSpec) -> None:
+        """Put a site at each foot; a state that contained geoms would not fit a planner without visual geoms."""
+        for name in ("right_foot", "left_foot"):
+            geom = spec.geom(name)
+            (spec.site(name) or geom.parent.add_site(name=name)).pos = geom.pos

@@ -64,7 +64,11 @@ class G1Stand(balancing.Balance):
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
     frame_skip, horizon = 4, 1000  # 20 s
     obs, actions = {"position": 17, "velocity": 18}, {"joint_target": "motors"}
-    physics = {"fast": lw.PhysicsOptions(timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5})}
+    physics = {
+        "fast": lw.PhysicsOptions(
+            timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5}, discardvisual=True
+        )
+    }
     planning = lw.Planning(
         settings=dict(horizon=30, samples=12, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
     )
@@ -72,6 +76,7 @@ class G1Stand(balancing.Balance):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Make the upper body rigid in the pose of the keyframe knees_bent, and set the legs' gains."""
+        balancing.Balance.edit_model(spec)
         walkers.prepare_walker(spec, ("left_foot", "right_foot"), timestep=0.005, iterations=(10, 10))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
