@@ -96,7 +96,7 @@ class PhysicsOptions:
     solver: Mapping[str, int] | None = None
     """Limits of the constraint solver: iterations, ls_iterations (of the line search) and noslip_iterations (0 for no
     noslip solver)."""
-    discardvisual: bool = False
+    discardvisual: bool | None = None
     """Leave out all geoms, meshes and materials that have no effect on the physics, as MuJoCo's compiler option of the
     same name does. Results do not change, but a substep takes less time if a model has many such geoms. Videos and
     viewers do not show these geoms."""
@@ -121,7 +121,7 @@ class PhysicsOptions:
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
         _one_of("Jacobian", self.jacobian, JACOBIANS)
-        _flags(self, "discardvisual", "deterministic")
+        _flags(self, "deterministic", *([] if self.discardvisual is None else ["discardvisual"]))
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 

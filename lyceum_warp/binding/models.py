@@ -122,7 +122,8 @@ def compile_model(
         spec.option.jacobian = JACOBIANS[physics.jacobian]
     if physics.impratio is not None:
         spec.option.impratio = physics.impratio
-    spec.compiler.discardvisual |= physics.discardvisual
+    if physics.discardvisual is not None:
+        spec.compiler.discardvisual = physics.discardvisual
     for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):
