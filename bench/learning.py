@@ -46,7 +46,7 @@ class Options(experiment.Options):
     """Time until NPG or PPO reaches a target return."""
 
     algorithm: Literal["npg", "ppo"] | None = None
-    """Algorithm; by default, each task has its own algorithm."""
+    """Algorithm; by default, the one listed in TARGETS for the task."""
     settings: tuple[str, ...] = ("default",)
     """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0

@@ -43,7 +43,7 @@ class TaskFunction:
     """Purpose and default, for the documentation."""
     default: str | None = None
     optional: str = ""
-    """Last arguments that a task may omit, written as in a task's file."""
+    """Arguments that a task's function may leave out at the end."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """What the function may write into each argument. "lasting" means lasting memory and the model, and "start" means
     everything that a reset may write. The other values are "inputs" and "memory". Arguments for results, such as

@@ -167,7 +167,7 @@ def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str, au
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_only_a_fault_restarts_a_world_without_automatic_resets(engine: str) -> None:
+def test_without_automatic_resets_only_a_fault_restarts_a_world(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=N, autoreset=False, horizon=3)
     for _ in range(5):
         env.step()

@@ -31,7 +31,7 @@ class TwinCritic(Normalized):
     """
 
     shape: dict[str, Any]
-    """Arguments that make critics with the same structure."""
+    """Arguments of the constructor for critics of the same structure as these."""
     group: str
     """The group of observations that the critics use."""
 

@@ -40,8 +40,9 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit to returns, and return whether the fit is finite; otherwise, restore all parameters and moments.
+        """Fit the value function to returns, and return whether the result is finite.
 
+        If it is not, all parameters and moments are restored.
         Targets are clipped to the value function's shift plus or minus ``BOUND`` times its scale. The generator must
         have the same state in every process.
         """

@@ -187,7 +187,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Analyse the children of a syntax node, and record each row that a child uses as a whole."""
+        """Analyse the children of a syntax node, and record each row that a child uses without an index."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):

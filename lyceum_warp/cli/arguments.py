@@ -55,7 +55,7 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
-    """Base class of groups of flags: each field of the given dataclasses becomes a flag.
+    """Base class of groups of flags. Each field of the dataclasses becomes a flag.
 
     The field's docstring becomes the flag's help text. A subclass declares a field again if its type is a union, or if
     it differs on the command line. Values are validated later, because the parser would print errors in a multi-line

@@ -52,7 +52,7 @@ class New:
     """
 
     template: Literal["plain", "velocity"] = "plain"
-    """With velocity, the task trains a walking robot to follow velocity commands. The robot needs a floating base, and
+    """The template "velocity" trains a walking robot to follow velocity commands. The robot needs a floating base, and
     legs made of hinges with one actuator each. The file is short, because it inherits most of its functions.
     """
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()

@@ -63,8 +63,7 @@ class ControlReport:
     miss_share: float | None
     """Fraction of plans with a planning time above the deadline."""
     blind_plans: int | None
-    """Number of plans whose samples all failed, including first plans. The planner then only shifts the previous plan
-    in time."""
+    """Number of plans whose samples all failed, so that the planner only shifted the previous plan in time."""
     known_plans: int
     """Number of plans, including first plans, for which the controller reports failed samples."""
     failed_share: float | None

@@ -9,8 +9,9 @@ from lyceum_warp.env import Env
 
 
 class Controller(Protocol):
-    """A function from the state and the observation of one world, the plant, to an action.
+    """A function that computes an action from the plant's state and observation.
 
+    The plant is an environment of one world.
     Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
     ``PlanningController`` lists optional attributes and methods.
     """

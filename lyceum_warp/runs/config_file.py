@@ -9,7 +9,7 @@ from lyceum_warp.support.files import unknown_format
 from lyceum_warp.support.validate import whole_number
 
 _COUNT = 0
-"""The type of non-negative whole numbers in ``_ENTRIES``."""
+"""Stands for whole numbers from 0 in ``_ENTRIES``."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,

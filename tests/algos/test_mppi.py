@@ -195,7 +195,7 @@ def test_equal_seeds_give_equal_plans_before_and_after_a_reset(update: str) -> N
 @pytest.mark.quick("mean-mujoco", "worst-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_equal_those_of_a_plain_implementation(risk: Any, engine: str) -> None:
+def test_plans_with_several_models_equal_those_of_a_simple_implementation(risk: Any, engine: str) -> None:
     settings = dict(horizon=6, samples=8, noise=1.0, smoothing=(1, 0, 0), temperature=0.5, update="mppi", risk=risk)
     plan = MPPI(Weighed, engine=engine, models=3, seed=2, **settings)
     fields = {name: rows.numpy() for name, rows in plan.model_fields.items()}

@@ -47,7 +47,7 @@ class Call:
 
     @property
     def names(self) -> list[str]:
-        """Return the arguments to attack. Videos are excluded, because a subprocess makes them."""
+        """Return the arguments to replace. Videos are excluded, because a subprocess makes them."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
         return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]

@@ -9,7 +9,7 @@ import warp as wp
 from lyceum_warp.engines.warp.group import Reserve, aligned
 
 LARGEST_BUFFER = 2**31 - 1
-"""The size of the largest byte array in Warp, whose axes have fewer than 2**31 elements."""
+"""Size of the largest byte array in Warp. An axis of a Warp array has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
 """Memory is extrapolated from these two numbers of worlds, with which all of Warp's buffers exceed their minimum

@@ -287,7 +287,10 @@ class Live:
     # worlds to show
 
     def choose(self, choice: int | str) -> int:
-        """Return the index of the chosen world. "best" and "worst" compare returns, and wait for the device."""
+        """Return the index of the chosen world.
+
+        "best" and "worst" compare the worlds' returns, so they synchronize with the device.
+        """
         if isinstance(choice, int):
             return choice
         if choice in ("next", "previous"):

@@ -15,7 +15,7 @@ PLOT_POINTS, PLOT_SECONDS = 200, 20.0
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
-"""The curves at the start: the reward and the evaluation."""
+"""The reward and the evaluation, which the viewer plots when it starts."""
 WINDOWS = ("messages", "curves", "view", "keys")
 
 
