@@ -40,8 +40,9 @@ def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Tab
         exact, same = fastest(rows, "reference"), fastest(rows, "same")
         faster = [row for row in rows if row["verdict"] in ("different", "not shown", "faults")
                   and row["speedup"] > (same["speedup"] if same else 1.0)]  # fmt: skip
+        episodes = "first 100 steps" if who["short"] else "whole episodes"
         lines.append([
-            who["task"], "first 100 steps" if who["short"] else "whole episodes",
+            who["task"], f"{who['episodes']:,} {episodes}" if who["episodes"] else episodes,
             f"{exact['steps_per_second']:,.0f} ({exact['speedup']:.2f})" if exact else "",
             *((same["name"], f"{same['speedup']:.2f}", changes(same)) if same else ("as it is", "1", "")),
             "; ".join(f"{row['name']}: {row['speedup']:.2f}, {row['verdict']}, {changes(row)}" for row in faster[:2]),
