@@ -24,9 +24,10 @@ def test_simple_shapes_replace_colliding_meshes_without_changing_masses(shared_e
         np.testing.assert_allclose(model.body(name).subtreemass, original.body(i).subtreemass, atol=1e-9, err_msg=name)
 
 
-def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv) -> None:
+@pytest.mark.parametrize("physics", ["exact", "fast"])
+def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv, physics: str) -> None:
     """The grippers move to the handles, close and rise. The task succeeds with a reward of nearly 6.5."""
-    env = shared_env("aloha_lift", nworld=3, autoreset=False)
+    env = shared_env("aloha_lift", nworld=3, autoreset=False, physics=physics)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))
     for world in range(3):

@@ -56,9 +56,10 @@ def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
     np.testing.assert_allclose(moved[0], [0.04] * 7 + [0.004], atol=1e-6)
 
 
-def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv) -> None:
+@pytest.mark.parametrize("physics", ["exact", "fast"])
+def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv, physics: str) -> None:
     """The gripper descends, closes and rises. The task succeeds with a reward of nearly 6.5."""
-    env = shared_env("panda_lift", nworld=4, autoreset=False)
+    env = shared_env("panda_lift", nworld=4, autoreset=False, physics=physics)
     start, at = positions(env)[0], cube(env)
     waypoints = np.zeros((3, 4, 8))
     for world in range(4):
