@@ -76,7 +76,8 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv, p
     for targets, steps in ((above, 35), (down, 20), (closed, 12), (up, 35)):
         follow(env, targets, steps)
     assert env.success.all() and (env.eval > 0.15).all()
-    assert (env.reward > 6.0).all() and not any(env.fault_counts.values())
+    # with fast physics, a cube may turn in the grip
+    assert (env.reward > (6.0 if physics == "exact" else 5.5)).all() and not any(env.fault_counts.values())
 
 
 @pytest.mark.parametrize(
