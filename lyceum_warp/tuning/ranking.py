@@ -16,7 +16,8 @@ from lyceum_warp.tuning.judgement import Correlation
 from lyceum_warp.tuning.trial import random_actions
 
 _SAMPLES = 64
-_MOVING_STEPS, _FALLING_STEPS, _LYING_STEPS = 30, 200, 10
+_MOVING_STEPS = (30, 120)
+_FALLING_STEPS, _LYING_STEPS = 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
 """A plan is improved this often before the compared samples are drawn around it."""
@@ -30,7 +31,8 @@ class Rankings:
     three kinds of states:
 
     - standing: after a random reset;
-    - moving: after 30 steps under a planner with the plant's physics that replans every 6 steps;
+    - moving: after 30 to 120 steps, spread evenly over the states, under a planner with the plant's physics that
+      replans every 6 steps. A robot that handles objects grasps only late in an episode;
     - fallen: after random actions until the end of the episode (at most 200 steps), and 10 more steps.
     """
 
@@ -54,11 +56,14 @@ class Rankings:
         found = {"standing": plant.get_state()}
         self.exact.reset(self.seed)
         every = min(_REPLAN_EVERY, self.exact.horizon)
-        for step in range(_MOVING_STEPS):
+        moving, counts = found["standing"].clone(), torch.linspace(*_MOVING_STEPS, self.states).round()
+        for step in range(int(counts.max())):
             if step % every == 0:
                 self.exact(plant.get_state(), shift=every if step else 0)
             plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
-        found["moving"] = plant.get_state()
+            taken = counts == step + 1
+            moving[taken] = plant.get_state()[taken]
+        found["moving"] = moving
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
         for _ in range(_FALLING_STEPS):
