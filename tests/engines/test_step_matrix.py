@@ -14,7 +14,7 @@ from step_table import Case
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage, describe, early_sensor_columns
-from lyceum_warp.model_fields import _FIELDS, Constants, ModelField, describe_model_field
+from lyceum_warp.model_fields import VARYING_FIELDS, Constants, ModelField, describe_model_field
 
 N = 2
 PARTS = 20
@@ -179,7 +179,7 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
     "body_mass", "body_inertia", "body_ipos", "qpos0", "dof_armature", "actuator_gear", "geom_size", "geom_gap",
     "cam_pos", "tendon_armature",
 )  # fmt: skip
-@pytest.mark.parametrize("name", _FIELDS)
+@pytest.mark.parametrize("name", VARYING_FIELDS)
 def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, device: wp.Device) -> None:
     """Some model fields are zero by default. Results are bitwise equal if no constants are derived from the field."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
