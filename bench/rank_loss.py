@@ -3,8 +3,9 @@
     lyceum-warp bench rank_loss half_cheetah hopper
 
 Each line of results/rank-loss.jsonl holds the rank correlations of ``lyceum-warp tune --planning`` and three returns.
-The loss is (R_exact - R_setting) / (R_exact - R_none): the return under the task's physics, under the setting's, and
-without a planner. Episodes do not run in real time, so the load of the machine does not matter.
+The loss is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return if the planner uses the task's physics,
+R_setting the return if it uses the setting, and R_none the return without a planner. Episodes do not run in real time,
+so the load of the machine does not matter.
 """
 
 import dataclasses

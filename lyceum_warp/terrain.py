@@ -1,7 +1,6 @@
 """Make rough ground from a height field with patches of increasing difficulty."""
 
 import dataclasses
-import difflib
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
@@ -126,8 +126,8 @@ class Terrain:
     def __post_init__(self) -> None:
         for name in [*self.kinds, *self.scale]:
             if isinstance(name, str) and name not in _KINDS:
-                close = difflib.get_close_matches(name, _KINDS, 3) or _KINDS
-                raise ValueError(f"there is no kind of terrain {name!r}: use {', '.join(close)}, or a function")
+                hint = did_you_mean(name, _KINDS, f"use {', '.join(_KINDS)}, or a function")
+                raise ValueError(f"there is no kind of terrain {name!r}: {hint}")
         for name, count in [("levels", self.levels), *((f"columns of {kind}", n) for kind, n in self.kinds.items())]:
             if not (isinstance(count, int) and count > 0):
                 raise ValueError(f"{name} must be a whole number above 0, not {count!r}")

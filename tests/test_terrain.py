@@ -84,14 +84,14 @@ def test_a_custom_function_makes_patches() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"kinds": {"stair_up": 1}}, "no kind of terrain 'stair_up': use stairs_up"),
+        ({"kinds": {"stair_up": 1}}, "no kind of terrain 'stair_up': did you mean stairs_up"),
         ({"kinds": {}}, "at least one kind"),
         ({"kinds": {"rough": 0}}, "columns of rough must be a whole number above 0, not 0"),
         ({"levels": 2.5}, "levels must be a whole number above 0, not 2.5"),
         ({"patch": 8.05}, r"patch=8\.05 must be a multiple of resolution=0\.1"),
         ({"border": -1.0}, r"border=-1\.0 must be a multiple"),
         ({"resolution": 0.0}, r"resolution must be positive, not 0\.0"),
-        ({"scale": {"ruogh": 0.1}}, "no kind of terrain 'ruogh': use rough"),
+        ({"scale": {"ruogh": 0.1}}, "no kind of terrain 'ruogh': did you mean rough"),
     ],
 )
 def test_invalid_terrain_raises_an_error(arguments: dict[str, object], message: str) -> None:

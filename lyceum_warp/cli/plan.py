@@ -116,7 +116,7 @@ class Plan:
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
     predict: bool = False
-    """With --real-time, plan from the predicted state at the end of the current step, when the plan can first apply."""
+    """With --real-time, plan from a prediction of the state at the end of the current step."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None

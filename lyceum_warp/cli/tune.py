@@ -56,8 +56,8 @@ class Tune:
     seed: int = 0
     """Seed of initial states and actions."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Its results are not measured
-    again."""
+    """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Settings in the file are not
+    measured again."""
     param: ParamWords = ()
     env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=Placement

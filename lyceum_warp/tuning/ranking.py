@@ -61,8 +61,8 @@ class Rankings:
             if step % every == 0:
                 self.exact(plant.get_state(), shift=every if step else 0)
             plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
-            taken = counts == step + 1
-            moving[taken] = plant.get_state()[taken]
+            if (taken := counts == step + 1).any():
+                moving[taken] = plant.get_state()[taken]
         found["moving"] = moving
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
