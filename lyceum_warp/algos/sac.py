@@ -1,8 +1,12 @@
 """Learn policies by soft actor-critic (SAC).
 
 SAC was proposed by Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and Applications"). It has twin critics, slowly
-moving target critics, and a temperature that is adapted to reach a target entropy. With many worlds and large batches,
-this implementation is close to FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
+moving target critics, and a temperature that is adapted to reach a target entropy.
+
+With few worlds, the critics predict quantiles, and the targets drop the largest ones, as in TQC (Kuznetsov et al. 2020,
+"Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile Critics"). With many
+worlds and large batches, this implementation is close to FastSAC (Seo et al. 2025, "Learning Sim-to-Real Humanoid
+Locomotion in 15 Minutes").
 """
 
 import copy
@@ -26,7 +30,7 @@ from lyceum_warp.algos.sac_config import SACConfig
 from lyceum_warp.algos.squashed_policy import SquashedPolicy
 from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
 from lyceum_warp.algos.timing import PhaseTimer
-from lyceum_warp.algos.twin_critic import TwinCritic
+from lyceum_warp.algos.twin_critic import TwinCritic, quantile_loss
 from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
@@ -48,7 +52,7 @@ class SACIteration(SampledIteration):
     """
 
     critic_loss: float
-    """Loss of the two critics: the sum of their mean squared errors."""
+    """Sum of the two critics' losses: quantile Huber losses, or mean squared errors if ``quantiles`` is 1."""
     q_mean: float
     """Mean of the critics' predictions."""
     actor_loss: float
@@ -132,7 +136,7 @@ class SAC(Learner):
         )
         self.value = value or TwinCritic(
             env.obs_spaces[group].size, nact, given.value_hidden, activation=given.value_activation,
-            layer_norm=given.layer_norm, group=group, **options,
+            layer_norm=given.layer_norm, quantiles=given.quantiles, group=group, **options,
         )  # fmt: skip
         _check_sizes(self.policy, self.value, env, low, high)
         trainable(self.policy.to(device)), trainable(self.value.to(device))
@@ -153,7 +157,8 @@ class SAC(Learner):
         self.config = dataclasses.replace(
             given, replay=self.replay.steps * nworld, hidden=tuple(own["hidden"]), activation=own["activation"],
             normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
-            layer_norm=critics["layer_norm"], symmetry="exact" if self.policy.mirror is not None else given.symmetry,
+            layer_norm=critics["layer_norm"], quantiles=critics["quantiles"],
+            symmetry="exact" if self.policy.mirror is not None else given.symmetry,
         )  # fmt: skip
         self.rollout = Rollout(env, given.num_steps)
         self.count = given.num_steps * nworld
@@ -321,15 +326,22 @@ class SAC(Learner):
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the sum of the critics' squared errors, and the mean of the critics' predictions."""
-        group = self.value.group
+        """Compute the sum of the critics' losses, and the mean of the critics' predictions."""
+        group, config = self.value.group, self.config
         with torch.no_grad():
             action, log_prob = self.policy.sample(batch.next_obs["policy"], noise)
             entropy = -self.log_temperature.exp() * log_prob
-            value = self._bound(self.target(batch.next_obs[group], action)) + entropy
-            target = batch.reward + batch.discount * value
-        values = self.value(batch.obs[group], self.policy.unit(batch.action))
-        return (weight * (values - target).square()).sum(), (weight * values.detach().mean(0)).sum()
+            values = self.target.quantiles(batch.next_obs[group], action)
+            if config.quantiles == 1:
+                values = self._bound(values)  # (batch, 1)
+            else:
+                # the quantiles of both critics, (batch, 2 * quantiles), without the largest ones
+                values = values.transpose(0, 1).flatten(1).sort().values
+                values = values[:, : 2 * (config.quantiles - config.dropped_quantiles)]
+            target = batch.reward[:, None] + batch.discount[:, None] * (values + entropy[:, None])
+        values = self.value.quantiles(batch.obs[group], self.policy.unit(batch.action))
+        loss = (values - target).square().sum((0, 2)) if config.quantiles == 1 else quantile_loss(values, target)
+        return (weight * loss).sum(), (weight * values.detach().mean((0, 2))).sum()
 
     def actor_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
@@ -347,7 +359,8 @@ class SAC(Learner):
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
     def _bound(self, values: torch.Tensor) -> torch.Tensor:
-        return values.amin(0) if self.config.critic_bound == "min" else values.mean(0)
+        least = self.config.quantiles == 1 and self.config.critic_bound == "min"
+        return values.amin(0) if least else values.mean(0)
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state except ``replay``; see ``Learner``."""

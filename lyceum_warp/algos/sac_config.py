@@ -8,22 +8,22 @@ from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
 
 _BOUNDS: dict[str, float | tuple[float, float]] = {
-    "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "mean_every": 0,
-    "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0), "learning_rate": 0.0, "temperature": 1e-6,
-    "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
+    "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "quantiles": 1,
+    "dropped_quantiles": 0, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0),
+    "learning_rate": 0.0, "temperature": 1e-6, "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
 }  # fmt: skip
 
 MANY_WORLDS = 256
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
-    "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
+    "quantiles": 25, "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
 }  # fmt: skip
-"""Defaults for fewer than 256 worlds, from Haarnoja et al., 2018."""
+"""Defaults for fewer than 256 worlds, from Haarnoja et al., 2018, and Kuznetsov et al., 2020 (TQC)."""
 
 _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
-    "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
+    "quantiles": 1, "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
 """Defaults for 256 worlds or more, close to the settings of Seo et al., 2025, for humanoids."""
 
@@ -64,9 +64,15 @@ class SACConfig:
     tau: float | None = None
     """Fraction by which each update moves the target critics towards the critics (Polyak averaging). The default is
     0.125 with 256 or more worlds, and otherwise 0.005."""
+    quantiles: int | None = None
+    """Number of quantiles that each critic predicts; with 1, it predicts the mean. The default is 1 with 256 or more
+    worlds, and otherwise 25."""
+    dropped_quantiles: int = 2
+    """Number of quantiles per critic that the targets drop, the largest ones of both critics (TQC). With one quantile,
+    the targets use ``critic_bound`` instead."""
     critic_bound: Literal["min", "mean"] | None = None
-    """Value of an action: the minimum or the mean of the two critics' predictions. The default is "mean" with 256 or
-    more worlds, and otherwise "min"."""
+    """Value of an action if ``quantiles`` is 1: the minimum or the mean of the two critics' predictions. The default is
+    "mean" with 256 or more worlds, and otherwise "min"."""
     learning_rate: float = 3e-4
     """Learning rate of the actor, the critics and the temperature (Adam)."""
     temperature: float | None = None
@@ -121,15 +127,19 @@ class SACConfig:
             nworld: Number of worlds of all processes.
 
         Raises:
-            ValueError: ``actor_every`` does not divide ``updates``.
+            ValueError: ``actor_every`` does not divide ``updates``, or ``dropped_quantiles`` leaves no quantile.
         """
         updates = min(nworld, 8)
         rules = {"num_steps": max(50, -(-1_000 // nworld)), "warmup": max(5_000, 10 * nworld), "updates": updates}
         defaults = rules | (_FEW if nworld < MANY_WORLDS else _MANY)
         config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
-        assert config.updates is not None and config.actor_every is not None
+        assert config.updates is not None and config.actor_every is not None and config.quantiles is not None
         if config.updates % config.actor_every:
             raise ValueError(
                 f"updates={config.updates} must be a multiple of actor_every, which is {config.actor_every}"
+            )
+        if config.dropped_quantiles >= config.quantiles > 1:
+            raise ValueError(
+                f"dropped_quantiles={config.dropped_quantiles} must be less than quantiles, which is {config.quantiles}"
             )
         return config

@@ -1,4 +1,8 @@
-"""Define twin critics, two networks that predict discounted returns from observations and actions."""
+"""Define twin critics, two networks that predict discounted returns from observations and actions.
+
+The critics can predict quantiles of the returns (Dabney et al. 2018, "Distributional Reinforcement Learning with
+Quantile Regression").
+"""
 
 import itertools
 import math
@@ -24,6 +28,7 @@ class TwinCritic(Normalized):
         activation: Activation of the hidden layers.
         layer_norm: Whether to normalise each hidden layer before its activation (Ba et al. 2016, "Layer
             Normalization").
+        quantiles: Number of quantiles that each critic predicts; with 1, it predicts the mean.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         group: The group of observations that the critics use.
@@ -43,19 +48,20 @@ class TwinCritic(Normalized):
         *,
         activation: Activation = "relu",
         layer_norm: bool = True,
+        quantiles: int = 1,
         normalize: bool = False,
         limit: float = LIMIT,
         group: str = "policy",
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
-        sizes = [nobs + nact, *layer_sizes(hidden), 1]
+        sizes = [nobs + nact, *layer_sizes(hidden), whole_number("quantiles", quantiles, low=1)]
         check_memory([2 * size for size in sizes], nobs=nobs, hidden=hidden, nact=nact)
         super().__init__(nobs, normalize, limit)
         self.group = group
         self.shape = {
             "nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "activation": activation,
-            "layer_norm": layer_norm, "normalize": normalize, "limit": limit, "group": group,
+            "layer_norm": layer_norm, "quantiles": quantiles, "normalize": normalize, "limit": limit, "group": group,
         }  # fmt: skip
         layers: list[nn.Module] = []
         for i, (n, m) in enumerate(itertools.pairwise(sizes)):
@@ -72,9 +78,27 @@ class TwinCritic(Normalized):
             obs: Observations, (rows, nobs).
             action: Unit actions, between -1 and 1, (rows, nact).
         """
+        return self.quantiles(obs, action).mean(-1)
+
+    def quantiles(self, obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        """Predict quantiles of discounted returns, (2, rows, quantiles). The arguments are those of ``forward``."""
         x = torch.cat([self.normalizer(obs), action], dim=-1).expand(2, -1, -1)
-        values: torch.Tensor = self.network(x).squeeze(-1)
+        values: torch.Tensor = self.network(x)
         return values.float()
+
+
+def quantile_loss(values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Compute the quantile Huber loss of each row (Dabney et al. 2018, equation 10), added over both critics.
+
+    Args:
+        values: The critics' quantiles, (2, rows, n).
+        target: Samples of the target, (rows, m).
+    """
+    n = values.shape[-1]
+    fraction = ((torch.arange(n, device=values.device) + 0.5) / n)[:, None]
+    error = target[:, None, :] - values[..., None]
+    huber = nn.functional.huber_loss(error, torch.zeros_like(error), reduction="none")
+    return ((fraction - (error.detach() < 0).float()).abs() * huber).mean((-2, -1)).sum(0)
 
 
 class TwinLinear(nn.Module):

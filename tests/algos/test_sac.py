@@ -66,12 +66,28 @@ class Plain(torch.nn.Module):
             x = x @ weight + bias
             x = (x - x.mean(-1, keepdim=True)) / (x.var(-1, correction=0, keepdim=True) + 1e-5).sqrt()
             x = torch.relu(x * gain + shift)
-        return (x @ self.w[8] + self.w[9]).squeeze(-1)
+        quantiles: torch.Tensor = x @ self.w[8] + self.w[9]
+        return quantiles
 
 
-@pytest.mark.parametrize("changes", [{"updates": 1}, {"updates": 1, "n_step": 3, "critic_bound": "mean"}])
+def quantile_huber(quantiles: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Dabney et al., 2018, equation 10, one quantile and one target at a time."""
+    (rows, n), losses = quantiles.shape, []
+    for row in range(rows):
+        for i in range(n):
+            for y in target[row]:
+                error, tau = y - quantiles[row, i], (2 * i + 1) / (2 * n)
+                huber = error**2 / 2 if error.abs() <= 1 else error.abs() - 0.5
+                losses.append(abs(tau - float(error < 0)) * huber)
+    return torch.stack(losses).mean()
+
+
+@pytest.mark.parametrize("changes", [
+    {"quantiles": 1}, {"quantiles": 1, "n_step": 3, "critic_bound": "mean"},
+    {"quantiles": 5, "dropped_quantiles": 1},
+])  # fmt: skip
 def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: lw.Env) -> None:
-    sac = made(env, target_entropy=-0.7, temperature=0.3, **changes)
+    sac = made(env, target_entropy=-0.7, temperature=0.3, updates=1, **changes)
     for _ in range(2):
         next(sac)
     with torch.no_grad():
@@ -94,15 +110,25 @@ def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: 
         return torch.tanh(value), log_prob.sum(-1)
 
     def bound(pair: list[Plain], obs: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        one, two = (critic(obs.double(), action) for critic in pair)
-        return torch.minimum(one, two) if config.critic_bound == "min" else (one + two) / 2
+        one, two = (critic(obs.double(), action).mean(-1) for critic in pair)
+        least = config.quantiles == 1 and config.critic_bound == "min"
+        return torch.minimum(one, two) if least else (one + two) / 2
 
     with torch.no_grad():
         action, log_prob = drawn(batch.next_obs["policy"], next_noise)
-        value = bound(targets, batch.next_obs["critic"], action) - alpha * log_prob
-        target = batch.reward.double() + batch.discount.double() * value
+        if config.quantiles == 1:
+            values = bound(targets, batch.next_obs["critic"], action)[:, None]
+        else:
+            both = [critic(batch.next_obs["critic"].double(), action) for critic in targets]
+            values = torch.cat(both, dim=-1).sort().values[:, :-2]
+        value = values - (alpha * log_prob)[:, None]
+        target = batch.reward.double()[:, None] + batch.discount.double()[:, None] * value
     unit = 2.0 * (batch.action.double() + 1.0) / 2.0 - 1.0  # actions of this task are between -1 and 1
-    loss = sum((critic(batch.obs["critic"].double(), unit) - target).square().mean() for critic in critics)
+    predicted = [critic(batch.obs["critic"].double(), unit) for critic in critics]
+    if config.quantiles == 1:
+        loss = sum((values - target).square().mean() for values in predicted)
+    else:
+        loss = sum(quantile_huber(values, target) for values in predicted)
     step = torch.optim.Adam([p for critic in critics for p in critic.parameters()], lr=config.learning_rate)
     # moments of Adam before the update
     for k, critic in enumerate(critics):
@@ -284,3 +310,5 @@ def test_invalid_hyperparameters_raise_an_error(words: dict[str, Any], message: 
         lw.SACConfig(**words)
     with pytest.raises(ValueError, match="updates=6 must be a multiple of actor_every, which is 4"):
         lw.SACConfig(updates=6).resolved(4096)
+    with pytest.raises(ValueError, match="dropped_quantiles=3 must be less than quantiles, which is 3"):
+        lw.SACConfig(quantiles=3, dropped_quantiles=3).resolved(8)
