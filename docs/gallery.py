@@ -91,7 +91,7 @@ SHOWS = {
     "dm/hopper_stand": Show({"horizon": 50, "knots": 6, "noise": 0.7, "temperature": 0.05}),
     "dm/humanoid_run": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}),
     "dm/humanoid_stand": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}, seconds=3.6),
-    "dm/humanoid_walk": Show({"update": "cem", "horizon": 40, "knots": 5, "noise": 0.4}),
+    "dm/humanoid_walk": Show(start=13.0, seconds=3.0, camera=FreeCamera(track=1, distance=4.5, elevation=-10.0)),
     "dm/manipulator_bring_ball": Show(
         {"horizon": 32, "knots": 5, "noise": 0.5, "temperature": 0.05}, {"close": 0.1}, seconds=2.5, seed=12,
         camera=FreeCamera(lookat=(0.0, 0.0, 0.5), distance=1.1, azimuth=90.0, elevation=-5.0),
@@ -119,8 +119,8 @@ SHOWS = {
     **{f"g1_{name}": Show(seconds=3.0, camera=FreeCamera(track=1, distance=2.8, azimuth=135.0, elevation=-15.0))
        for name in ("stand", "walk")},
     "humanoid": Show(
-        {"horizon": 48, "knots": 6, "noise": 0.25, "temperature": 1.0}, start=1.0, seconds=3.0,
-        camera=FreeCamera(lookat=(3.2, 0.0, 0.9), distance=4.8, azimuth=90.0, elevation=-8.0),
+        {"horizon": 48, "knots": 6, "noise": 0.25, "temperature": 1.0}, start=1.0, seconds=1.8,
+        camera=FreeCamera(track=1, distance=4.2, azimuth=90.0, elevation=-8.0),
     ),
     "humanoid_get_up": Show(seconds=3.0),
     "humanoid_stand": Show(seconds=3.0),

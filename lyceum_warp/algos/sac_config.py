@@ -17,13 +17,13 @@ MANY_WORLDS = 256
 
 _FEW: dict[str, Any] = {
     "batch": 256, "actor_every": 1, "gamma": 0.99, "tau": 0.005, "temperature": 1.0, "target_entropy": -1.0,
-    "quantiles": 25, "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
+    "critic_bound": "min", "hidden": (256, 256), "value_hidden": (256, 256),
 }  # fmt: skip
-"""Defaults for fewer than 256 worlds, from Haarnoja et al., 2018, and Kuznetsov et al., 2020 (TQC)."""
+"""Defaults for fewer than 256 worlds, from Haarnoja et al., 2018."""
 
 _MANY: dict[str, Any] = {
     "batch": 8192, "actor_every": 4, "gamma": 0.97, "tau": 0.125, "temperature": 1e-3, "target_entropy": 0.0,
-    "quantiles": 1, "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
+    "critic_bound": "mean", "hidden": (512, 256, 128), "value_hidden": (512, 512, 512),
 }  # fmt: skip
 """Defaults for 256 worlds or more, close to the settings of Seo et al., 2025, for humanoids."""
 
@@ -64,9 +64,9 @@ class SACConfig:
     tau: float | None = None
     """Fraction by which each update moves the target critics towards the critics (Polyak averaging). The default is
     0.125 with 256 or more worlds, and otherwise 0.005."""
-    quantiles: int | None = None
-    """Number of quantiles that each critic predicts; with 1, it predicts the mean. The default is 1 with 256 or more
-    worlds, and otherwise 25."""
+    quantiles: int = 1
+    """Number of quantiles that each critic predicts; with 1, it predicts the mean. TQC (Kuznetsov et al., 2020) uses
+    25."""
     dropped_quantiles: int = 2
     """Number of quantiles per critic that the targets drop, the largest ones of both critics (TQC). With one quantile,
     the targets use ``critic_bound`` instead."""
@@ -133,7 +133,7 @@ class SACConfig:
         rules = {"num_steps": max(50, -(-1_000 // nworld)), "warmup": max(5_000, 10 * nworld), "updates": updates}
         defaults = rules | (_FEW if nworld < MANY_WORLDS else _MANY)
         config = dataclasses.replace(self, **{k: v for k, v in defaults.items() if getattr(self, k) is None})
-        assert config.updates is not None and config.actor_every is not None and config.quantiles is not None
+        assert config.updates is not None and config.actor_every is not None
         if config.updates % config.actor_every:
             raise ValueError(
                 f"updates={config.updates} must be a multiple of actor_every, which is {config.actor_every}"
