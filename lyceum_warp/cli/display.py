@@ -198,7 +198,7 @@ def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
 # plans
 
 
-class PlanDisplay:
+class PlanDisplay(Progress):
     """Shows the progress of a planner's episode: a live line on a terminal, and a line when the episode ends.
 
     The live line shows the steps per second. With ``real_time``, it shows the plans per second and the age of the
@@ -208,20 +208,12 @@ class PlanDisplay:
     def __init__(
         self, console: Console, episode: int, episodes: int, steps: int, timestep: float, *, real_time: bool = False
     ) -> None:
-        self.console, self.timestep, self.real_time = console, timestep, real_time
-        self.title = f"episode {episode + 1}/{episodes}"
-        self.progress = Progress(
+        self.title, self.timestep, self.real_time = f"episode {episode + 1}/{episodes}", timestep, real_time
+        super().__init__(
             TextColumn(self.title), BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
             console=console, disable=not console.is_terminal, transient=True,
         )  # fmt: skip
-        self.bar = self.progress.add_task("", total=steps, text="")
-
-    def __enter__(self) -> "PlanDisplay":
-        self.progress.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.progress.stop()
+        self.bar = self.add_task("", total=steps, text="")
 
     def __call__(self, now: ControlProgress) -> None:
         """Show a step."""
@@ -232,7 +224,7 @@ class PlanDisplay:
             else:
                 pace = f"{now.step / time:.0f} Hz {now.step / time * self.timestep:.2f}x real time"
             text = f"reward {now.reward:.3g} eval {now.eval:.3g} {pace}"
-            self.progress.update(self.bar, completed=now.step, text=text)
+            self.update(self.bar, completed=now.step, text=text)
 
     def done(self, trajectory: Trajectory) -> None:
         """Print the episode's result."""

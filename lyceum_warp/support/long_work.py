@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 
-class LongWork:
+class LongWork(Progress):
     """Shows the progress of long work: a temporary bar on a terminal, otherwise a line every 10 s.
 
     Args:
@@ -17,26 +17,19 @@ class LongWork:
     """
 
     def __init__(self, text: str, unit: str, console: Console | None = None, *, wait: float = 3.0) -> None:
-        self.text, self.unit, self.console = text, unit, console or Console(highlight=False, stderr=True)
-        self.progress = Progress(
+        console = console or Console(highlight=False, stderr=True)
+        super().__init__(
             TextColumn("{task.description}"), BarColumn(bar_width=12), MofNCompleteColumn(), TextColumn(unit),
-            TimeElapsedColumn(), console=self.console, transient=True, disable=not self.console.is_terminal,
+            TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
-        self.bar = self.progress.add_task(text, total=None)
-        self.start, self.next = time.monotonic(), wait
-
-    def __enter__(self) -> "LongWork":
-        self.progress.start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.progress.stop()
+        self.text, self.unit, self.bar = text, unit, self.add_task(text, total=None)
+        self.began, self.next_line = time.monotonic(), wait
 
     def __call__(self, done: int, total: int) -> None:
         """Show how many of all units are done."""
-        self.progress.update(self.bar, completed=done, total=total)
-        seconds = time.monotonic() - self.start
-        if not self.console.is_terminal and seconds >= self.next and done < total:
+        self.update(self.bar, completed=done, total=total)
+        seconds = time.monotonic() - self.began
+        if not self.console.is_terminal and seconds >= self.next_line and done < total:
             self.console.print(f"{self.text}: {done} of {total} {self.unit}, {seconds:.0f} s", soft_wrap=True)
             self.console.file.flush()
-            self.next = seconds + 10.0
+            self.next_line = seconds + 10.0

@@ -344,5 +344,5 @@ def test_live_display_shows_the_real_time_factor_or_the_age_of_actions(capsys: p
     for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
         with PlanDisplay(Console(force_terminal=True, width=120), 0, 1, 20, 0.02, real_time=real_time) as display:
             display(now)
-            display.progress.refresh()
+            display.refresh()
         assert f"10/20 reward 1 eval 2 {words}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().out)

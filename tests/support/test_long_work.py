@@ -10,9 +10,9 @@ def test_long_work_prints_its_progress_regularly() -> None:
     with LongWork("drawing the video", "frames", console) as work:
         work(1, 500)
         assert console.file.getvalue() == ""
-        start = work.start
+        began = work.began
         for seconds in (4.0, 4.5, 15.0):
-            work.start = start - seconds
+            work.began = began - seconds
             work(int(20 * seconds), 500)
     assert console.file.getvalue().splitlines() == [
         "drawing the video: 80 of 500 frames, 4 s", "drawing the video: 300 of 500 frames, 15 s",
