@@ -18,7 +18,6 @@ from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.runs.configuration import Configuration, describe
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import run_lock
-from lyceum_warp.runs.metrics_table import cut_rows
 from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
 from lyceum_warp.runs.task_copy import note_changes, task_copy
@@ -269,7 +268,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         text = " ".join(str(error).split())
         raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
     if learner.team.leads:
-        cut_rows(run.metrics, done)  # a killed run may have unsaved rows
+        run.cut(done)  # a killed run may have unsaved rows
         now = versions(run.config["device"])
         then = run.config.get("versions", now)
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:

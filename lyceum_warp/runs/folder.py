@@ -1,6 +1,7 @@
 """Read and write the folder of a training run."""
 
 import contextlib
+import csv
 import json
 import logging
 import shutil
@@ -10,25 +11,32 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.runs.checkpoints import (
-    FORMAT,
-    PolicyContent,
-    policy_of,
-    read_checkpoint,
-    value_of,
-    write_content,
-)
-from lyceum_warp.runs.config_file import read_config
-from lyceum_warp.runs.metrics_table import read_metrics
+from lyceum_warp.runs.checkpoints import FORMAT, PolicyContent, policy_of, read_checkpoint, value_of, write_content
 from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import check_kind
+from lyceum_warp.support.files import replaced, unknown_format
+from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.support.versions import versions
 
 _CONFIG, _TASK = "config.json", "task"
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
 """Remains of a process that was killed while it created a run."""
+
+_COUNT = 0
+"""Stands for whole numbers from 0 in ``_ENTRIES``."""
+
+_ENTRIES: dict[str, Any] = {
+    "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
+    "algorithm": str, "nworld": _COUNT, "threads": _COUNT, "seed": _COUNT, "iterations": _COUNT, "keep_every": _COUNT,
+    "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
+    "reached": dict, "kept": dict, "versions": dict, "resumed": list,
+}  # fmt: skip
+_REACHED: dict[str, Any] = {"iteration": _COUNT, "return": float | int}
+_KEPT: dict[str, Any] = {
+    "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
+    "program": bool,
+}  # fmt: skip
+"""Types of the entries of config.json. All entries are optional."""
 
 log = logging.getLogger(__name__)
 
@@ -37,49 +45,37 @@ log = logging.getLogger(__name__)
 class Run:
     """The folder of a training run.
 
-    =================== ======================================================================================
-    ``config.json``     the task, its parameters, the engine, its physics, the seed and all hyperparameters; the
-                        versions of the packages and of Python, the machine, the commit
-    ``metrics.csv``     one row per iteration
-    ``policy.pt``       the last policy and the value function
-    ``best.pt``         the policy with the best return
-    ``policies/``       the policy of every n-th iteration, if ``keep_every`` is set
-    ``checkpoint.pt``   the complete state to resume from exactly, at the same iteration as ``policy.pt``
-    ``previous.pt``     the previous checkpoint
-    ``replay/``         the replay buffer of the checkpoint, if the algorithm has one
-    ``transfer.json``   the verdict of ``lw.transfer`` on the last policy
-    ``task/``           copies of the task's file, modules and model, unless they are part of the package
-    =================== ======================================================================================
-
     Args:
         folder: The folder.
         config: The content of ``config.json``.
     """
 
+    config: dict[str, Any]
+    """The task, its parameters, the engine, its physics, the seed and all hyperparameters; the versions of the packages
+    and of Python, the machine, the commit."""
     metrics: Path
-    """Path of ``metrics.csv``."""
-    checkpoint: Path
-    """Path of ``checkpoint.pt``."""
-    previous: Path
-    """Path of ``previous.pt``."""
-    replay: Path
-    """Path of the folder ``replay``."""
+    """Path of ``metrics.csv``, with one row per iteration."""
     policy: Path
-    """Path of ``policy.pt``."""
+    """Path of ``policy.pt``, with the last policy and the value function."""
     best: Path
-    """Path of ``best.pt``."""
+    """Path of ``best.pt``, with the policy of the best return."""
+    checkpoint: Path
+    """Path of ``checkpoint.pt``: the complete state to resume from exactly, at the same iteration as ``policy.pt``."""
+    previous: Path
+    """Path of ``previous.pt``, the previous checkpoint."""
+    replay: Path
+    """Path of the folder ``replay``: the replay buffer of the checkpoint, if the algorithm has one."""
     transfer: Path
-    """Path of ``transfer.json``."""
+    """Path of ``transfer.json``, the verdict of ``lw.transfer`` on the last policy."""
     task_folder: Path
-    """Path of the folder ``task``."""
+    """Path of the folder ``task``: copies of the task's file, modules and model, unless they are in the package."""
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
-        self.metrics, self.task_folder = folder / "metrics.csv", folder / _TASK
-        self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
+        self.metrics, self.transfer = folder / "metrics.csv", folder / "transfer.json"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
-        self.replay = folder / "replay"
-        self.transfer = folder / "transfer.json"
+        self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
+        self.replay, self.task_folder = folder / "replay", folder / _TASK
 
     @property
     def task_name(self) -> str:
@@ -146,17 +142,36 @@ class Run:
 
     @classmethod
     def open(cls, folder: str | Path) -> "Run":
-        """Open the run in a folder.
+        """Open the run in a folder, and check the types of the entries of its configuration.
 
         Raises:
             FileNotFoundError: The folder has no run.
             ValueError: The configuration cannot be read, or was written by a newer release.
         """
-        folder = Path(folder)
-        path = folder / _CONFIG
+        path = Path(folder) / _CONFIG
         if not path.is_file():
             raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}")
-        return cls(folder, read_config(path))
+        try:
+            config = json.loads(path.read_text())
+            number = config["format"]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
+        if not isinstance(number, int) or number != FORMAT:
+            raise unknown_format(path, number, FORMAT)
+        algorithm = config.get("algorithm")
+        own = {str(algorithm): dict, f"{algorithm}_seed": _COUNT}
+        try:
+            for part, kinds in (None, _ENTRIES | own), ("reached", _REACHED), ("kept", _KEPT):
+                entries = config if part is None else config.get(part, {})
+                for name in kinds.keys() & entries.keys():
+                    kind, value = kinds[name], entries[name]
+                    if kind is _COUNT:
+                        whole_number(name, value, low=0)
+                    elif not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+                        raise ValueError(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {value!r}")
+        except ValueError as error:
+            raise ValueError(f"{path} is damaged: {error}") from error
+        return cls(Path(folder), config)
 
     def amend(self, **changes: Any) -> None:
         """Change entries of the configuration, in memory and in the file."""
@@ -169,8 +184,31 @@ class Run:
         if str(self.folder) not in str(error):
             error.add_note(f"with the settings in {self.folder / _CONFIG}")
 
+    # metrics
+
+    def append(self, row: Mapping[str, Any]) -> None:
+        """Append a row to the metrics table, by the names of columns. New columns are empty in earlier rows.
+
+        None becomes an empty cell. Floats are written with all digits.
+        """
+        known: list[str] = []
+        rows: list[list[str]] = []
+        if self.metrics.exists():
+            with self.metrics.open(newline="") as file:
+                reader = csv.reader(file)
+                known = next(reader, [])
+                if not row.keys() <= set(known):
+                    rows = list(reader)
+        columns = list(dict.fromkeys([*known, *row]))
+        if columns != known:
+            empty = [""] * (len(columns) - len(known))
+            with replaced(self.metrics) as temporary, temporary.open("w", newline="") as file:
+                csv.writer(file).writerows([columns, *(cells + empty for cells in rows)])
+        with self.metrics.open("a", newline="") as file:
+            csv.writer(file).writerow(map(row.get, columns))  # csv writes None as an empty cell
+
     def rows(self) -> list[dict[str, float | None]]:
-        """Read the rows of the metrics table. Empty cells become None.
+        """Read the rows of the metrics table. Empty cells become None. An incomplete last row is ignored.
 
         Raises:
             FileNotFoundError: The run has no metrics table yet.
@@ -178,7 +216,26 @@ class Run:
         """
         if not self.metrics.exists():
             raise FileNotFoundError(f"there is no file {self.metrics}, because the run has no complete iteration")
-        return read_metrics(self.metrics)
+        with self.metrics.open(newline="") as file:
+            reader = csv.DictReader((line for line in file if line.endswith("\n")), strict=True)
+            try:
+                return [{key: float(cell) if cell else None for key, cell in row.items()} for row in reader]
+            except (ValueError, TypeError, csv.Error) as error:
+                raise ValueError(
+                    f"{self.metrics} is not a table of metrics: line {reader.line_num}: {error}"
+                ) from error
+
+    def cut(self, iteration: int) -> None:
+        """Delete the rows after an iteration, and an incomplete last row, from the metrics table, if there is one."""
+        if not self.metrics.exists():
+            return
+        numbers = [row.get("iteration") or number for number, row in enumerate(self.rows(), 1)]
+        kept = sum(number <= iteration for number in numbers)
+        with self.metrics.open(newline="") as file:
+            lines = [line for line in file if line.strip()]
+        if len(lines) > kept + 1:
+            with replaced(self.metrics) as temporary:
+                temporary.write_text("".join(lines[: kept + 1]), newline="")
 
     # policies
 

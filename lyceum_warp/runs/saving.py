@@ -8,7 +8,6 @@ from collections.abc import Callable
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import append_row
 from lyceum_warp.runs.replay_files import clean_replay, write_replay
 
 log = logging.getLogger(__name__)
@@ -72,7 +71,7 @@ class Saver:
         """
         assert self.run is not None and self._check is not None
         self._check()
-        append_row(self.run.metrics, iteration.row())
+        self.run.append(iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
         score = None if score is None or math.isnan(score) else score

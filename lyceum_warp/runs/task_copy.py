@@ -28,15 +28,13 @@ Note = Callable[[str], None]
 Files = dict[Path, Path | bytes]
 """The content of each file, or the file from which to copy it."""
 
-_MODEL, TABLES = "model", "tables"
+TABLES = "tables"
 _APART = 2
 """If the task's file is more than this many levels below the folder that it shares with the model, the two are copied
 into separate folders.
 """
 _LARGEST = 512 * 2**20
 """Maximum size of a model that is copied, in bytes."""
-_MOST_MODULES, _LARGEST_MODULES = 100, 8 * 2**20
-"""Maximum number of a task's modules that are copied, and their maximum total size in bytes."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
@@ -53,20 +51,31 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     if file is not None:
         kept["source_hash"] = _digest(loaded[file])
     if own or given:
-        sources = _sources(file, loaded) if own and file is not None else {}
         main, model = _model_files(env)
-        modules = [path for path in sources if path != file]
-        names = _names_in_copy([*sources, *model], file, modules)
+        sources = loaded if own else {}
+        # relative paths stay the same, so that the copied task finds the copied model
+        names = _names_in_copy([*sources, *model])
+        if file in sources and names[file].count("/") > _APART:
+            names = _names_in_copy(sources) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
+        files = {names[path]: content for path, content in {**sources, **model}.items()}
         if own and file is not None:
-            kept["modules"] = {_beside(path, file): _digest(sources[path]) for path in modules}
+            kept["modules"] = {
+                path.relative_to(file.parent).as_posix(): _digest(source)
+                for path, source in loaded.items()
+                if path != file
+            }
             kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
         if main is not None:
             kept["model"] = names[main]
-        files = {names[path]: content for path, content in {**sources, **model}.items()}
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
     return kept, files
+
+
+def _names_in_copy(paths: Collection[Path]) -> dict[Path, str]:
+    root = os.path.commonpath([path.parent for path in paths]) if paths else ""
+    return {path: path.relative_to(root).as_posix() for path in paths}
 
 
 def json_value(name: str, value: Any) -> Any:
@@ -95,19 +104,6 @@ def _npy(array: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.save(buffer, array)
     return buffer.getvalue()
-
-
-def _sources(file: Path, loaded: Mapping[Path, bytes]) -> dict[Path, bytes]:
-    """Get a task's file and the modules that it imports from its folder, unless they exceed a limit."""
-    size = sum(map(len, loaded.values())) - len(loaded[file])
-    if len(loaded) - 1 <= _MOST_MODULES and size <= _LARGEST_MODULES:
-        return dict(loaded)
-    log.info(
-        "%s imports %d modules from its folder, which are too many or too large for a copy in the run's folder",
-        file,
-        len(loaded) - 1,
-    )
-    return {file: loaded[file]}
 
 
 def run_env(
@@ -236,25 +232,6 @@ def _model_hash(env: Env) -> str:
             elif isinstance(value, bytes | int | float):
                 found.update(f"{name}{value!r}".encode())
     return found.hexdigest()[:16]
-
-
-def _beside(path: Path, file: Path) -> str:
-    return path.relative_to(file.parent).as_posix()
-
-
-def _names_in_copy(paths: Collection[Path], file: Path | None, modules: Collection[Path] = ()) -> dict[Path, str]:
-    """Choose paths within the folder ``task`` for a task's file, its modules and its model's files.
-
-    Relative paths are kept if possible, so that the copied task finds the copied model.
-    """
-    if not paths:
-        return {}
-    root = Path(os.path.commonpath([path.parent for path in paths]))
-    if file is not None and file in paths and len(file.parent.relative_to(root).parts) > _APART:
-        own = {path: _beside(path, file) for path in (file, *modules)}
-        rest = _names_in_copy([path for path in paths if path not in own], None)
-        return own | {path: f"{_MODEL}/{name}" for path, name in rest.items()}
-    return {path: path.relative_to(root).as_posix() for path in paths}
 
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:

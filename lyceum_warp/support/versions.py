@@ -1,5 +1,6 @@
 """Collect the versions of packages and data about the machine, which both affect a run's numbers."""
 
+import contextlib
 import functools
 import importlib.metadata
 import os
@@ -25,7 +26,10 @@ def versions(device: str = "cpu") -> dict[str, Any]:
     found["torch"] = torch.__version__  # includes the build, such as +cpu
     found["python"] = platform.python_version()
     found["platform"] = platform.platform()
-    found["cpu"] = _cpu_name()
+    found["cpu"] = platform.processor() or platform.machine()
+    with contextlib.suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        found["cpu"] = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     found["cores"] = os.cpu_count()
     if device.startswith("cuda") and torch.cuda.is_available():
         found["gpu"] = torch.cuda.get_device_name(device)
@@ -33,16 +37,6 @@ def versions(device: str = "cpu") -> dict[str, Any]:
     if commit := _commit():
         found["commit"] = commit
     return found
-
-
-def _cpu_name() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
 
 
 @functools.cache

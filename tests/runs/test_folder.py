@@ -1,11 +1,16 @@
+import csv
 import json
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from training_runs import QUIET, algorithm, refused
 
+import lyceum_warp as lw
+from lyceum_warp import cli
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.runs.checkpoints import FORMAT
 from lyceum_warp.runs.checkpoints import policy_content as content
@@ -47,8 +52,10 @@ def test_creating_a_run_in_a_folder_with_content_raises_an_error(run: Run, tmp_p
     with pytest.raises(ValueError, match=r"contains a run: use another folder, or continue the run"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
-    (tmp_path / "file").write_text("mine")
-    for place in (tmp_path, tmp_path / "file"):
+    for file in ("file", "other/mine.tmp"):  # temporary files may belong to another program
+        (tmp_path / file).parent.mkdir(exist_ok=True)
+        (tmp_path / file).write_text("mine")
+    for place in (tmp_path, tmp_path / "file", tmp_path / "other"):
         with pytest.raises(ValueError, match="is not an empty folder: use another folder"):
             Run.create(place, {})
 
@@ -80,33 +87,6 @@ def test_run_can_be_created_in_a_folder_that_a_killed_process_left(
     assert [path.name for path in run.task_folder.iterdir()] == ["mine.py"]
 
 
-def test_folder_with_temporary_files_of_other_programs_is_not_used(tmp_path: Path) -> None:
-    (tmp_path / "mine.tmp").write_text("")
-    with pytest.raises(ValueError, match="is not an empty folder"):
-        Run.create(tmp_path, {})
-
-
-def test_opening_an_empty_folder_raises_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
-        Run.open(tmp_path)
-
-
-def test_opening_a_configuration_of_another_program_raises_an_error(tmp_path: Path) -> None:
-    for text in ("{", "[]", "{}", '"text"'):
-        (tmp_path / "config.json").write_text(text)
-        with pytest.raises(ValueError, match=r"config\.json is not the configuration of a run"):
-            Run.open(tmp_path)
-
-
-@pytest.mark.parametrize("number", [FORMAT + 1, "one"])
-def test_opening_a_run_of_an_unknown_format_raises_an_error(number: int | str, tmp_path: Path) -> None:
-    (tmp_path / "config.json").write_text(json.dumps({"format": number}))
-    with pytest.raises(
-        ValueError, match=rf"has format {number!r}, and .* reads formats up to 1: pip install --upgrade"
-    ):
-        Run.open(tmp_path)
-
-
 def test_loaded_policy_equals_the_saved_policy(run: Run) -> None:
     policy = GaussianPolicy(3, 2, (8, 4), normalize=True)
     policy.normalizer.update(3.0 + 2.0 * torch.randn(100, 3))  # type: ignore[operator]
@@ -129,3 +109,116 @@ def test_previous_checkpoint_remains_after_a_save(run: Run, caplog: pytest.LogCa
     run.previous.write_bytes(b"PK half")
     with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt"):
         run.read()
+
+
+# config.json
+
+
+@pytest.mark.parametrize(("config", "message"), [
+    *((config, "is not the configuration of a run") for config in ("{", [], {}, "text")),
+    *(({"format": number}, f"has format {number!r}, and .* reads formats up to 1: pip install --upgrade")
+      for number in (FORMAT + 1, "one")),
+    ({"task": 3}, "is damaged: task must be"),
+    ({"kept": []}, r"is damaged: kept must be of type dict, not \[\]"),
+    ({"kept": {"file": 3}}, "file must be of type str, not 3"),
+    ({"params": None}, "params must be of type dict"),
+    ({"seed": 2**63}, "seed must be a whole number from 0"),
+    ({"nworld": True}, "nworld must be a whole number"),
+    ({"tensorboard": 1}, "tensorboard must be of type bool"),
+    ({"reached": {"iteration": 1, "return": None}}, "return must be of type"),
+    ({"algorithm": "mine", "mine": 3}, "mine must be of type dict"),
+    ({"algorithm": "npg", "npg_seed": -1}, "npg_seed must be a whole number"),
+])  # fmt: skip
+def test_error_of_an_invalid_configuration_names_the_file(config: Any, message: str, tmp_path: Path) -> None:
+    if isinstance(config, dict) and config:
+        config = {"format": FORMAT} | config
+    (tmp_path / "config.json").write_text(config if config == "{" else json.dumps(config))
+    with pytest.raises(ValueError, match=rf"{tmp_path}/config\.json .*{message}"):
+        Run.open(tmp_path)
+
+
+def test_opening_an_empty_folder_raises_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"there is no run in .*: it has no config\.json"):
+        Run.open(tmp_path)
+
+
+@pytest.mark.parametrize("command", ["eval", "resume"])
+def test_error_of_an_invalid_setting_names_the_file(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=1)
+    run.amend(engine="x")
+    arguments = {"eval": ["eval", str(run.folder)],
+                 "resume": ["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]}  # fmt: skip
+    assert cli.main(arguments[command]) == 2
+    refused(capsys, "'x'", f"with the settings in {run.folder / 'config.json'}")
+
+
+# metrics.csv
+
+
+def test_a_new_column_of_metrics_is_empty_in_earlier_rows(tmp_path: Path) -> None:
+    """A newer task or package may add a column. The order of the names in a row does not matter."""
+    run = Run(tmp_path, {})
+    run.append({"iteration": 1, "kl": 0.5})
+    run.append({"iteration": 2, "kl": None, "metrics/forward, m": 1.5})
+    run.append({"metrics/forward, m": 2.5, "iteration": 3})
+    assert run.rows() == [
+        {"iteration": 1, "kl": 0.5, "metrics/forward, m": None},
+        {"iteration": 2, "kl": None, "metrics/forward, m": 1.5},
+        {"iteration": 3, "kl": None, "metrics/forward, m": 2.5},
+    ]
+
+
+def test_numbers_of_metrics_rows_are_read_exactly(tmp_path: Path) -> None:
+    run = Run(tmp_path, {})
+    rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
+    for row in rows:
+        run.append(row)
+    with run.metrics.open(newline="") as file:
+        cells = list(csv.reader(file))
+    assert cells[0] == ["iteration", "value", "mean", "bad"]
+    assert cells[1] == ["1", repr(1 / 3), "", "nan"]
+    read = run.rows()
+    assert [row["value"] for row in read] == [row["value"] for row in rows]
+    assert [row["mean"] for row in read] == [None, 1e-30, None]
+
+
+def test_metrics_rows_after_the_checkpoint_are_removed(tmp_path: Path) -> None:
+    run = Run(tmp_path, {})
+    run.cut(2)  # without a table
+    for i in (1, 2, 3):
+        run.append({"iteration": i, "value": 0.5})
+    with run.metrics.open("a") as file:
+        file.write("4,0.")  # an incomplete row
+    whole = run.metrics.read_text()
+    run.cut(2)
+    assert [row["iteration"] for row in run.rows()] == [1, 2]
+    run.metrics.write_text(whole)
+    run.cut(9)
+    assert [row["iteration"] for row in run.rows()] == [1, 2, 3]
+    run.cut(0)
+    run.append({"iteration": 1, "value": 0.5})
+    assert [row["iteration"] for row in run.rows()] == [1]
+
+
+def test_file_that_is_not_a_metrics_table_raises_an_error(tmp_path: Path) -> None:
+    run = Run(tmp_path, {})
+    run.metrics.write_text("iteration,value\n1,apple\n")
+    with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
+        run.rows()
+    run.metrics.write_text("iteration,value\n1,2,3\n")
+    with pytest.raises(ValueError, match="line 2"):
+        run.rows()
+
+
+@pytest.mark.parametrize("place", [0, 12, 16])
+def test_metrics_table_with_an_invalid_byte_raises_an_error_and_is_not_changed(place: int, tmp_path: Path) -> None:
+    run = Run(tmp_path, {})
+    damaged = bytearray(b"iteration,value\n1,2\n2,3\n")
+    damaged[place] = 0xFF
+    run.metrics.write_bytes(damaged)
+    for read in (lambda: run.rows(), lambda: run.cut(1)):
+        with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics"):
+            read()
+    assert run.metrics.read_bytes() == damaged

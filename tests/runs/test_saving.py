@@ -1,9 +1,7 @@
 import os
 import resource
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from conftest import SharedEnv
@@ -42,46 +40,27 @@ def test_saving_takes_a_small_fraction_of_the_training_time(
     assert saver.due()
 
 
-def trained_with(folder: Path, at_three: Callable[[], Any]) -> OSError:
-    def callback(iteration: lw.Iteration) -> None:
-        if iteration.iteration == 3:
-            at_three()
-
-    with pytest.raises(OSError) as raised:
-        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=callback, save_every=2)
-    return raised.value
-
-
 def test_run_ends_with_its_last_save_intact_if_a_file_cannot_be_written(six: Path, tmp_path: Path) -> None:
     """A file size limit simulates a full disk. The policy's file fits, but the larger file of the complete state does
     not."""
     folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     size = 2 * os.path.getsize(six / "policy.pt")
     assert size < os.path.getsize(six / "checkpoint.pt")
+
+    def limit(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+
     try:
-        error = trained_with(folder, lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1])))
+        with pytest.raises(OSError) as raised:
+            lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=limit, save_every=2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    error = raised.value
     assert error.strerror == "File too large" and error.filename == str(folder / "checkpoint.pt")
     assert error.__notes__ == [f"the run in {folder} is saved up to iteration 2"]
     assert not list(folder.rglob("*.tmp")) and Run.open(folder).read()["iteration"] == 2
     assert cli.main(["train", "--resume", str(folder), "--iterations", "6", *QUIET]) == 0
-    assert metrics(folder) == metrics(six)
-
-
-def test_resumed_run_removes_an_incomplete_metrics_row(six: Path, tmp_path: Path) -> None:
-    folder, limits = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
-
-    def limit() -> None:
-        size = (folder / "metrics.csv").stat().st_size + 9
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-
-    try:
-        assert trained_with(folder, limit).strerror == "File too large"
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not (folder / "metrics.csv").read_text().endswith("\n")
-    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
     assert metrics(folder) == metrics(six)
 
 

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -98,74 +97,32 @@ def test_run_of_another_user_raises_an_error_until_it_is_trusted(
     assert cli.main(command) == 2
 
 
-def outside(folder: Path) -> Path:
-    file = folder.parent / "evil.py"
-    file.write_text(SOURCE)
-    return file
-
-
-def names_a_task(folder: Path) -> Path:
-    file = outside(folder)
-    change(folder, task=f"{file}:Told")
-    return file
-
-
-def names_a_file_outside(folder: Path) -> Path:
-    outside(folder)
-    (folder / "task").mkdir()
-    config = Run.open(folder).config
-    change(folder, kept=config["kept"] | {"file": "../../evil.py"})
-    return folder / "task" / "../../evil.py"
-
-
-def names_an_absolute_file(folder: Path) -> Path:
-    file = outside(folder)
-    change(folder, kept=Run.open(folder).config["kept"] | {"file": str(file)})
-    return file
-
-
-def brings_a_file(folder: Path) -> Path:
-    (folder / "task").mkdir()
-    (folder / "task" / "point_mass.py").write_text(SOURCE)
-    change(folder, kept=Run.open(folder).config["kept"] | {"file": "point_mass.py"})
-    return folder / "task" / "point_mass.py"
-
-
-def names_a_table(folder: Path) -> Path:
-    change(folder, params={"motion": "/home/other/table.npy"})
-    return Path("/home/other/table.npy")
-
-
-def names_a_model(folder: Path) -> Path:
-    change(folder, options={"model": "/home/other/model.xml"})
-    return Path("/home/other/model.xml")
-
-
-def brings_a_model(folder: Path) -> Path:
-    (folder / "task").mkdir()
-    change(folder, kept=Run.open(folder).config["kept"] | {"model": "../model.xml"})
-    return folder / "task" / "../model.xml"
-
-
-ATTACKS = [names_a_task, names_a_file_outside, names_an_absolute_file, brings_a_file, names_a_table, names_a_model,
-           brings_a_model]  # fmt: skip
-
-
-@pytest.mark.parametrize("attack", ATTACKS)
+@pytest.mark.parametrize(("entries", "kept", "named"), [
+    ({"task": "EVIL:Told"}, {}, "EVIL"),
+    ({}, {"file": "EVIL"}, "EVIL"),
+    ({}, {"file": "../../evil.py"}, "task/../../evil.py"),
+    ({}, {"file": "point_mass.py"}, "task/point_mass.py"),
+    ({"params": {"motion": "/home/other/table.npy"}}, {}, "/home/other/table.npy"),
+    ({"options": {"model": "/home/other/model.xml"}}, {}, "/home/other/model.xml"),
+    ({}, {"model": "../model.xml"}, "task/../model.xml"),
+])  # fmt: skip
 def test_run_with_an_edited_path_raises_an_error(
-    attack: Callable[[Path], Path], made: Path, witness: Path, tmp_path: Path
+    entries: dict[str, Any], kept: dict[str, str], named: str, made: Path, witness: Path, tmp_path: Path
 ) -> None:
     """The run's folder was trusted before it was edited."""
-    folder = Path(shutil.copytree(made / "named", tmp_path / "named"))
-    file = attack(folder)
+    folder, evil = Path(shutil.copytree(made / "named", tmp_path / "named")), tmp_path / "evil.py"
+    (folder / "task").mkdir()
+    for file in (evil, folder / "task" / "point_mass.py") if "point_mass" in named else [evil]:
+        file.write_text(SOURCE)
+    entries, kept, named = json.loads(json.dumps([entries, kept, named]).replace("EVIL", str(evil)))
+    change(folder, **entries, kept=Run.open(folder).config["kept"] | kept)
     run = Run.open(folder)
     saved = Configuration.of(run)
-    with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
-        run_env(run, saved.options, saved.params)
-    assert str(file) in str(refusal.value) and not witness.exists()
-    if attack in (names_a_table, names_a_model):  # a given task would also read the file that the run names
-        with pytest.raises(ValueError, match=r"was not made by you .*--trust"):
-            run_env(run, saved.options, saved.params, task="point_mass")
+    # a given task would also read a table or a model that the run names
+    for task in (None, "point_mass") if named.startswith("/home") else [None]:
+        with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
+            run_env(run, saved.options, saved.params, task=task)
+        assert named in str(refusal.value) and not witness.exists()
 
 
 @pytest.mark.parametrize("link", ["file", "folder"])

@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.metrics_table import append_row, cut_rows
 from lyceum_warp.viz import learning_curve as module
 from lyceum_warp.viz.learning_curve import learning_curve
 
@@ -13,7 +12,7 @@ from lyceum_warp.viz.learning_curve import learning_curve
 def run(tmp_path: Path) -> Run:
     run = Run.create(tmp_path / "run", {"task": "point_mass", "seed": 3})
     for i in range(1, 8):
-        append_row(run.metrics, {
+        run.append({
             "iteration": i, "samples": 100 * i, "return_mean": float(i), "return_std": 0.5, "eval_mean": 1 / i,
             "mean_return": 2.0 * i if i % 3 == 0 else None, "mean_eval": 0.5 if i % 3 == 0 else None,
         })  # fmt: skip
@@ -36,7 +35,7 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
     for number, metrics in enumerate(({}, {"metrics/forward": 1.0, "metrics/effort": float("nan")})):
         run = Run.create(tmp_path / str(number), {"task": "point_mass", "seed": 3})
         for i in (1, 2):
-            append_row(run.metrics, {"samples": i, "return_mean": 1.0, "return_std": 0.5, "eval_mean": 1.0, **metrics})
+            run.append({"samples": i, "return_mean": 1.0, "return_std": 0.5, "eval_mean": 1.0, **metrics})
         header = learning_curve(run).read_bytes()[16:24]
         sizes.append(int.from_bytes(header[4:], "big"))
     assert sizes[1] > sizes[0]
@@ -44,7 +43,7 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
 
 def test_learning_curve_of_a_run_without_complete_iterations_raises_an_error(run: Run) -> None:
     pytest.importorskip("matplotlib")
-    cut_rows(run.metrics, 0)
+    run.cut(0)
     with pytest.raises(ValueError, match="has no complete iteration to plot: continue its training"):
         learning_curve(run)
 
@@ -57,7 +56,7 @@ def test_learning_curve_shows_rewards_if_no_episode_ended(tmp_path: Path, monkey
         run = Run.create(tmp_path / str(mean_return), {"task": "half_cheetah", "seed": 3})
         for i in (1, 2):
             row = {"samples": 10 * i, "reward_mean": 0.1 * i, "mean_return": mean_return, "mean_eval": mean_return}
-            append_row(run.metrics, row | dict.fromkeys(("return_mean", "return_std", "eval_mean"), math.nan))
+            run.append(row | dict.fromkeys(("return_mean", "return_std", "eval_mean"), math.nan))
         learning_curve(run)
     rewards, returns = (figure.axes[0] for figure in figures)
     assert rewards.get_ylabel() == "reward of a step" and list(rewards.lines[0].get_ydata()) == [0.1, 0.2]
