@@ -53,21 +53,6 @@ def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
     return Difference(mean, mean - half, mean + half, len(change))
 
 
-@dataclasses.dataclass(frozen=True)
-class Correlation:
-    """Mean rank correlation over some states, with its 95 % confidence interval."""
-
-    mean: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, values: np.ndarray) -> "Correlation":
-        """Average correlations, (states,)."""
-        mean, half = mean_interval(values)
-        return cls(mean, max(mean - half, -1.0), min(mean + half, 1.0))
-
-
 def episodes_needed(found: Difference, half_width: float) -> int:
     """Estimate how many episodes give an interval of a given half-width.
 
@@ -100,9 +85,9 @@ def verdict(row: Mapping[str, Any], tolerance: str) -> str:
 
 
 def _verdict_on_ranks(row: Mapping[str, Any], least: float) -> str:
-    found = [Correlation(**part) for part in row["ranks"].values()]
-    if any(part.high < least for part in found):
+    found = list(row["ranks"].values())
+    if any(part["high"] < least for part in found):
         return "ranks badly"
     if row["speedup"] < LEAST_GAIN:
         return "no gain"
-    return "same" if found and all(part.low >= least for part in found) else "not shown"
+    return "same" if found and all(part["low"] >= least for part in found) else "not shown"

@@ -1,6 +1,5 @@
 """Compare planners with different physics options by planning time and by how they rank the same samples."""
 
-import dataclasses
 import statistics
 import time
 from typing import Any
@@ -10,9 +9,9 @@ import torch
 
 from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.support.intervals import mean_interval
 from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting
-from lyceum_warp.tuning.judgement import Correlation
 from lyceum_warp.tuning.trial import random_actions
 
 _SAMPLES = 64
@@ -108,7 +107,8 @@ class Rankings:
         for kind, (plan, returns) in self._exact.items():
             found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
             if len(found):
-                row["ranks"][kind] = dataclasses.asdict(Correlation.of(found))
+                mean, half = mean_interval(found)
+                row["ranks"][kind] = {"mean": mean, "low": max(mean - half, -1.0), "high": min(mean + half, 1.0)}
         return row
 
     def _seconds(self, planner: MPPI, start: torch.Tensor) -> float:

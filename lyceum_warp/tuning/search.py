@@ -2,7 +2,7 @@
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, 
 from lyceum_warp.tuning.judgement import TOLERANCES, verdict
 from lyceum_warp.tuning.ranking import Rankings
 from lyceum_warp.tuning.row_file import RowFile, identity
-from lyceum_warp.tuning.trial import FULL, SHORT, Effort, Trials
+from lyceum_warp.tuning.trial import FULL, SHORT, Trials
 
 NWORLD, GPU_NWORLD = 256, 4096
 """Default number of worlds, on a CPU and on a GPU."""
@@ -126,68 +126,50 @@ def tune(
         trials = Rankings(kind, states=episodes or states, repeats=repeats, seed=seed, **words)
         measured["planner"] = trials.exact.settings
     else:
-        trials = _trials(kind, run, which, words, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
-        measured["policy"] = None if run is None else _digest(run, which)
+        options, params = EnvOptions.split(words)
+        if "nworld" not in words:
+            options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
+        opened = None if run is None else Run.open(run)
+        if opened is not None:
+            if opened.task_name != task_name(kind):
+                raise ValueError(
+                    f"{run} is a run of the task {opened.task_name!r}, not of the task {task_name(kind)!r}"
+                )
+            params = {**Configuration.of(opened).params, **params}
+        env, policy = Env(kind, options.changed({"autoreset": False}), **params), None
+        measured["policy"] = None
+        if opened is not None:
+            policy = load(opened, which=which, device=env.obs.device)
+            check_sizes(policy, env, f"the policy of {run}")
+            measured["policy"] = hashlib.sha256(opened.policy_file(which).read_bytes()).hexdigest()[:16]
+        own = None if policy is None else acting(policy)
+        trials = Trials(env, own, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
     name = f"{file_name(task_name(kind))}{'-planning' * planning}.jsonl"
-    rows = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
-    return _Search(trials, rows, tolerance, progress).run()
+    file = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
+    return _search(trials, file, tolerance, progress)
 
 
-def _trials(
-    task: type[Task], run: str | Path | None, which: str, words: Mapping[str, Any], *, effort: Effort, seed: int,
-    episodes: int | None,
-) -> Trials:  # fmt: skip
-    options, params = EnvOptions.split(words)
-    if "nworld" not in words:
-        options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
-    known = {} if run is None else _params_of(run, task)
-    env, policy = Env(task, options.changed({"autoreset": False}), **{**known, **params}), None
-    if run is not None:
-        own = load(run, which=which, device=env.obs.device)
-        check_sizes(own, env, f"the policy of {run}")
-        policy = acting(own)
-    return Trials(env, policy, effort=effort, seed=seed, episodes=episodes)
-
-
-def _digest(run: str | Path, which: str) -> str:
-    return hashlib.sha256(Run.open(run).policy_file(which).read_bytes()).hexdigest()[:16]
-
-
-def _params_of(run: str | Path, task: type[Task]) -> Mapping[str, Any]:
-    """Get a run's task parameters, after checking that it belongs to the same task."""
-    opened = Run.open(run)
-    if opened.task_name != task_name(task):
-        raise ValueError(f"{run} is a run of the task {opened.task_name!r}, not of the task {task_name(task)!r}")
-    return Configuration.of(opened).params
-
-
-class _Search:
-    def __init__(
-        self, trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
-    ) -> None:
-        self.trials, self.file, self.tolerance, self.progress = trials, file, tolerance, progress
-
-    def run(self) -> Tuning:
-        env = self.trials.reference
-        reference = self._row(Setting("", "", {}))
-        tried = [(setting, self._row(setting)) for setting in candidates(env)]
-        rows = [row for _, row in tried]
-        good = [(setting, row) for setting, row in tried if row["verdict"] == "same"]
-        good.sort(key=lambda one: -one[1]["speedup"])
-        settings = [setting for setting, _ in good]
-        while (both := combined(settings)) is not None:
-            row = self._row(both)
-            if row["name"] == both.name:
-                rows.append(row)
-            if row["verdict"] == "same":
-                break
-            settings = settings[: settings.index(both.parts[-1])]
-        rows.sort(key=lambda row: -row.get("speedup", 0.0))
-        return Tuning(rows, reference, not_tried(env), self.file.path)
-
-    def _row(self, setting: Setting) -> Row:
-        row = self.file.get(setting.physics) or self.file.add(self.trials.measure(setting))
-        row = {**row, "verdict": verdict(row, self.tolerance) if setting.physics else "reference"}
-        if self.progress is not None:
-            self.progress(row)
+def _search(
+    trials: Trials | Rankings, file: RowFile, tolerance: str, progress: Callable[[Row], object] | None
+) -> Tuning:
+    def row_of(setting: Setting) -> Row:
+        row = file.get(setting.physics) or file.add(trials.measure(setting))
+        row = {**row, "verdict": verdict(row, tolerance) if setting.physics else "reference"}
+        if progress is not None:
+            progress(row)
         return row
+
+    reference = row_of(Setting("", "", {}))
+    tried = [(setting, row_of(setting)) for setting in candidates(trials.reference)]
+    rows = [row for _, row in tried]
+    good = sorted((one for one in tried if one[1]["verdict"] == "same"), key=lambda one: -one[1]["speedup"])
+    settings = [setting for setting, _ in good]
+    while (both := combined(settings)) is not None:
+        row = row_of(both)
+        if row["name"] == both.name:
+            rows.append(row)
+        if row["verdict"] == "same":
+            break
+        settings = settings[: settings.index(both.parts[-1])]
+    rows.sort(key=lambda row: -row.get("speedup", 0.0))
+    return Tuning(rows, reference, not_tried(trials.reference), file.path)
