@@ -14,16 +14,16 @@ from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_w
 from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
-from lyceum_warp.cli.algorithms import Hyperparameters
 from lyceum_warp.cli.arguments import (
     CameraWords,
     EnvFlags,
+    OptionFlags,
     ParamWords,
     Physics,
     Trust,
     given,
     parameters,
-)
+)  # fmt: skip
 from lyceum_warp.cli.display import Display, console, curve_table, note, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
@@ -49,6 +49,36 @@ _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
     "out": "--out",
 }  # fmt: skip
+
+_DEFAULTS: dict[str, list[str]] = {}
+for _algorithm, (_, _config) in ALGORITHMS.items():
+    for _name in _config.__dataclass_fields__:
+        _value = getattr(_config, _name)
+        _words = " ".join(map(str, _value)) if isinstance(_value, tuple) else "" if _value is None else str(_value)
+        _DEFAULTS.setdefault(_name, []).append(f"{_algorithm} {_words}".strip())
+
+
+class Hyperparameters(
+    OptionFlags,
+    options=[config for _, config in ALGORITHMS.values()],
+    default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
+):
+    """Hyperparameters. For each flag, the help lists the algorithms that have it, with their defaults."""
+
+    def on_top_of(self, config: Any, algorithm: str) -> Any:
+        """Override a configuration's hyperparameters with the given flags."""
+        if algorithm not in ALGORITHMS:
+            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
+        values, (_, kind) = given(self), ALGORITHMS[algorithm]
+        for name in values.keys() - kind.__dataclass_fields__.keys():
+            fitting = " or ".join(
+                other for other, (_, config) in ALGORITHMS.items() if name in config.__dataclass_fields__
+            )
+            raise ValueError(
+                f"--{name.replace('_', '-')} is a setting of {fitting}, not of {algorithm}: omit it, or give "
+                f"--algorithm {fitting}"
+            )
+        return kind(**values) if config is None else dataclasses.replace(config, **values)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -157,7 +187,7 @@ class Train:
             for name, flag in _KEPT.items():
                 if getattr(self, name) is not None:
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
-        elif self.from_run is None and self.task is None:
+        elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         folder = self.resume or self.from_run
         if self.trust and folder is None:
