@@ -104,12 +104,10 @@ def test_reset_clears_the_done_reason_of_the_previous_episode() -> None:
         assert terminated == bool(env.env.get_terminated(env.env.get_state())[0]) and not truncated
 
 
-@pytest.mark.quick("0")
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_rule_gives_the_same_result_after_other_rules(seed: int) -> None:
+def test_rule_gives_the_same_result_after_other_rules() -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
-    check_task(Leave, steps=20, seed=seed, nworld=8)
-    check_task(Leave, steps=20, seed=seed, nworld=8, checks=[rule])
+    check_task(Leave, steps=20, nworld=8)
+    check_task(Leave, steps=20, nworld=8, checks=[rule])
 
 
 @ENGINES

@@ -79,53 +79,6 @@ def step_without_events(env: lw.Env, action: torch.Tensor) -> None:
             phase.run()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_randomized_world_continues_identically_in_another_environment(engine: str) -> None:
-    first, other = (lw.make(Drawn, nworld=3, engine=engine, seed=seed) for seed in (1, 2))
-    actions = random_actions(first, 12)
-    for action in actions[:4]:
-        first.step(action)
-    state = first.get_state()
-    other.set_state(state)
-    assert torch.equal(mass(other), mass(first))
-    for action in actions[4:]:
-        first.step(action)
-        other.step(action)
-        assert torch.equal(other.get_state(), first.get_state())
-        assert torch.equal(other.reward, first.reward)
-
-
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ENGINES)
-def test_randomized_masses_do_not_accumulate_over_resets(engine: str) -> None:
-    env = lw.make(Drawn, nworld=4, engine=engine)
-    masses = []
-    for _ in range(1000 if engine == "mujoco" else 100):
-        env.rand_reset()
-        masses.append(mass(env))
-    drawn = torch.stack(masses)
-    assert 0.5 <= drawn.min() < 0.55 and 1.45 < drawn.max() <= 1.5
-    assert abs(drawn[-50:].mean().item() - 1.0) < 0.1
-    gravity = env.field("gravity").clone()
-    env.reset()
-    assert (mass(env) == 1.0).all()
-    assert torch.equal(env.field("gravity"), gravity) and len(gravity[:, 2].unique()) == 4
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_randomizing_one_world_does_not_change_other_worlds(engine: str) -> None:
-    env, still = (lw.make(Drawn, nworld=3, engine=engine, horizon=0) for _ in range(2))
-    mask = torch.tensor([False, True, False])
-    for i, action in enumerate(random_actions(env, 8)):
-        if i == 3:
-            env.rand_reset(mask=mask)
-            assert not torch.equal(mass(env)[mask], mass(still)[mask])
-        env.step(action)
-        still.step(action)
-        assert torch.equal(env.get_state()[~mask], still.get_state()[~mask])
-    assert not torch.equal(env.get_state()[mask], still.get_state()[mask])
-
-
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> None:
@@ -156,50 +109,6 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(other.field("body_mass"), masses)
 
 
-def test_getters_use_the_model_fields_in_the_given_state() -> None:
-    env = lw.make(Drawn, nworld=2, horizon=0)
-    before = env.get_state()
-    action = random_actions(env, 1)[0]
-    env.step(action)
-    after, reward, obs = env.get_state(), env.reward.clone(), env.obs.clone()
-    env.rand_reset()
-    assert not torch.equal(mass(env), mass(env, after).float())
-    assert torch.equal(env.get_reward(before, action, after), reward)
-    assert torch.equal(env.get_obs(after), obs)
-    assert torch.equal(obs[:, 4], mass(env, after).float())
-
-
-@pytest.mark.quick("cost-128-mujoco", "noise-256-warp")
-@pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(("name", "reason"), [("cost", lw.Done.REWARD), ("noise", lw.Done.OBSERVATION)])
-def test_non_finite_value_of_a_task_function_causes_a_fault_in_its_world(
-    name: str, reason: lw.Done, engine: str
-) -> None:
-    env, fine = (lw.make(Full, nworld=3, engine=engine, horizon=0) for _ in range(2))
-    others = torch.tensor([True, False, True])
-    value = env.task.params[name]
-    env.set_params(**{name: np.array([value, np.inf, value])})
-    before, good = env.get_state(), env.final_obs[1].clone()
-    for action in random_actions(env, 2):
-        env.step(action)
-        fine.step(action)
-        assert env.done_reason.tolist() == [0, int(reason), 0]
-        assert env.truncated[1] and env.reward[1] == 0 and (env.episode_metrics["cost"][1] == 0)
-        for obs in (*env.obs_groups.values(), *env.final_obs_groups.values()):
-            assert torch.isfinite(obs).all()
-        if reason == lw.Done.OBSERVATION:
-            assert torch.equal(env.final_obs[1], good)
-        assert torch.equal(env.get_state()[others], fine.get_state()[others])
-        assert torch.equal(env.obs[others], fine.obs[others])
-    assert env.fault_counts[str(reason.name).lower()] == 2
-    after = env.get_state()
-    judged = env.get_reward(before, action, after)
-    assert torch.isfinite(judged).all()
-    env.set_params(**{name: value})
-    assert torch.equal(env.get_reward(before, action, after)[others], judged[others])
-    assert env.get_reward(before, action, after)[1] != 0
-
-
 def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
     env = lw.make(Full, nworld=8)
     tip = env.field("site_xpos")[:, 0, 0]
@@ -226,18 +135,6 @@ def test_startup_does_not_randomize_lasting_memory_in_a_planner_state() -> None:
     columns = plan.env.state_space.parts["practice"]
     assert plan.env.get_state()[0, columns].item() >= 1
     assert plan.state_of()[columns].tolist() == [0.0]
-
-
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ENGINES)
-def test_model_fields_that_events_change_are_nominal_after_a_reset(engine: str) -> None:
-    env = lw.make(Full, nworld=4, engine=engine, horizon=0)
-    for action in random_actions(env, 4):
-        env.step(action)
-    damping = env.field("dof_damping")[:, 0]
-    assert (damping != np.float32(0.2)).any()
-    env.rand_reset()
-    assert (damping == np.float32(0.2)).all()
 
 
 @pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco")
@@ -275,17 +172,15 @@ def test_a_rollout_uses_the_model_in_the_state_or_the_nominal_model(task: type[l
     assert not torch.equal(stepped(plain), stepped(state))
 
 
-@pytest.mark.quick("Drawn-mujoco", "DrawnWithControl-mujoco", "Drawn-warp")
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("task", [Drawn, DrawnWithControl])
-def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(task: type[lw.Task], engine: str) -> None:
-    env = lw.make(task, nworld=2, engine=engine)
+def test_a_planner_uses_the_model_in_the_state_unless_nominal_model_is_set(engine: str) -> None:
+    env = lw.make(Drawn, nworld=2, engine=engine)
     state = env.get_state()[:1].clone()
     heavy = state.clone()
     mass(env, heavy).mul_(1.5)
     returns: dict[bool, list[torch.Tensor]] = {}
     for nominal in (False, True):
-        plan = lw.MPPI(task, engine=engine, samples=8, horizon=4, nominal_model=nominal)
+        plan = lw.MPPI(Drawn, engine=engine, samples=8, horizon=4, nominal_model=nominal)
         for given in (state, heavy):
             plan.reset()
             plan(given[0])
@@ -336,6 +231,19 @@ def test_a_rollout_equals_steps_without_events(engine: str) -> None:
         env.step(action)
         changed |= env.worlds.changed_view
     assert changed.any(), "there were no events to leave out"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_controls_are_clipped_and_draws_of_a_step_differ(engine: str) -> None:
+    env = lw.make(Full, nworld=2, engine=engine, horizon=0)
+    env.reset()
+    smooth, draws = env.state_space.parts["smooth"], []
+    for _ in range(2):
+        before = env.get_state()[:, smooth]
+        env.step(torch.tensor([[0.5, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+        draws.append((env.get_state()[:, smooth] - 0.9 * before).round(decimals=6))
+        assert env.field("ctrl")[1].item() == 1.0
+    assert torch.stack(draws).unique().numel() == 4
 
 
 @pytest.mark.quick("mujoco")
@@ -415,20 +323,6 @@ RNG = "rng: Row[wp.uint32]"
 STEP = "s0: World, action: Row[float], s1: World, p: Params"
 MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a name like no field": ([field("wheels: Row[float]")], "there is no field 'wheels': .*MuJoCo's names"),
-    "the seconds of a substep": (
-        [field("timestep: float")],
-        "the model field 'timestep' cannot be read in World: all worlds share it; the parameters dt and substep_dt",
-    ),
-    "drawn ranges of controls": (
-        [field("actuator_ctrlrange: Row[wp.vec2]"),
-         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.actuator_ctrlrange[0] = wp.vec2(-3.0, 3.0)")],
-        "the model field 'actuator_ctrlrange' cannot differ between worlds: controls are clipped to the model's own",
-    ),
-    "a field that cannot differ": (
-        [field("body_subtreemass: Row[float]"),
-         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_subtreemass[0] = 1.0")],
-        "the model field 'body_subtreemass' cannot differ between worlds: MuJoCo computes it from other fields",
-    ),
     "a negative mass": (
         [MASS, function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[1] = s.body_mass[1] - 9.0")],
         r"'tiny': body_mass\[1\] of world 0 is -\S+ and must be positive \(its nominal value is 3\S*\)",
@@ -441,10 +335,6 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a group that no function fills": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "critic": {"x": 1}}')],
         r"observe_critic\(s: World, p: Params, obs: Row\[float\]\)",
-    ),
-    "a function without its group": (
-        [line("observe_critic = observe")],
-        "obs of the task 'tiny' has no group 'critic', which observe_critic writes",
     ),
     "a group of two words": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "my group": {"x": 1}}')],
@@ -459,14 +349,6 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         [line('metrics = ("a,b",)'), function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
         "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
     ),
-    "a metric's name twice": (
-        [line('metrics = ("a", "b", "a")'),
-         function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
-        "the task 'tiny' names the metric 'a' twice: give each one name",
-    ),
-    "metrics without measure": (
-        [line('metrics = ("a",)')], "metrics of the task 'tiny' has 'a', but there is no such function: .* measure",
-    ),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
     "a keyframe by its number": (
         [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of a keyframe .*, such as 'home', not 0",
@@ -475,16 +357,9 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "actions without sizes": (
         [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
     ),
-    "memory that is counted": (
-        [line("lasting_memory = 1")],
-        r"lasting_memory of the task 'tiny' is a row without .*, as air_time: Row\[float\] = lw\.lasting_memory\(4\)",
-    ),
     "memory without a size": ([field("memory: Row[float]")], "memory of the task 'tiny' is a row without named parts"),
     "memory of no numbers": (
         [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
-    ),
-    "memory that is a number": (
-        [field("level: float = lw.memory()")], r"World\.level has a size, .*: declare it as level: Row\[float\]",
     ),
     "memory with the name of a field": (
         [field("qvel: Row[float] = lw.memory()")], r"World\.qvel of the task 'tiny' is memory, but qvel is already",

@@ -62,7 +62,6 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
         ("    dt: float", "    dt: float\n    name: str"),
         r"line \d+: a @wp\.struct has a field of the type str: it can hold float, int, bool, vectors and matrices",
     ),
-    "an unknown field": (("qpos: Row[float]", "qpoz: Row[float]"), "there is no field 'qpoz': did you mean qpos"),
     # functions
     "observe without wp.func": (("@wp.func\n", ""), r"observe of the task 'tiny' must be a @wp\.func, not <function"),
     "a reward without return": (
