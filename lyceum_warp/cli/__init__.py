@@ -91,4 +91,4 @@ def _run(argv: list[str]) -> int:
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
     # arguments after the name of a bench/ program belong to that program
     words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
-    return int(parse(command, f"lyceum-warp {name}", words).run(*rest))
+    return parse(command, f"lyceum-warp {name}", words).run(*rest) or 0

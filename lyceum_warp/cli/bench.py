@@ -32,7 +32,6 @@ class Bench:
     """A program in bench/, without .py."""
 
     def run(self, *arguments: str) -> int:
-        """Run the command, and return the program's exit code."""
         if not (FOLDER / "experiment.py").exists():
             raise FileNotFoundError(f"the experiments need a checkout of the repository, and {FOLDER} does not exist")
         programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
-from lyceum_warp.cli.display import console
+from lyceum_warp.cli.display import say
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.testing import CHECKS, Context, check_task
 
@@ -42,15 +42,14 @@ class Check:
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> int:
-        """Run the command, and return the exit code."""
         words = vars(self.env) | given(self.physics) | parameters(self.param, self)
         checks = [_check(name) for name in self.rule] or CHECKS
         try:
             report = check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **words)
         except AssertionError as error:
-            console.print(str(error), soft_wrap=True, markup=False)
+            say(str(error))
             return 1
-        console.print(str(report), soft_wrap=True, markup=False)
+        say(str(report))
         return 0
 
 

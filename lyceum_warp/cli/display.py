@@ -29,6 +29,11 @@ console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
 """In a file or a pipe, it has 120 columns, so that tables are not wrapped."""
 
 
+def say(text: str) -> None:
+    """Print text without wrapping its lines."""
+    console.print(text, soft_wrap=True, markup=False)
+
+
 def note(line: str) -> None:
     """Print a message to stderr."""
     print(f"lyceum-warp: {line}", file=sys.stderr)
@@ -112,7 +117,7 @@ _BAR_WIDTH = 36
 
 def counted(number: int, what: str) -> str:
     """Format a number with a noun, in the plural if necessary."""
-    return f"{number:,d} {what}{'s' if number > 1 else ''}"
+    return f"{number:,d} {what}{'s' * (number != 1)}"
 
 
 _COLUMNS = [

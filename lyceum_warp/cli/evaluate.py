@@ -5,8 +5,8 @@ import signal
 from pathlib import Path
 from typing import Annotated, Any
 
+import torch
 import tyro
-from rich.console import Console
 
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
@@ -14,7 +14,7 @@ from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.algos.transfer import Transfer, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
-from lyceum_warp.cli.display import console, fitting_table, note, tried
+from lyceum_warp.cli.display import console, fitting_table, note, say, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
 from lyceum_warp.engines.placement import options_for_few_worlds
@@ -82,8 +82,7 @@ class Eval:
     )
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         if self.episodes < 1 or self.nworld < 1:
             raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
         if self.transfer and self.env.engine is not None:
@@ -113,18 +112,16 @@ class Eval:
             name = signal.Signals(signalled.number).name
             note(f"interrupted by {name} before the episodes were complete: there are no statistics")
             raise
-        columns: dict[str, list[str]] = {heading: [] for heading in ("", "mean", "std", "min", "max")}
-        for name, values in (("return", episodes.returns), ("evaluation at the end", episodes.evals),
-                             ("last reward", episodes.rewards), ("length", episodes.lengths),
-                             *episodes.metrics.items()):  # fmt: skip
-            numbers = (values.mean(), values.std(correction=0), values.min(), values.max())
-            cells = (name, *(f"{number.item():.6g}" for number in numbers))
-            for column, cell in zip(columns.values(), cells, strict=True):
-                column.append(cell)
+        found = {
+            "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
+            "length": episodes.lengths, **episodes.metrics,
+        }  # fmt: skip
+        columns = {"": list(found)}
+        for heading, number in (("mean", torch.mean), ("std", _std), ("min", torch.min), ("max", torch.max)):
+            columns[heading] = [f"{number(values).item():.6g}" for values in found.values()]
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
         where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
-        text = f"{env.task.name}: {self.episodes} episodes of {which} {where}"
-        console.print(text, soft_wrap=True, markup=False)
+        say(f"{env.task.name}: {self.episodes} episodes of {which} {where}")
         console.print(fitting_table(console, columns, omit=("std",)))
         if env.task.functions["success"] is not None:
             console.print(f"success: {episodes.success.mean().item():.0%}")
@@ -133,18 +130,19 @@ class Eval:
                 verdict = transfer(
                     env, policy, max(2, self.episodes), seed=self.seed, device=self.env.device, progress=work
                 )
-            _print_transfer(verdict, console)
+            _print_transfer(verdict)
         if self.episodes_to is not None:
-            paths = _save_episodes(env, policy, self, run, origin)
-            console.print(f"episodes: {paths}", soft_wrap=True, markup=False)
+            say(f"episodes: {_save_episodes(env, policy, self, run, origin)}")
         if self.video:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
-            video = tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)
-            console.print(f"video: {video}", soft_wrap=True, markup=False)
-        return 0
+            say(f"video: {tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)}")
 
 
-def _print_transfer(verdict: Transfer, console: Console) -> None:
+def _std(values: torch.Tensor) -> torch.Tensor:
+    return values.std(correction=0)
+
+
+def _print_transfer(verdict: Transfer) -> None:
     for comparison in verdict.comparisons:
         found = comparison.differences
         columns = {

@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.arguments import Trust
-from lyceum_warp.cli.display import console, note
+from lyceum_warp.cli.display import note, say
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Env
 from lyceum_warp.runs.configuration import Configuration
@@ -36,16 +36,13 @@ class Export:
     """The policy to export: last, best, or the number of a saved iteration."""
     trust: Trust = False
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         path = self.to or self.folder / "policy.onnx"
         check_export(path)
         run = Run.open(self.folder)
         policy = load(run, which=self.which)
         export_policy(policy, path, env=self._env(run) if path.suffix == ".onnx" else None)
-        text = f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB"
-        console.print(text, soft_wrap=True, markup=False)
-        return 0
+        say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
 
     def _env(self, run: Run) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""

@@ -47,8 +47,7 @@ class Tasks:
     word: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WORD")] = ""
     """List only tasks with this word in their name, description or model source."""
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         entries = [entry for entry in map(_entry, task_names()) if entry.has(self.word)]
         if not entries:
             raise ValueError(
@@ -72,7 +71,6 @@ class Tasks:
             if entry.note:
                 console.print(escape(textwrap.fill(entry.note, **indented)), style="yellow", soft_wrap=True)
         console.print(f"\n{_LEGEND}", style="dim", soft_wrap=True)
-        return 0
 
 
 @dataclasses.dataclass

@@ -13,7 +13,7 @@ import tyro
 
 from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
-from lyceum_warp.cli.display import console
+from lyceum_warp.cli.display import say
 from lyceum_warp.cli.task_text import literal, task_text
 from lyceum_warp.cli.velocity_text import TRAINING, Walker, velocity_text
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
@@ -63,8 +63,7 @@ class New:
     joints keep their pose.
     """
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         if self.template == "plain" and (self.feet or self.joints):
             raise ValueError("--feet and --joints have no effect without --template velocity")
         path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
@@ -76,34 +75,33 @@ class New:
         source, title, spec = _model(self.model, path)
         try:
             model = compile_model(spec, ("sensordata",), PhysicsOptions())
+            walker = Walker(spec, self.feet, self.joints) if self.template == "velocity" else None
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
         if model.nu == 0:
             raise ValueError(f"the model {self.model} has no actuators, so actions would have no effect: add actuators")
         if model.nv == 0:
             raise ValueError(f"the model {self.model} has no joints, so its bodies cannot move: add joints")
-        if self.template == "velocity":
-            walker = self._walker(spec)
-            _write(path, velocity_text(path.name, class_name, source, title, walker))
+        if walker is not None:
+            text = velocity_text(path.name, class_name, source, title, walker)
+        else:
+            text = task_text(path.name, class_name, source, title, model)
+        try:
+            with replaced(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise ValueError(f"can't write {path}: {error.strerror}") from error
+        if walker is not None:
             sizes = f"feet {', '.join(foot.name for foot in walker.feet)}; joints {', '.join(walker.joints)}"
         else:
-            _write(path, task_text(path.name, class_name, source, title, model))
             task = find_task(path)
             sizes = (
                 f"{sum(task.obs.values())} observations, {model.nu} actions, "
                 f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step"
             )
-        console.print(f"{path}: {sizes}; check and train it with", soft_wrap=True, markup=False)
-        for command in ("check", "train"):
-            options = f" {TRAINING}" if (self.template, command) == ("velocity", "train") else ""
-            console.print(f"  lyceum-warp {command} {path}{options}", soft_wrap=True, markup=False)
-        return 0
-
-    def _walker(self, spec: mujoco.MjSpec) -> Walker:
-        try:
-            return Walker(spec, self.feet, self.joints)
-        except ValueError as error:
-            raise ValueError(f"{self.model}: {error}") from error
+        training = "" if walker is None else f" {TRAINING}"
+        say(f"{path}: {sizes}; check and train it with")
+        say(f"  lyceum-warp check {path}\n  lyceum-warp train {path}{training}")
 
 
 def _class_name(path: Path) -> str:
@@ -142,11 +140,3 @@ def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
 def _title(file: str) -> str:
     plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
     return f"the model {file}" if plain else "a model"
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        with replaced(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ValueError(f"can't write {path}: {error.strerror}") from error

@@ -29,7 +29,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import PlanDisplay, console, report_table, tried
+from lyceum_warp.cli.display import PlanDisplay, console, counted, report_table, say, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
@@ -139,8 +139,7 @@ class Plan:
     mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
     planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         whole_number("episodes", self.episodes, low=1)
         if self.minutes is not None:
             positive_number("minutes", self.minutes, "minutes")
@@ -174,7 +173,7 @@ class Plan:
         choice = _choice(self, plant, make_planner) if self.real_time else None
         if choice is not None:
             every = round(choice.deadline / plant.timestep) * choice.replan_every
-            console.print(str(choice), soft_wrap=True, markup=False)
+            say(str(choice))
         planner = make_planner(None if choice is None else choice.setting)
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
         config = {
@@ -186,7 +185,7 @@ class Plan:
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
         }  # fmt: skip
         run = Run.create(out, config, device=self.planner.device)
-        return _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
+        _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
 
 
 def _worlds(
@@ -269,7 +268,7 @@ def _model(path: Path) -> Path:
     return path
 
 
-def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
+def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
     simulated, update = planner.env, planner.settings["update"]
     name = {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
     physics = ", ".join(f"{option} {value}" for option, value in simulated.options.physics.given().items())
@@ -290,56 +289,41 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> int:
     try:
         for episode in range(options.episodes):
             if done and time.monotonic() >= end:
-                console.print(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
+                say(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
                 break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
             done.append(trajectory)
             display.done(trajectory)
-            _save(run, done, options)
+            report = _save(run, done, options)
     except BaseException as error:  # ignore further signals until the files are written
         if done:
             _save(run, done, options)
-        path = aborted[0].save(_file(run, len(done))) if aborted else None
+        for part in aborted:
+            part.save(_file(run, len(done)))
         if isinstance(error, Interrupted):
-            message = f"interrupted by {signal.Signals(error.number).name} {_left(run, len(done), aborted, path)}"
-            console.print(message, soft_wrap=True, markup=False)
+            whole, rest = counted(len(done), "episode"), counted(sum(part.steps for part in aborted), "step")
+            say(f"interrupted by {signal.Signals(error.number).name} after {whole} and {rest}; files in {run.folder}")
         raise
-    return _report(run, plant, done, options)
-
-
-def _left(run: Run, whole: int, aborted: list[Trajectory], path: Path | None) -> str:
-    steps = f"after {aborted[0].steps} step{'s' * (aborted[0].steps != 1)}" if aborted else "before its first step"
-    if not whole:
-        where = f"it is in {path}" if path else f"{run.folder} holds no episode"
-        return f"in the first episode, {steps}; {where}"
-    summary = f"after {whole} episode{'s' * (whole != 1)}; in {run.folder}"
-    return f"{summary}; the interrupted episode is in {path.name}, {steps}" if path else summary
+    console.print(report_table(report, success=plant.task.functions["success"] is not None))
+    paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
+    if options.plot:
+        paths["plot"] = tried(control_plot, done, run.folder / "plan.png")
+    if options.video:
+        camera = parsed_camera(options.camera)
+        paths["video"] = tried(write_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)
+    for name, path in paths.items():
+        say(f"{name + ':':<12}{path}")
 
 
 def _file(run: Run, episode: int) -> Path:
     return run.folder / f"episode-{episode:03d}.npz"
 
 
-def _save(run: Run, done: list[Trajectory], options: Plan) -> None:
+def _save(run: Run, done: list[Trajectory], options: Plan) -> ControlReport:
     done[-1].save(_file(run, len(done) - 1))
-    _summary(done, options).write(run.folder / "report.json")
-
-
-def _summary(done: list[Trajectory], options: Plan) -> ControlReport:
-    """Make the report of the given episodes. The deadline of a plan is the time from one plan to the next."""
-    return control_report(done, rate=1 / (options.replan_every * done[0].period))
-
-
-def _report(run: Run, plant: Env, done: list[Trajectory], options: Plan) -> int:
-    camera, report = parsed_camera(options.camera), _summary(done, options)
-    console.print(report_table(report, success=plant.task.functions["success"] is not None))
-    paths = [("episodes", str(run.folder / "episode-*.npz")), ("report", str(run.folder / "report.json"))]
-    if options.plot:
-        paths.append(("plot", tried(control_plot, done, run.folder / "plan.png")))
-    if options.video:
-        paths.append(("video", tried(write_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)))
-    for name, path in paths:
-        console.print(f"{name + ':':<12}{path}", soft_wrap=True, markup=False)
-    return 0
+    # the deadline of a plan is the time from one plan to the next
+    report = control_report(done, rate=1 / (options.replan_every * done[0].period))
+    report.write(run.folder / "report.json")
+    return report

@@ -1,6 +1,7 @@
 """Generate the text of a task file for a model, for lyceum-warp new."""
 
 import json
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -53,8 +54,8 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
     if "home" in _names(model, "keyframes"):
         settings.append('keyframe = "home"  # where episodes start')
     return _TEXT.format(
-        file=file, class_name=class_name, title=title, elements=_elements(model), fields=_indented(fields),
-        put=_indented(put), settings=_indented(settings),
+        file=file, class_name=class_name, title=title, elements=_elements(model), fields=indented(fields),
+        put=indented(put), settings=indented(settings),
     )  # fmt: skip
 
 
@@ -172,8 +173,9 @@ def _listed(kind: str, names: list[str]) -> list[str]:
     return []
 
 
-def _indented(lines: list[str]) -> str:
-    return "\n".join(f"    {line}" for line in lines)
+def indented(lines: Sequence[str], indent: int = 4) -> str:
+    """Indent lines and join them."""
+    return "\n".join(f"{' ' * indent}{line}" for line in lines)
 
 
 def literal(text: str) -> str:

@@ -24,7 +24,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )  # fmt: skip
-from lyceum_warp.cli.display import Display, console, curve_table, note, tried
+from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
@@ -182,7 +182,6 @@ class Train:
     )
 
     def run(self) -> int:
-        """Run the command, and return the exit code."""
         if self.resume is not None:
             for name, flag in _KEPT.items():
                 if getattr(self, name) is not None:
@@ -207,6 +206,7 @@ class Train:
             with team.together():  # check all options before the folder is created
                 learner, folder, entries = self._learner(source, team)
             leads, total = learner.team.leads, settings["iterations"]
+            resume = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
             try:
                 run = train(
                     learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
@@ -216,24 +216,20 @@ class Train:
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
                     done = read_checkpoint(path, parts=("iteration",))["iteration"]
-                    text = f"interrupted by {signal.Signals(signalled.number).name} after {done} of {total} iterations"
-                    if done < total:
-                        text += f"; continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-                    console.print(text, soft_wrap=True, markup=False)
+                    name = signal.Signals(signalled.number).name
+                    rest = f"; {resume}" if done < total else ""
+                    say(f"interrupted by {name} after {done} of {total} iterations{rest}")
                     if self.plot and (folder / "metrics.csv").exists():
                         with obeyed():
-                            console.print(f"curve:      {tried(learning_curve, folder)}", soft_wrap=True, markup=False)
+                            say(f"curve:      {tried(learning_curve, folder)}")
                 return 128 + signalled.number
             if not leads:
                 return 0
             reached = run.config.get("reached", {})
             if reached.get("iteration") == learner.iteration < total:
-                text = f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}"
-                console.print(text, soft_wrap=True, markup=False)
+                say(f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}")
             elif learner.iteration < total and self.minutes is not None:
-                text = f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; continue "
-                text += f"with\n  lyceum-warp train --resume {folder} --iterations {total}"
-                console.print(text, soft_wrap=True, markup=False)
+                say(f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; {resume}")
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
@@ -321,24 +317,22 @@ class Train:
         with LongWork("evaluating the mean policy", "steps", console) as work:
             returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns
         final = returns.mean().item()
-        console.print(
-            f"mean policy, {len(returns)} new episodes: return {final:.1f} ± {returns.std(correction=0):.1f} "
-            f"({returns.min():.1f} to {returns.max():.1f})", soft_wrap=True,
-        )  # fmt: skip
+        say(f"mean policy, {len(returns)} new episodes: return {final:.1f} ± {returns.std(correction=0):.1f} "
+            f"({returns.min():.1f} to {returns.max():.1f})")  # fmt: skip
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
         if (best := run.best_score()) is not None:
             every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
-            console.print(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}", soft_wrap=True)
+            say(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}")
             paths["best"] = str(run.best)
         if run.transfer.is_file():
-            console.print(f"transfer: {json.loads(run.transfer.read_text())['line']}", soft_wrap=True, markup=False)
+            say(f"transfer: {json.loads(run.transfer.read_text())['line']}")
         if self.plot:
             paths["curve"] = tried(learning_curve, run)
         if self.video:
             camera, path = parsed_camera(self.camera), run.folder / "video.mp4"
             paths["video"] = tried(policy_video, env, policy, path, evaluation_seed(seed), camera=camera)
         for name, place in paths.items():
-            console.print(f"{name + ':':<12}{place}", soft_wrap=True, markup=False)
+            say(f"{name + ':':<12}{place}")
         if self.require_return is not None and not final > self.require_return:
             note(f"the mean policy's return is {final:.1f}; --require-return demands more than {self.require_return:g}")
             return 1

@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
-from lyceum_warp.cli.display import console, fitting_table, note
+from lyceum_warp.cli.display import console, fitting_table, note, say
 from lyceum_warp.tuning.judgement import Difference
 from lyceum_warp.tuning.search import Tuning, tune
 from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
@@ -63,8 +63,7 @@ class Tune:
         default_factory=Placement
     )
 
-    def run(self) -> int:
-        """Run the command, and return the exit code."""
+    def run(self) -> None:
         torch.set_num_threads(1)
         words: dict[str, Any] = vars(self.env) | parameters(self.param, self)
         if self.nworld is not None:
@@ -74,7 +73,6 @@ class Tune:
             episodes=self.episodes, planning=self.planning, out=self.out, seed=self.seed, progress=_progress, **words,
         )  # fmt: skip
         _report(tuning, self)
-        return 0
 
 
 def _progress(row: dict[str, Any]) -> None:
@@ -86,12 +84,8 @@ def _progress(row: dict[str, Any]) -> None:
 
 def _report(tuning: Tuning, options: Tune) -> None:
     reference = tuning.reference
-
-    def line(text: str) -> None:
-        console.print(text, soft_wrap=True, markup=False)
-
     who = reference["identity"]
-    line(f"{who['task']}: {who['nworld']} worlds, {who['engine']} engine on {who['device']}")
+    say(f"{who['task']}: {who['nworld']} worlds, {who['engine']} engine on {who['device']}")
     columns = _planning_columns(reference) if options.planning else _columns(reference)
     rows = [*(row for row in tuning.rows if not row["refused"]), reference]
     cells = {
@@ -103,27 +97,28 @@ def _report(tuning: Tuning, options: Tune) -> None:
     console.print(fitting_table(console, cells, omit=[name for name in rest if not name.startswith("return")]))
     if not options.planning:
         nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
-        line(f"{reference['in_contact']:.0%} of the states are in contact. diverg. is the divergence after 1, 10 and "
-             f"50 steps, divided by the divergence of the exact physics from states moved by {NUDGE:g}: "
-             f"{nudged}.")  # fmt: skip
+        say(
+            f"{reference['in_contact']:.0%} of the states are in contact. diverg. is the divergence after 1, 10 and 50 "
+            f"steps, divided by the divergence of the exact physics from states moved by {NUDGE:g}: {nudged}."
+        )
     for row in tuning.rows:
         if row["verdict"] == "refused":
-            line(f"refused: {row['name']}: {row['refused']}")
+            say(f"refused: {row['name']}: {row['refused']}")
         elif row["verdict"] == "ranks badly":
             kind = min(row["ranks"], key=lambda kind: row["ranks"][kind]["mean"])
-            line(f"not suggested: {row['name']}: the rank correlation of samples is {row['ranks'][kind]['mean']:.2f} "
-                 f"in {kind} states")  # fmt: skip
+            mean = row["ranks"][kind]["mean"]
+            say(f"not suggested: {row['name']}: the rank correlation of samples is {mean:.2f} in {kind} states")
     for reason in tuning.not_tried:
-        line(f"not tried: {reason}")
+        say(f"not tried: {reason}")
     if tuning.best is None:
         unknown = sum(row["verdict"] == "not shown" for row in tuning.rows)
         hint = f" ({unknown} not shown: more --episodes may decide)" if unknown else ""
-        line(f"best within {options.tolerance}: the task as it is{hint}")
+        say(f"best within {options.tolerance}: the task as it is{hint}")
     else:
-        line(f"best within {options.tolerance}: {tuning.best['name']}, {tuning.best['speedup']:.2f} times as fast")
-        line(f"flags: {tuning.flags}")
-        line(f"task:  {tuning.task_line}")
-    line(f"results: {tuning.path}")
+        say(f"best within {options.tolerance}: {tuning.best['name']}, {tuning.best['speedup']:.2f} times as fast")
+        say(f"flags: {tuning.flags}")
+        say(f"task:  {tuning.task_line}")
+    say(f"results: {tuning.path}")
 
 
 def _columns(reference: dict[str, Any]) -> dict[str, Cell]:

@@ -3,12 +3,13 @@
 import dataclasses
 import textwrap
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
 
 from lyceum_warp import walkers
-from lyceum_warp.cli.task_text import literal
+from lyceum_warp.cli.task_text import indented, literal
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
 """Options of lyceum-warp train that suffice to learn walking on one GPU."""
@@ -66,7 +67,7 @@ class Walker:
             if mujoco.mj_name2id(self.model, _Kind.mjOBJ_JOINT, name) < 0:
                 raise ValueError(f"the model has no joint {name!r}: give names after --joints, separated by spaces")
         ids = [self.model.joint(name).id for name in self.joints]
-        self.servos = walkers.servos(self.model, _Joints(ids))
+        self.servos = walkers.servos(self.model, SimpleNamespace(joints=ids))
         self.pose = [float(self.data.qpos[self.model.jnt_qposadr[joint]]) for joint in ids]
         lowest = min(self._lowest(foot.body) for foot in self.feet)
         self.height = float(self.data.xpos[self.base, 2]) - lowest
@@ -153,16 +154,6 @@ class Walker:
         mujoco.mju_sparse2dense(moment, d.actuator_moment, d.moment_rownnz, d.moment_rowadr, d.moment_colind)
         return np.any(moment, axis=0)[m.jnt_dofadr]
 
-    @property
-    def has_motors(self) -> bool:
-        """Whether a joint's actuator is a motor instead of a servo."""
-        return bool((self.model.actuator_biastype[self.servos] == mujoco.mjtBias.mjBIAS_NONE).any())
-
-
-@dataclasses.dataclass
-class _Joints:
-    joints: list[int]
-
 
 def velocity_text(file: str, class_name: str, source: str, title: str, walker: Walker) -> str:
     """Generate the text of a robot's task file; see ``task_text`` for the other arguments."""
@@ -188,7 +179,8 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
     if walker.has_home != biped:
         settings.append(f"keyframe = {literal('home') if walker.has_home else None}")
     edits = ["walkers.add_feet(spec, NEW_SITES)"] if new else []
-    edits += ["walkers.use_servos(spec, JOINTS)"] if walker.has_motors else []
+    if (model.actuator_biastype[walker.servos] == mujoco.mjtBias.mjBIAS_NONE).any():  # a motor instead of a servo
+        edits.append("walkers.use_servos(spec, JOINTS)")
     edits.append("walkers.prepare_walker(spec, FEET)")
     head = _wrapped("FEET = [", [literal(foot.name) for foot in walker.feet], "]", 0)
     if new:
@@ -198,7 +190,7 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
         file=file, class_name=class_name, title=title, training=TRAINING, kind="Biped" if biped else "Velocity",
         params_class="BipedParams" if biped else "Params", feet="\n".join(head),
         joints="\n".join(_wrapped("JOINTS = [", [literal(name) for name in walker.joints], "]", 0)),
-        params=_indented(params, 4), settings=_indented(settings, 4), edits=_indented(edits, 8),
+        params=indented(params), settings=indented(settings), edits=indented(edits, 8),
     )  # fmt: skip
 
 
@@ -208,10 +200,6 @@ def _wrapped(start: str, parts: Sequence[str], end: str, indent: int = 4) -> lis
         return [line]
     body = textwrap.wrap(", ".join(parts) + ",", 120 - indent - 4, break_long_words=False)
     return [start, *(f"    {text}" for text in body), f"{end}  # fmt: skip"]
-
-
-def _indented(lines: Sequence[str], indent: int) -> str:
-    return "\n".join(f"{' ' * indent}{line}" for line in lines)
 
 
 _TEXT = '''"""{class_name}: {title} walks at a commanded velocity.

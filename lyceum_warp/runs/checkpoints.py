@@ -50,19 +50,10 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
         temporary.write_bytes(buffer.getbuffer())
 
 
-def policy_of(content: PolicyContent, path: Path, given: nn.Module | None = None) -> nn.Module:
-    """Make a policy from a file's content."""
-    return _filled(content, path, "policy", given)
-
-
-def value_of(content: PolicyContent, path: Path) -> nn.Module:
-    """Make a value function from a file's content."""
-    if "value" not in content:
+def network_of(content: PolicyContent, path: Path, name: str, given: nn.Module | None = None) -> nn.Module:
+    """Make the network "policy" or "value" from a file's content, or load its weights into a given network."""
+    if name not in content:
         raise ValueError(f"{path} has no value function, because the run's algorithm learns none")
-    return _filled(content, path, "value", None)
-
-
-def _filled(content: PolicyContent, path: Path, name: str, given: nn.Module | None) -> nn.Module:
     saved = content[name]
     try:
         module = given

@@ -20,7 +20,7 @@ from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.engines.placement import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint, value_of
+from lyceum_warp.runs.checkpoints import network_of, read_checkpoint
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import TABLES, is_table, json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
@@ -37,11 +37,10 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
-    others = options.given()
-    if learner.team.neighbours > 1:  # omit nthread: the run may be resumed with another number of processes
-        others.pop("nthread", None)
-    for name in others.keys() - {"nthread", "horizon", "graphs", "fields", "dynamics"}:
-        del others[name]
+    kept = ["horizon", "graphs", "fields", "dynamics"]
+    if learner.team.neighbours == 1:  # several processes may be resumed with another number of processes
+        kept.append("nthread")
+    others = {name: value for name, value in options.given().items() if name in kept}
     if isinstance(options.model, str | Path):
         others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
@@ -162,5 +161,5 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
     content = read_checkpoint(path, parts=("iteration", "policy"))
     if which is None and "from" not in run.config and "limit" not in (content["policy"].get("shape") or {}):
         return None, None, content["iteration"]
-    value = value_of(content, path) if "value" in content else None
-    return policy_of(content, path), value, content["iteration"]
+    value = network_of(content, path, "value") if "value" in content else None
+    return network_of(content, path, "policy"), value, content["iteration"]

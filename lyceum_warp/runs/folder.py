@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.runs.checkpoints import FORMAT, PolicyContent, policy_of, read_checkpoint, value_of, write_content
+from lyceum_warp.runs.checkpoints import FORMAT, PolicyContent, network_of, read_checkpoint, write_content
 from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
@@ -345,7 +345,7 @@ def load(
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
-    return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
+    return network_of(content, path, "policy", policy).to(device).eval().requires_grad_(False)
 
 
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:
@@ -364,7 +364,7 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
             release.
     """
     content, path = _content(run, which, device)
-    return value_of(content, path).to(device).eval().requires_grad_(False)
+    return network_of(content, path, "value").to(device).eval().requires_grad_(False)
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:

@@ -5,7 +5,6 @@ import io
 import logging
 import os
 import warnings
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -268,16 +267,9 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
 
 def _dependencies(source: Path) -> list[Path]:
     """List the files to which a model file refers: includes, other models, meshes, textures, height fields."""
-    if source.suffix.lower() != ".urdf":
-        return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
-    root = ET.parse(source).getroot()  # MuJoCo lists no dependencies of URDF files
-    folders = [source.parent / (compiler.get("meshdir") or "") for compiler in root.iter("compiler")]
-    names = [mesh.get("filename", "").removeprefix("package://") for mesh in root.iter("mesh")]
-    found = {
-        Path(os.path.normpath(folder / name)): None
-        for folder in (*folders, source.parent) for named in names for name in (named, Path(named).name)
-    }  # fmt: skip
-    return [path for path in found if path.is_file()]
+    if source.suffix.lower() == ".urdf":  # MuJoCo lists no dependencies of URDF files
+        return _spec_dependencies(read_spec(source), source.parent)
+    return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
 
 
 def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:

@@ -1,7 +1,6 @@
 """Compare a physics setting with the unchanged task: speed, memory, faults, divergence and returns."""
 
 import dataclasses
-import gc
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -15,7 +14,6 @@ import warp as wp
 from lyceum_warp.algos.evaluation import ENDLESS_STEPS
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.support.machine import free_memory
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, difference, episodes_needed
 
@@ -126,18 +124,14 @@ class Trials:
     def measure(self, setting: Setting) -> dict[str, Any]:
         """Return a row of results. Returns are compared only if the setting saves time or memory."""
         row: dict[str, Any] = {"name": setting.name, "physics": dict(setting.physics), "refused": ""}
-        before = self._free()
         try:
             env = self.reference.replicate(autoreset=False, **setting.physics)
         except ValueError as error:
             return row | {"refused": str(error)}
-        taken = before - self._free()
         speed, speedup, low = self._speed(env)
         row |= {"steps_per_second": speed, "speedup": speedup, "speedup_low": low}
         row |= {"in_contact": self.in_contact, "bytes_per_world": env.bytes_per_world}
         row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
-        if env.device.is_cuda:
-            row["device_bytes"] = taken
         row["divergence"] = self._distance([self._velocities(env, k) for k in range(len(self._starts))])
         row["nudged_divergence"] = self.nudged
         row["returns"], faults, steps = {}, np.zeros(2), np.zeros(2)
@@ -149,14 +143,6 @@ class Trials:
         rates = 1e6 * faults / np.maximum(steps, 1)
         row |= {"faults_per_million": rates[0], "reference_faults_per_million": rates[1]}
         return row
-
-    def _free(self) -> int:
-        if not self.reference.device.is_cuda:
-            return 0
-        gc.collect()
-        torch.cuda.empty_cache()
-        wp.synchronize_device(self.reference.device)
-        return free_memory(self.reference.device) or 0
 
     def _speed(self, env: Env) -> tuple[float, float, float]:
         """Measure steps per second of all worlds, and the speed-up's median and lower bound.

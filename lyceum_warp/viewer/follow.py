@@ -5,7 +5,7 @@ The viewer only reads the run's files. It may run on another machine that shares
 
 import torch
 
-from lyceum_warp.runs.checkpoints import policy_of, read_checkpoint
+from lyceum_warp.runs.checkpoints import network_of, read_checkpoint
 from lyceum_warp.runs.folder import Run
 
 
@@ -31,7 +31,7 @@ class Follower:
                 return []
             self._seen = stamp
             content = read_checkpoint(path, parts=("iteration", "policy"))
-            policy_of(content, path, self.policy)
+            network_of(content, path, "policy", self.policy)
         except (OSError, ValueError) as error:  # the training may be writing the file
             return [f"the policy of {self.run.folder} was not read: {str(error).splitlines()[0]}"]
         return [f"policy of iteration {content['iteration']}"]

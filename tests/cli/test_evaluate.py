@@ -19,7 +19,7 @@ from lyceum_warp.viz.cameras import find_camera
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "two"
+    out = tmp_path_factory.mktemp("runs") / "[" / "bold]x"  # not markup of rich
     assert train(out, "--iterations", "2") == 0
     return out
 
@@ -44,7 +44,7 @@ def test_eval_with_equal_seeds_prints_equal_statistics(trained: Path, capsys: py
         assert cli.main(["eval", str(trained), "--episodes", "3", "--seed", seed, "--nworld", "2"]) == 0
         outputs.append(capsys.readouterr().out)
     assert outputs[0] == outputs[1] != outputs[2]
-    assert "3 episodes of the mean policy" in outputs[0]
+    assert f"3 episodes of the mean policy in {trained}" in outputs[0]
     lines = {line.split()[0]: line.split() for line in outputs[0].splitlines() if line.split()}
     assert lines["length"] == ["length", "256", "0", "256", "256"]
     mean, std, low, high = (float(number) for number in lines["return"][1:])
@@ -75,12 +75,6 @@ def test_eval_refuses_zero_episodes_and_folders_without_a_run(
     refused(capsys, "at least 1 episode")
     assert cli.main(["eval", str(trained.parent)]) == 2
     refused(capsys, "there is no run in")
-
-
-def test_folder_name_may_contain_rich_markup(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = Path(shutil.copytree(trained, tmp_path / "[" / "bold]x"))
-    assert cli.main(["eval", str(run), "--episodes", "1"]) == 0
-    assert f"1 episodes of the mean policy in {run}" in capsys.readouterr().out
 
 
 def test_eval_saves_the_evaluated_episodes(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,35 +10,12 @@ from lyceum_warp.runs.folder import Run
 
 DATA = Path(__file__).parent.parent / "data"
 OLD = DATA / "old_run"
-RSL_RL = DATA / "rsl_rl_run"
 QUIET = ["--no-video", "--no-plot"]
 
 
 @pytest.fixture
 def old_run(tmp_path: Path) -> Path:
     return Path(shutil.copytree(OLD, tmp_path / "run"))
-
-
-def test_policy_and_value_function_of_an_old_run_are_loaded(old_run: Path) -> None:
-    policy, value = lw.load(old_run), lw.load_value(old_run)
-    assert policy(torch.zeros(2, policy.nobs)).shape == (2, 3)
-    assert value(torch.zeros(2, policy.nobs), torch.zeros(2)).shape == (2,)
-    assert value.discount == 0.995
-
-
-def test_old_run_is_evaluated_with_the_physics_of_its_training(
-    old_run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["eval", str(old_run), "--episodes", "2"]) == 0
-    assert "hopper: 2 episodes of the mean policy" in capsys.readouterr().out
-
-
-def test_old_run_resumes_with_all_its_settings(old_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["train", "--resume", str(old_run), "--iterations", "3", *QUIET]
-    assert main(arguments) == 0
-    assert [row["iteration"] for row in Run.open(old_run).rows()] == [1, 2, 3]
-    out = capsys.readouterr().out
-    assert "4 worlds, mujoco engine on cpu" in out
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
@@ -59,21 +36,22 @@ def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: flo
     torch.testing.assert_close(npg.value(obs, step), plain)
 
 
-@pytest.fixture(params=["command", "python", "task_file"])
+@pytest.fixture(params=["old_run", "runs_0_1/command", "runs_0_1/python", "runs_0_1/task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations by release 0.1: from the command line, from Python, or with a task file."""
-    return Path(shutil.copytree(DATA / "runs_0_1" / request.param, tmp_path / "run"))
+    """A run of two iterations: before release 0.1, or by 0.1 from the command line, from Python or of a task file."""
+    return Path(shutil.copytree(DATA / request.param, tmp_path / "run"))
 
 
-def test_run_of_release_0_1_is_loaded_and_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_of_an_early_release_is_loaded_and_evaluated(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     policy = lw.load(run)
-    assert policy.act(torch.zeros(2, policy.nobs)).shape == (2, policy.nact)
-    assert lw.load_value(run).discount == 0.995
+    obs, value = torch.zeros(2, policy.nobs), lw.load_value(run)
+    assert policy.act(obs).shape == (2, policy.nact)
+    assert value(obs, torch.zeros(2)).shape == (2,) and value.discount == 0.995
     assert main(["eval", str(run), "--trust", "--episodes", "2"]) == 0
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_run_of_release_0_1_is_resumed_and_new_training_starts_from_it(run: Path, tmp_path: Path) -> None:
+def test_run_of_an_early_release_is_resumed_and_new_training_starts_from_it(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
     assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)
@@ -82,13 +60,13 @@ def test_run_of_release_0_1_is_resumed_and_new_training_starts_from_it(run: Path
     out = tmp_path / "out"
     assert main(["train", "--from", str(run), "--out", str(out), "--iterations", "1", *QUIET]) == 0
     config = Run.open(out).config
-    assert config["npg"] == before.config["npg"] and config["from"]["iteration"] == 4
+    assert config["npg"].items() >= before.config["npg"].items() and config["from"]["iteration"] == 4
 
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
     """A run of rsl_rl's PPO. Early releases named its algorithm rsl-rl."""
-    return Path(shutil.copytree(RSL_RL, tmp_path / "rsl_rl"))
+    return Path(shutil.copytree(DATA / "rsl_rl_run", tmp_path / "rsl_rl"))
 
 
 def test_run_of_rsl_rl_is_loaded_evaluated_and_exported(rsl_rl_run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,9 +69,3 @@ def test_too_small_buffers_of_the_warp_engine_are_reported_as_faults() -> None:
     row = own.measure(Setting("", "", {"nconmax": 1, "njmax": 2}))
     assert row["memory"] < 0.95 and row["faults_per_million"] > row["reference_faults_per_million"]
     assert verdict(row, "strict") == "faults"
-
-
-@pytest.mark.gpu
-def test_trial_on_a_gpu_reports_the_memory_of_the_device() -> None:
-    row = trials("hopper", nworld=1024, device="cuda").measure(SAME)
-    assert row["device_bytes"] > 0
