@@ -15,18 +15,18 @@ from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.viz import NoVideoError
 
 _COMMANDS = {
-    "tasks": ("list_tasks", "Tasks", "List the tasks of the package, their sizes and the sources of their models."),
-    "new": ("new_task", "New", "Write a task file for a model."),
-    "check": ("check", "Check", "Check that a task follows every rule of an environment."),
-    "train": ("train", "Train", "Train a policy on a task, with NPG, PPO or SAC."),
-    "eval": ("evaluate", "Eval", "Evaluate a run's policy, and print statistics of its episodes."),
-    "export": ("export", "Export", "Write a run's policy to an ONNX or .pt2 file."),
-    "plan": ("plan", "Plan", "Control a task with a planner, and report rewards, success and planning times."),
-    "tune": ("tune", "Tune", "Find the fastest physics options that do not change a task's returns."),
-    "view": ("view", "View", "Show a task, a policy, a planner or saved episodes in a browser."),
-    "bench": ("bench", "Bench", "Run an experiment or another program of bench/."),
+    "tasks": ("list_tasks", "List the tasks of the package, their sizes and the sources of their models."),
+    "new": ("new_task", "Write a task file for a model."),
+    "check": ("check", "Check that a task follows every rule of an environment."),
+    "train": ("train", "Train a policy on a task, with NPG, PPO or SAC."),
+    "eval": ("evaluate", "Evaluate a run's policy, and print statistics of its episodes."),
+    "export": ("export", "Write a run's policy to an ONNX or .pt2 file."),
+    "plan": ("plan", "Control a task with a planner, and report rewards, success and planning times."),
+    "tune": ("tune", "Find the fastest physics options that do not change a task's returns."),
+    "view": ("view", "Show a task, a policy, a planner or saved episodes in a browser."),
+    "bench": ("bench", "Run an experiment or another program of bench/."),
 }
-"""The module, the class and the help line of each command.
+"""The module and the help line of each command. The class has the name of the command, capitalised.
 
 Only the module of the given command is imported, because most modules import torch, Warp and MuJoCo.
 """
@@ -79,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: list[str]) -> int:
     """Import the module of a command, parse its options, and run it."""
     if argv[:1] in (["-h"], ["--help"]):
-        commands: Any = {name: type(name, (), {"__doc__": line}) for name, (*_, line) in _COMMANDS.items()}
+        commands: Any = {name: type(name, (), {"__doc__": line}) for name, (_, line) in _COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])
     if not argv:
         raise ValueError(f"which command? The commands are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
@@ -87,8 +87,7 @@ def _run(argv: list[str]) -> int:
     if name not in _COMMANDS:
         hint = did_you_mean(name, _COMMANDS, f"there are {', '.join(_COMMANDS)}")
         raise ValueError(f"there is no command {name!r}: {hint}")
-    module, kind, _ = _COMMANDS[name]
-    command = getattr(importlib.import_module(f"lyceum_warp.cli.{module}"), kind)
+    command = getattr(importlib.import_module(f"lyceum_warp.cli.{_COMMANDS[name][0]}"), name.capitalize())
     # arguments after the name of a bench/ program belong to that program
     words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
     return parse(command, f"lyceum-warp {name}", words).run(*rest) or 0

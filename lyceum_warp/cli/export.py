@@ -9,11 +9,10 @@ import tyro
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.arguments import Trust
 from lyceum_warp.cli.display import note, say
+from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Env
-from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run, load
-from lyceum_warp.runs.task_copy import run_env
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,9 +46,7 @@ class Export:
     def _env(self, run: Run) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""
         try:
-            saved = Configuration.of(run)
-            options = saved.options.changed({"nworld": 1} | options_on_cores())
-            return run_env(run, options, saved.params, note=note, trust=self.trust)
+            return run_worlds(run, options_on_cores(), {}, nworld=1, task=None, trust=self.trust)
         except (ValueError, FileNotFoundError, ImportError) as error:
             note(f"the file has no metadata on the robot: {error}")
             return None

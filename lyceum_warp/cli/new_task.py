@@ -34,8 +34,8 @@ _TAKEN = ("World", "Params", "Row")
 class New:
     """Write a task file for a model. It can be checked, stepped and trained immediately, but its reward is zero.
 
-    The policy observes positions, velocities and the model's sensors, or only the sensors if they measure every joint.
-    It acts through the model's actuators. A step lasts about 20 ms. Comments in the file explain the next steps.
+    The policy observes positions, velocities, activations and sensors, and acts through the model's actuators. A step
+    lasts about 20 ms. Comments in the file explain the next steps.
 
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml

@@ -98,9 +98,7 @@ class Plan:
     $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
     """
 
-    USUAL = (
-        "episodes", "steps", "seed", "real_time", "out", "param", "device", "horizon", "samples", "physics",
-    )  # fmt: skip
+    USUAL = ("episodes", "steps", "seed", "real_time", "out", "param", "device", "horizon", "samples", "physics")
 
     task: TaskWord
     episodes: int = 1

@@ -32,9 +32,6 @@ _Sensor = mujoco.mjtSensor
 _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
 """Types of sensors that do not measure the robot's state, or that need custom code."""
 
-_FREE_SENSORS = (_Sensor.mjSENS_FRAMEQUAT, _Sensor.mjSENS_GYRO, _Sensor.mjSENS_FRAMEANGVEL)
-"""Types of sensors that measure the motion of a floating body."""
-
 
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
     """Generate the text of a task file, in ruff's format.
@@ -76,28 +73,19 @@ def _has_other_ranges(model: mujoco.MjModel) -> bool:
 
 
 def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
-    """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation.
-
-    Positions and velocities are omitted if sensors measure every joint.
-    """
-    fields = ["qpos: Row[float]", "qvel: Row[float]"]
-    sensed = _sensor_places(model)
-    parts: dict[str, int] = {}
-    rows: list[str] = []
-    if not (sensed and _all_joints_are_sensed(model)):
-        parts |= {"position": model.nq, "velocity": model.nv}
-        rows += ["s.qpos", "s.qvel"]
+    """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation."""
+    fields, rows = ["qpos: Row[float]", "qvel: Row[float]"], ["s.qpos", "s.qvel"]
+    parts = {"position": model.nq, "velocity": model.nv}
     if model.na:
         fields.append("act: Row[float]")
         parts["activation"] = model.na
         rows.append("s.act")
-    if sensed:
+    if sensed := _sensor_places(model):
         fields.append("sensordata: Row[float]")
         parts["sensors"] = sum(last - first for first, last in sensed)
         whole = sensed == [(0, model.nsensordata)]
         rows += ["s.sensordata"] if whole else [f"s.sensordata, {first}, {last}" for first, last in sensed]
-    at = ["0", *["k"] * (len(rows) - 1)]
-    put = [f"k = lw.put(obs, {k}, {row})" for k, row in zip(at, rows, strict=True)]
+    put = [f"k = lw.put(obs, {'k' if i else 0}, {row})" for i, row in enumerate(rows)]
     put[-1] = put[-1].removeprefix("k = ")
     return fields, parts, put
 
@@ -114,29 +102,6 @@ def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
         else:
             places.append((start, start + size))
     return places
-
-
-def _all_joints_are_sensed(model: mujoco.MjModel) -> bool:
-    """Whether sensors measure every joint's position and velocity and every floating body's motion."""
-    sensors = list(zip(model.sensor_type.tolist(), model.sensor_objtype.tolist(), model.sensor_objid.tolist(),
-                       strict=True))  # fmt: skip
-    objects = {kind: {i for found, _, i in sensors if found == kind} for kind in set(model.sensor_type.tolist())}
-    bodies = set()
-    for kind, objtype, i in sensors:
-        if kind in _FREE_SENSORS:
-            bodies.add(int(model.site_bodyid[i]) if objtype == mujoco.mjtObj.mjOBJ_SITE else i)
-    wanted = {
-        mujoco.mjtJoint.mjJNT_HINGE: (_Sensor.mjSENS_JOINTPOS, _Sensor.mjSENS_JOINTVEL),
-        mujoco.mjtJoint.mjJNT_SLIDE: (_Sensor.mjSENS_JOINTPOS, _Sensor.mjSENS_JOINTVEL),
-        mujoco.mjtJoint.mjJNT_BALL: (_Sensor.mjSENS_BALLQUAT, _Sensor.mjSENS_BALLANGVEL),
-    }
-    for joint, kind in enumerate(model.jnt_type.tolist()):
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
-            if int(model.jnt_bodyid[joint]) not in bodies:
-                return False
-        elif not all(joint in objects.get(int(sensor), ()) for sensor in wanted[mujoco.mjtJoint(kind)]):
-            return False
-    return True
 
 
 def _elements(model: mujoco.MjModel) -> str:

@@ -105,9 +105,7 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = (
-        "algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device",
-    )  # fmt: skip
+    USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device")
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""

@@ -28,9 +28,7 @@ from lyceum_warp.support.machine import cpu_cores
 
 log = logging.getLogger(__name__)
 
-ALGORITHMS: dict[str, tuple[Any, Any]] = {
-    "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)
-}  # fmt: skip
+ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
 """The learner's class and the class of its hyperparameters, by the algorithm's name in config.json."""
 
 

@@ -32,14 +32,6 @@ RICH = text(
     + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
     '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
 )
-SENSED = text(
-    ARM + '<body name="robot" pos="0 0 .1"><freejoint/><geom size=".1"/><site name="imu"/></body>',
-    actuated('<motor joint="hinge"/>')
-    + '<sensor><gyro site="imu"/><jointpos joint="hinge"/><jointvel joint="hinge"/><jointpos joint="wrist"/>'
-    '<jointvel joint="wrist"/></sensor>',
-)
-"""A model whose sensors measure every joint and the motion of the floating body."""
-
 # all checks except slow ones that do not depend on the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
@@ -82,13 +74,6 @@ def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
     assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities
     env.step()
     assert env.reward.tolist() == [0.0, 0.0]
-
-
-def test_new_task_observes_only_sensors_if_they_measure_every_joint(folder: Path) -> None:
-    task = find_task(new("sensed", SENSED))
-    assert task.obs == {"sensors": 7}
-    unsensed = SENSED.replace('<gyro site="imu"/>', '<gyro site="end"/>')  # no sensor measures the floating body
-    assert list(find_task(new("unsensed", unsensed)).obs) == ["position", "velocity", "sensors"]
 
 
 @pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
@@ -147,7 +132,7 @@ def test_new_files_are_formatted(folder: Path) -> None:
         pytest.skip("ruff is not installed")
     names = "abcdefghijklmnopqrstuvwxyz"
     many = "".join(f'<site name="{letter * 15}" pos="0 0 1"/>' for letter in names)
-    for name, xml in (("everything", RICH), ("sensed", SENSED), ("crowd", text(ARM + many))):
+    for name, xml in (("everything", RICH), ("crowd", text(ARM + many))):
         new(name, xml)
     assert "  sites: here, aaaaaaaaaaaaaaa, bbb" in Path("crowd.py").read_text()
     assert "... (29 in all)" in Path("crowd.py").read_text()
