@@ -37,7 +37,7 @@ Callback = Callable[[Any], Any]
 
 
 class Display:
-    """Shows the progress of training. This base class only logs messages."""
+    """Shows the progress of training. This base class shows nothing."""
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
@@ -49,10 +49,6 @@ class Display:
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
         """Show the progress of work between iterations, such as rendering a video."""
-
-    def note(self, line: str) -> None:
-        """Show a message."""
-        log.warning(line)
 
 
 def train(
@@ -108,7 +104,7 @@ def train(
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.
         entries: More JSON entries for config.json.
-        display: Shows the progress; by default, only messages are logged.
+        display: Shows the progress.
 
     Returns:
         The run; ``run.rows()`` returns its metrics.
@@ -159,19 +155,17 @@ def train(
                     run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
             check = shown.enter_context(run_lock(run.folder, take_over=take_over)) if leads else None
             if resume:
-                _load_checkpoint(run, learner, settings, display.note if leads else log.debug)
+                _load_checkpoint(run, learner, settings)
         saver = Saver(
             run if leads else None, check, learner, keep_every=keep_every, save_every=save_every,
-            saved=learner.iteration if resume else -1, note=display.note,
+            saved=learner.iteration if resume else -1,
         )  # fmt: skip
         callbacks: list[Callback] = []
         if leads:
             board = shown.enter_context(TensorBoard(run.folder, env)) if tensorboard else None
             seed = evaluation_seed(env.options.seed + 1)
-            videos = Videos(
-                learner, run.folder / "videos", video_every, seed, camera=camera, note=display.note,
-                progress=display.work,
-            )  # fmt: skip
+            folder = run.folder / "videos"
+            videos = Videos(learner, folder, video_every, seed, camera=camera, progress=display.work)
             shown.enter_context(display.training(run, learner, iterations))
             callbacks = [function for function in (board, display, videos, callback) if function is not None]
         try:
@@ -202,7 +196,7 @@ def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Di
             physics=wanted is True, progress=progress,
         )  # fmt: skip
     except Exception as error:  # an error must not discard the training
-        display.note(f"no verdict on transfer ({one_line(error)})")
+        log.warning("no verdict on transfer (%s)", one_line(error))
         return
     with replaced(run.transfer) as temporary:
         temporary.write_text(json.dumps({"iteration": learner.iteration, **found.to_dict()}, indent=2))
@@ -245,8 +239,8 @@ def _learn(
             ended = bool(last or signal)
 
 
-def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note: Callable[[str], None]) -> None:
-    folder, content = run.folder, run.read(learner.env.obs.device, note=note)
+def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any]) -> None:
+    folder, content = run.folder, run.read(learner.env.obs.device)
     reached, target, done = run.config.get("reached"), settings["target_return"], content["iteration"]
     if reached is not None and target is not None and reached["return"] >= target:
         raise ValueError(
@@ -259,7 +253,8 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
             f"iterations={2 * done} in Python)"
         )
     _check_equal(run, learner)
-    note_changes(run, learner.env, note=note)
+    if learner.team.leads:
+        note_changes(run, learner.env)
     try:
         learner.load_state_dict(content["state"])
         if learner.replay is not None:
@@ -273,7 +268,7 @@ def _load_checkpoint(run: Run, learner: Learner, settings: dict[str, Any], note:
         then = run.config.get("versions", now)
         if changed := {name: value for name, value in now.items() if then.get(name) != value}:
             text = ", ".join(f"{name} {then.get(name)} then, {value} now" for name, value in changed.items())
-            note(f"versions have changed, so numbers may differ from an uninterrupted run's: {text}")
+            log.warning("versions have changed, so numbers may differ from an uninterrupted run's: %s", text)
             settings = settings | {"resumed": [*run.config.get("resumed", []), changed]}
         run.amend(**settings)
 

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -48,6 +49,13 @@ lyceum-warp COMMAND --help describes a command and its usual options, --help-all
 """
 
 
+class _Messages(logging.Handler):
+    """Print the package's warnings to stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"lyceum-warp: {record.getMessage()}", file=sys.stderr)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program ``lyceum-warp``.
 
@@ -59,6 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
         return 0
+    log, messages = logging.getLogger("lyceum_warp"), _Messages(logging.WARNING)
+    log.addHandler(messages)
     try:
         with signals():
             return _run(argv)
@@ -74,6 +84,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         text = "; ".join([text, *getattr(error, "__notes__", [])])
         print(f"lyceum-warp: {' '.join(text.split())}", file=sys.stderr)
         return 2
+    finally:
+        log.removeHandler(messages)
 
 
 def _run(argv: list[str]) -> int:

@@ -66,8 +66,6 @@ class Display(training.Display):
         with self.progress:
             yield
 
-    note = staticmethod(note)
-
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:

@@ -181,12 +181,12 @@ def run_worlds(
     if "device" not in words:
         known = known.changed(options_for_few_worlds(known.engine, known.device))
     try:
-        env = run_env(run, known, own | params, note=note, task=task, trust=trust)
+        env = run_env(run, known, own | params, task=task, trust=trust)
     except (ValueError, FileNotFoundError) as error:
         run.note_settings(error)
         raise
     if task is None:
-        note_changes(run, env, note=note, model=env.options.physics == saved.options.physics)
+        note_changes(run, env, model=env.options.physics == saved.options.physics)
     return env
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 import datetime
 import json
+import logging
 import signal
 from pathlib import Path
 from typing import Annotated, Any
@@ -201,6 +202,8 @@ class Train:
         if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         with join(self.env.device or saved.get("device", "cpu")) as team:
+            if not team.leads:  # one process prints the messages of all
+                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
             with team.together():  # check all options before the folder is created
                 learner, folder, entries = self._learner(source, team)
             leads, total = learner.team.leads, settings["iterations"]
@@ -291,10 +294,7 @@ class Train:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
-        says = note if team.leads else lambda line: None
-        learner = configuration.learner(
-            team, run=source, networks=(policy, value), note=says, task=self.task, trust=self.trust
-        )
+        learner = configuration.learner(team, run=source, networks=(policy, value), task=self.task, trust=self.trust)
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
             for name, value in given(self.hyperparameters).items():
@@ -304,7 +304,7 @@ class Train:
                         f"--{name.replace('_', '-')}"
                     )
         if source is not None and self.task is None and self.resume is None:
-            note_changes(source, learner.env, note=says)
+            note_changes(source, learner.env)
         name = f"{file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
 

@@ -1,8 +1,7 @@
 """Convert between a learner and the config.json of its run."""
 
 import dataclasses
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,6 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import TABLES, is_table, json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
-
-log = logging.getLogger(__name__)
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
 """The learner's class and the class of its hyperparameters, by the algorithm's name in config.json."""
@@ -107,7 +104,6 @@ class Configuration:
         *,
         run: Run | None = None,
         networks: tuple[Any, Any] = (None, None),
-        note: Callable[[str], None] = log.warning,
         task: str | None = None,
         trust: bool = False,
     ) -> Learner:
@@ -117,7 +113,6 @@ class Configuration:
             team: The processes that train together.
             run: The run that provides the task. A file that has moved or changed is replaced by the run's copy.
             networks: The initial policy and value function; None for new networks.
-            note: Called with messages about the task's files.
             task: Another task to use instead.
             trust: Whether to execute the task even if the run was not made by this user on this machine.
         """
@@ -136,7 +131,7 @@ class Configuration:
                 env = Env(self.task, options, **self.params)
             else:
                 # only rank 0 checks trust, because other machines may have no record of the run
-                env = run_env(run, options, self.params, note=note, task=task, trust=trust or not team.leads)
+                env = run_env(run, options, self.params, task=task, trust=trust or not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
             return learner

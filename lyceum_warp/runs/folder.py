@@ -5,7 +5,7 @@ import csv
 import json
 import logging
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -273,14 +273,15 @@ class Run:
         numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
-    def best_score(self, *, note: Callable[[str], None] = log.warning) -> tuple[int, float] | None:
+    def best_score(self) -> tuple[int, float] | None:
         """Read the iteration and the score of the best policy, or return None without one."""
         if not self.best.is_file():
             return None
         try:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
         except ValueError as error:
-            note(f"{str(error).rpartition(': ')[0]}: the next evaluated policy replaces it, whatever its return")
+            cause = str(error).rpartition(": ")[0]
+            log.warning("%s: the next evaluated policy replaces it, whatever its return", cause)
             return None
         return content["iteration"], content["score"]["value"]
 
@@ -292,14 +293,13 @@ class Run:
         checkpoint = {**content, "state": dict(state)}
         write_content(self.checkpoint, checkpoint, durable=True, previous=self.previous)
 
-    def read(self, device: str | torch.device = "cpu", *, note: Callable[[str], None] = log.warning) -> dict[str, Any]:
+    def read(self, device: str | torch.device = "cpu") -> dict[str, Any]:
         """Read the checkpoint's ``iteration``, ``policy``, ``state`` and, if it has one, ``value``.
 
         If the checkpoint is broken or missing, the previous checkpoint is read instead.
 
         Args:
             device: Device for the tensors.
-            note: Called with a message if the previous checkpoint is read.
 
         Raises:
             FileNotFoundError: The run has no checkpoint.
@@ -311,7 +311,8 @@ class Run:
             with contextlib.suppress(ValueError, FileNotFoundError):
                 content = read_checkpoint(self.previous, device)
                 cause = str(error).rpartition(": ")[0]
-                note(f"{cause}: {self.previous}, of iteration {content['iteration']}, is used instead")
+                done = content["iteration"]
+                log.warning("%s: %s, of iteration %d, is used instead", cause, self.previous, done)
                 return content
             if isinstance(error, ValueError) and self.policy.is_file():
                 raise ValueError(

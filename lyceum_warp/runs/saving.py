@@ -1,6 +1,5 @@
 """Decide when to save a run, and save it."""
 
-import logging
 import math
 import time
 from collections.abc import Callable
@@ -9,8 +8,6 @@ from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.replay_files import clean_replay, write_replay
-
-log = logging.getLogger(__name__)
 
 SAVE_SECONDS = 30.0
 """Maximum seconds between saves, unless saves are slow (see ``LONG``)."""
@@ -39,7 +36,6 @@ class Saver:
         keep_every: Iterations between two policies in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
         saved: Number of the last saved iteration; -1 before the first save.
-        note: Called with a message if the file of the best policy is damaged.
     """
 
     saved: int
@@ -53,11 +49,10 @@ class Saver:
         keep_every: int = 0,
         save_every: int = 0,
         saved: int = -1,
-        note: Callable[[str], None] = log.warning,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
         self.saved, self._check = saved, check
-        best = None if run is None else run.best_score(note=note)
+        best = None if run is None else run.best_score()
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
         self._seconds, self._when = 0.0, time.perf_counter()

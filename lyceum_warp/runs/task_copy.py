@@ -5,7 +5,7 @@ import io
 import logging
 import os
 import warnings
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,6 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.trust import check_trust
 
 log = logging.getLogger(__name__)
-
-Note = Callable[[str], None]
 
 Files = dict[Path, Path | bytes]
 """The content of each file, or the file from which to copy it."""
@@ -54,7 +52,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         sources = loaded if own else {}
         # relative paths stay the same, so that the copied task finds the copied model
         names = _names_in_copy([*sources, *model])
-        if file in sources and names[file].count("/") > _APART:
+        if file is not None and names.get(file, "").count("/") > _APART:
             names = _names_in_copy(sources) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
         files = {names[path]: content for path, content in {**sources, **model}.items()}
         if own and file is not None:
@@ -110,20 +108,18 @@ def run_env(
     options: EnvOptions,
     params: Mapping[str, Any],
     *,
-    note: Note = log.warning,
     task: str | None = None,
     trust: bool = False,
 ) -> Env:
     """Make an environment for a run's task.
 
-    A file or a model that has moved or changed since the run started is replaced by the run's copy, and ``note`` is
-    called. Tasks of the package are used in their current version.
+    A file or a model that has moved or changed since the run started is replaced by the run's copy, with a warning in
+    the log. Tasks of the package are used in their current version.
 
     Args:
         run: The run.
         options: Options of the environment.
         params: Parameters of the task.
-        note: Called with each message.
         task: Another task to use instead.
         trust: Whether to execute the task and read the files even if this user did not make the run on this machine.
 
@@ -158,7 +154,7 @@ def run_env(
         check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
     if copy.is_file() and (changes := _source_changes(Path(path), kept)):
         new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
-        note(f"{changes[0]}: the run's own copy is used, {copy}{new}")
+        log.warning("%s: the run's own copy is used, %s%s", changes[0], copy, new)
         chosen = f"{copy}{colon}{attribute}"
     copy = run.task_folder / kept.get("model", "")
     if not copy.is_file():
@@ -172,7 +168,7 @@ def run_env(
         reason = "has changed since the run began"
     except FileNotFoundError:
         reason = "is no longer where it was"
-    note(f"the model of the task {run.task_name!r} {reason}: the run's own copy is used, {copy}")
+    log.warning("the model of the task %r %s: the run's own copy is used, %s", run.task_name, reason, copy)
     return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
 
 
@@ -188,13 +184,12 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
     return changes
 
 
-def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = True) -> None:
-    """Report how an environment's task and model differ from the run's.
+def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
+    """Log how an environment's task and model differ from the run's.
 
     Args:
         run: The run.
         env: The environment.
-        note: Called with each message.
         model: Whether to compare the compiled models, which also depend on the physics options.
     """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
@@ -202,9 +197,9 @@ def note_changes(run: Run, env: Env, *, note: Note = log.warning, model: bool = 
     # a task's file may also be the training script, and then a change may be unrelated to the task
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
-        note(f"{change}: it is used as it is now" if "changed" in change else change)
+        log.warning("%s", f"{change}: it is used as it is now" if "changed" in change else change)
     if model and _model_changed(run, env):
-        note(f"the model of the task {env.task.name!r} has changed since the run began: it is used as it is now")
+        log.warning("the model of the task %r has changed since the run began: it is used as it is now", env.task.name)
 
 
 def _model_changed(run: Run, env: Env) -> bool:

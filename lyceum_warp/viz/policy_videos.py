@@ -50,10 +50,10 @@ class Videos:
 
     def __init__(
         self, learner: Learner, folder: Path, every: int, seed: int, *, camera: CameraChoice = None,
-        note: Callable[[str], object] = log.warning, progress: NamedProgress | None = None,
+        progress: NamedProgress | None = None,
     ) -> None:  # fmt: skip
         self.learner, self.folder, self.every, self.seed = learner, folder, every, seed
-        self.camera, self.note, self.progress = camera, note, progress
+        self.camera, self.progress = camera, progress
 
     def __call__(self, iteration: Iteration) -> None:
         """Write a video after an iteration, if one is due."""
@@ -65,7 +65,7 @@ class Videos:
                 self.learner.env, self.learner.policy, path, self.seed, camera=self.camera, progress=self.progress
             )
         except Exception as error:  # an error of any kind must not end the training
-            self.note(f"no further videos ({one_line(error)})")
+            log.warning("no further videos (%s)", one_line(error))
             self.every = 0
 
 
