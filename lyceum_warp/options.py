@@ -50,11 +50,6 @@ def _whole(options: Any, name: str, low: int) -> None:
         object.__setattr__(options, name, whole_number(name, value, low=low))
 
 
-def _flags(options: Any, *names: str) -> None:
-    for name in names:
-        check_flag(name, getattr(options, name))
-
-
 def _one_of(what: str, name: Any, known: Mapping[str, Any]) -> None:
     if name is not None and (not isinstance(name, str) or name not in known):
         *others, last = map(repr, known)
@@ -121,7 +116,9 @@ class PhysicsOptions:
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
         _one_of("Jacobian", self.jacobian, JACOBIANS)
-        _flags(self, "deterministic", *([] if self.discardvisual is None else ["discardvisual"]))
+        check_flag("deterministic", self.deterministic)
+        if self.discardvisual is not None:
+            check_flag("discardvisual", self.discardvisual)
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 
@@ -189,7 +186,8 @@ class EnvOptions:
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
-        _flags(self, "autoreset", "graphs")
+        check_flag("autoreset", self.autoreset)
+        check_flag("graphs", self.graphs)
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
             if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):

@@ -97,9 +97,8 @@ def train(
         camera: Camera of the videos: the name or index of a camera in the model, a ``viz.cameras.FreeCamera``, or
             "free" for MuJoCo's default camera.
         transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
-            only comparisons that take seconds are made. After training on a GPU, this is the C engine; after training
-            with other physics options, it is the task's exact physics. ``transfer=True`` also compares each set of the
-            task's physics options and, after training on CPU cores, the Warp engine.
+            only with the C engine after training on a GPU, and with exact physics after training with other physics.
+            ``transfer=True`` also compares the task's other physics options and the Warp engine.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.
@@ -151,8 +150,7 @@ def train(
                 run = Run(Path(folder), describe(learner) | settings | dict(entries or {}))
                 if leads:
                     kept, files = task_copy(env)
-                    device = env.options.device or "cpu"
-                    run = Run.create(folder, run.config | {"kept": kept}, device=device, files=files)
+                    run = Run.create(folder, run.config | {"kept": kept}, files=files)
             check = shown.enter_context(run_lock(run.folder, take_over=take_over)) if leads else None
             if resume:
                 _load_checkpoint(run, learner, settings)

@@ -89,7 +89,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    """Import the module of a command, parse its options, and run it."""
     if argv[:1] in (["-h"], ["--help"]):
         commands: Any = {name: type(name, (), {"__doc__": line}) for name, (_, line) in _COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])

@@ -26,6 +26,7 @@ from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.long_work import LongWork
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.policy_videos import policy_video
 from lyceum_warp.viz.video import check_video
@@ -83,8 +84,7 @@ class Eval:
     physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
 
     def run(self) -> None:
-        if self.episodes < 1 or self.nworld < 1:
-            raise ValueError(f"eval needs at least 1 episode and 1 world, not {self.episodes} and {self.nworld}")
+        whole_number("episodes", self.episodes, low=1)
         if self.transfer and self.env.engine is not None:
             raise ValueError("--transfer plays episodes on both engines: omit --engine")
         camera = parsed_camera(self.camera)

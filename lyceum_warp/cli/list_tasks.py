@@ -48,7 +48,8 @@ class Tasks:
     """List only tasks with this word in their name, description or model source."""
 
     def run(self) -> None:
-        entries = [entry for entry in map(_entry, task_names()) if entry.has(self.word)]
+        entries = list(map(_entry, task_names()))
+        entries = [one for one in entries if self.word.lower() in f"{one.name} {one.about} {one.source}".lower()]
         if not entries:
             raise ValueError(
                 f"no task has {self.word!r} in its name, description or model: list all tasks with lyceum-warp tasks"
@@ -66,7 +67,7 @@ class Tasks:
         console.print(heading.rstrip(), style="bold", soft_wrap=True)
         for line, entry in zip(lines, entries, strict=True):
             console.print(escape(line.rstrip()), soft_wrap=True)
-            about = (entry.about or _UNKNOWN) + f"; model: {entry.source}" * (not fits)
+            about = entry.about + f"; model: {entry.source}" * (not fits)
             console.print(escape(textwrap.fill(about, **indented)), style="dim", soft_wrap=True)
             if entry.note:
                 console.print(escape(textwrap.fill(entry.note, **indented)), style="yellow", soft_wrap=True)
@@ -77,12 +78,9 @@ class Tasks:
 class _Entry:
     name: str
     task: type[Task] | None = None
-    about: str = ""
+    about: str = _UNKNOWN
     source: str = _UNKNOWN
     note: str = ""
-
-    def has(self, word: str) -> bool:
-        return word.lower() in " ".join((self.name, self.about, self.source)).lower()
 
 
 def _entry(name: str) -> _Entry:

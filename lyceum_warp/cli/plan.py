@@ -177,12 +177,12 @@ class Plan:
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.task), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
-            "planner_model": self.planner_model and str(_model(self.planner_model)),
+            "planner_model": self.planner_model and str(self.planner_model.expanduser().resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
         }  # fmt: skip
-        run = Run.create(out, config, device=self.planner.device)
+        run = Run.create(out, config)
         _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
 
 
@@ -199,7 +199,7 @@ def _worlds(
     config = options.mppi.on_top_of(task_config(task, value))
     words = vars(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
-        words["model"] = _model(options.planner_model)
+        words["model"] = options.planner_model.expanduser().resolve()
 
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}
@@ -257,13 +257,6 @@ def _fill(words: tuple[str, ...]) -> Any:
     except ValueError:
         return " ".join(words)  # MPPIConfig refuses unknown words
     return numbers[0] if len(numbers) == 1 else numbers
-
-
-def _model(path: Path) -> Path:
-    path = path.expanduser().resolve()
-    if not path.is_file():
-        raise FileNotFoundError(f"--planner-model: there is no file {path}")
-    return path
 
 
 def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:

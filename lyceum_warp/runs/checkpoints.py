@@ -20,16 +20,13 @@ FORMAT = 1
 
 _FIX = "restore the file from a copy, or train again into another folder"
 
-PolicyContent = dict[str, Any]
-"""``iteration``, ``policy``, and ``value`` if there is a value function."""
-
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
 """The class of a network for files that do not name it."""
 
 
-def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> PolicyContent:
-    """Copy a policy and a value function to the CPU, in the format in which they are saved."""
-    content: PolicyContent = {"lyceum_warp": FORMAT, "iteration": iteration}
+def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> dict[str, Any]:
+    """Copy a policy and a value function to the CPU: the entries ``iteration``, ``policy`` and, if any, ``value``."""
+    content: dict[str, Any] = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
             kind = type(module)
@@ -50,7 +47,7 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
         temporary.write_bytes(buffer.getbuffer())
 
 
-def network_of(content: PolicyContent, path: Path, name: str, given: nn.Module | None = None) -> nn.Module:
+def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Module | None = None) -> nn.Module:
     """Make the network "policy" or "value" from a file's content, or load its weights into a given network."""
     if name not in content:
         raise ValueError(f"{path} has no value function, because the run's algorithm learns none")

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.runs.checkpoints import FORMAT, PolicyContent, network_of, read_checkpoint, write_content
+from lyceum_warp.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
 from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
@@ -104,23 +104,22 @@ class Run:
         folder: str | Path,
         config: Mapping[str, Any],
         *,
-        device: str = "cpu",
         files: Mapping[str, Path | bytes] | None = None,
     ) -> "Run":
         """Create a run folder with a copy of the task, the configuration and the versions.
 
         The folder is deleted if an error occurs. If the run uses the user's own files, it is recorded as trusted (see
-        ``lyceum_warp.runs.trust``). Later calls can then execute the task without ``trust=True``.
+        ``lyceum_warp.runs.trust``), so that later commands execute the task.
 
         Args:
             folder: A new or empty folder.
             config: The configuration, as JSON values.
-            device: Device of the run, for the entry ``versions``.
             files: The content of the folder ``task``: maps paths in it to files to copy, or to bytes to write.
         """
         folder = Path(folder)
         cls.check_free(folder)
-        run, task = cls(folder, {"format": FORMAT, **config, "versions": versions(device)}), folder / f"{_TASK}.tmp"
+        found = versions(config.get("device", "cpu"))
+        run, task = cls(folder, {"format": FORMAT, **config, "versions": found}), folder / f"{_TASK}.tmp"
         text = json.dumps(run.config, indent=2)  # before the folder is created, because this may fail
         try:
             shutil.rmtree(task, ignore_errors=True)
@@ -287,7 +286,7 @@ class Run:
 
     # the checkpoint
 
-    def save(self, content: PolicyContent, state: Mapping[str, Any]) -> None:
+    def save(self, content: Mapping[str, Any], state: Mapping[str, Any]) -> None:
         """Replace the last policy and the checkpoint atomically. The old checkpoint becomes ``previous.pt``."""
         write_content(self.policy, content)
         checkpoint = {**content, "state": dict(state)}
@@ -368,7 +367,7 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
     return network_of(content, path, "value").to(device).eval().requires_grad_(False)
 
 
-def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[PolicyContent, Path]:
+def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[dict[str, Any], Path]:
     check_kind("run", run, str | Path | Run, "a run's folder")
     check_kind("which", which, str | int, "as 'last', 'best' or 100")
     check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")

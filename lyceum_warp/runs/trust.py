@@ -38,8 +38,7 @@ def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, r
     if not trust:
         raise ValueError(
             f"the run in {folder} was not made by you on this machine, and the command would "
-            f"{'run' if runs else 'read'} {named}: look at the folder, then allow the run with --trust (trust=True in "
-            "Python)"
+            f"{'run' if runs else 'read'} {named}: look at the folder, then allow the run with --trust"
         )
     remember(folder, config)
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from lyceum_warp.env import Env
 from lyceum_warp.runs.task_copy import json_value, task_copy
+from lyceum_warp.support.files import replaced
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.versions import versions
 
-_BEGIN = b'{"name": '
 _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
@@ -38,18 +38,13 @@ class RowFile:
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path, self.identity = path, json.loads(json.dumps(identity))
         self._rows: dict[str, dict[str, Any]] = {}
-        self._whole = 0
-        lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
-        for number, line in enumerate(lines, 1):
+        self._lines = path.read_text(errors="replace").splitlines() if path.exists() else []
+        for number, line in enumerate(self._lines, 1):
             try:
                 row = json.loads(line)
                 found, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
-                # a killed process may leave an incomplete last line, which the next row replaces
-                if number == len(lines) and line.startswith(_BEGIN):
-                    break
                 raise ValueError(f"line {number} of {path} is not a result of tune: use another file") from None
-            self._whole += len(line)
             if found == self.identity:
                 self._rows[key] = row
 
@@ -59,12 +54,11 @@ class RowFile:
 
     def add(self, row: Mapping[str, Any]) -> dict[str, Any]:
         """Append a row to the file, and return it as read from JSON."""
-        line = json.dumps({**row, "identity": self.identity})
+        self._lines.append(json.dumps({**row, "identity": self.identity}))
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("ab") as file:
-            file.truncate(self._whole)
-            self._whole += file.write(f"{line}\n".encode())
-        self._rows[_key(row["physics"])] = kept = json.loads(line)
+        with replaced(self.path) as temporary:
+            temporary.write_text("".join(f"{line}\n" for line in self._lines))
+        self._rows[_key(row["physics"])] = kept = json.loads(self._lines[-1])
         return kept
 
 

@@ -14,7 +14,7 @@ def test_value_function_has_the_discount_factor_of_its_training(tmp_path: Path) 
     assert value.discount is None
     npg = lw.NPG(env, value=value, config=config)
     assert value.discount == lw.NPG(env, config=config).value.discount == 0.9
-    run = Run.create(tmp_path, {}, device="cpu")
+    run = Run.create(tmp_path, {})
     run.save(policy_content(0, npg.policy, value), {})
     assert lw.load_value(run).discount == 0.9
     content = torch.load(run.policy)

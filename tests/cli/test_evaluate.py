@@ -72,7 +72,7 @@ def test_eval_refuses_zero_episodes_and_folders_without_a_run(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["eval", str(trained), "--episodes", "0"]) == 2
-    refused(capsys, "at least 1 episode")
+    refused(capsys, "episodes must be a whole number from 1")
     assert cli.main(["eval", str(trained.parent)]) == 2
     refused(capsys, "there is no run in")
 

@@ -212,7 +212,7 @@ def test_chosen_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.
     (["--param", "horizon=9"], ["horizon is an option", "use --steps"]),
     (["--planner-param", "horizon=9"], ["horizon is an option", "use --horizon"]),
     (["--planner-param", "nworld=9"], ["nworld is an option", "use --samples"]),
-    (["--planner-model", "nowhere.xml"], ["there is no file", str(Path("nowhere.xml").resolve())]),
+    (["--planner-model", "nowhere.xml"], ["no model file", str(Path("nowhere.xml").resolve())]),
     (["--fill", "1", "zero"], ["fill", "1 zero"]),
     (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
     (["--device", "cuda:7"], ["cuda:7"]),
