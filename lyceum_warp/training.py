@@ -96,9 +96,9 @@ def train(
             none. If a video fails, a warning is logged, and training continues without videos.
         camera: Camera of the videos: the name or index of a camera in the model, a ``viz.cameras.FreeCamera``, or
             "free" for MuJoCo's default camera.
-        transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
-            only with the C engine after training on a GPU, and with exact physics after training with other physics.
-            ``transfer=True`` also compares the task's other physics options and the Warp engine.
+        transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. The default
+            makes only comparisons that take seconds: with the C engine after training on a GPU, and with exact physics
+            after training with other physics. ``transfer=True`` adds the task's other physics and the Warp engine.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.

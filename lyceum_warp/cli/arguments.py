@@ -166,15 +166,14 @@ def _flag_names(command: Any) -> list[str]:
 
 def parameter(text: str) -> tuple[str, Any]:
     """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit."""
-    name, equals, value = text.partition("=")
-    if not equals or not name.strip():
+    name, value = (part.strip() for part in text.partition("=")[::2])
+    parts = [part for part in value.strip("[]()").split(",") if part.strip()]
+    if not name or not parts:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")
-    if value.strip().endswith(".npy"):
-        return name.strip(), str(Path(value.strip()).expanduser().resolve())
-    parts = [_value(part, text) for part in value.strip().strip("[]()").split(",") if part.strip()]
-    if not parts:
-        raise ValueError(f"{text!r} must be written as NAME=VALUE")
-    return name.strip(), parts[0] if len(parts) == 1 else parts
+    if value.endswith(".npy"):
+        return name, str(Path(value).expanduser().resolve())
+    values = [_value(part, text) for part in parts]
+    return name, values[0] if len(values) == 1 else values
 
 
 def _value(part: str, text: str) -> bool | int | float:

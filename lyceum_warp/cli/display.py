@@ -77,10 +77,7 @@ class Display(training.Display):
         result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
         mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
         success = f"success {row['success']:.0%}" if "success" in row else ""
-        bad = []
-        for column, what in _COUNTED.items():
-            if number := row.get(column):
-                bad.append(counted(number, what))
+        bad = [counted(number, what) for column, what in _COUNTED.items() if (number := row.get(column))]
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
         if self.console.is_terminal:
             most = [result, mean, success, *bad, rate.replace(" samples", "")]
@@ -141,11 +138,9 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
         for i, (heading, cells) in enumerate(columns.items()):
             if heading in omit[:count]:
                 continue
-            width = max(map(len, cells))
-            lines = heading if len(heading) <= width else heading.replace(" ", "\n")
-            width = max(width, *map(len, lines.split("\n")))
-            words: dict[str, Any] = {"min_width": width, "no_wrap": True} if i else {"overflow": "fold"}
-            table.add_column(escape(lines), justify="right" if i or cells[0].isdecimal() else "left", **words)
+            width = max(map(len, [*cells, *heading.split()]))
+            words: dict[str, Any] = {"min_width": width} if i else {"overflow": "fold"}
+            table.add_column(escape(heading), justify="right" if i or cells[0].isdecimal() else "left", **words)
         for row in zip(*(cells for heading, cells in columns.items() if heading not in omit[:count]), strict=True):
             table.add_row(*map(escape, row))
         if Measurement.get(console, console.options.update_width(10_000), table).minimum <= console.width:
@@ -174,11 +169,8 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
         if any(cells):
             columns[heading] = cells
     table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))
-    bad = []
-    for what in ("fault", "outlier"):
-        if number := round(sum(row.get(what + "s") or 0.0 for row in rows)):
-            bad.append(counted(number, what))
-    if bad:
+    sums = {what: round(sum(row.get(column) or 0.0 for row in rows)) for column, what in _COUNTED.items()}
+    if bad := [counted(number, what) for what, number in sums.items() if number]:
         table.caption = f"{' and '.join(bad)} in all {len(rows)} iterations"
     return table
 

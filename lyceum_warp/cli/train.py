@@ -24,7 +24,7 @@ from lyceum_warp.cli.arguments import (
     Trust,
     given,
     parameters,
-)  # fmt: skip
+)
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
@@ -207,7 +207,7 @@ class Train:
             with team.together():  # check all options before the folder is created
                 learner, folder, entries = self._learner(source, team)
             leads, total = learner.team.leads, settings["iterations"]
-            resume = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+            hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
             try:
                 run = train(
                     learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
@@ -218,7 +218,7 @@ class Train:
                 if leads and (path := folder / "policy.pt").exists():
                     done = read_checkpoint(path, parts=("iteration",))["iteration"]
                     name = signal.Signals(signalled.number).name
-                    rest = f"; {resume}" if done < total else ""
+                    rest = f"; {hint}" if done < total else ""
                     say(f"interrupted by {name} after {done} of {total} iterations{rest}")
                     if self.plot and (folder / "metrics.csv").exists():
                         with obeyed():
@@ -230,7 +230,7 @@ class Train:
             if reached.get("iteration") == learner.iteration < total:
                 say(f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}")
             elif learner.iteration < total and self.minutes is not None:
-                say(f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; {resume}")
+                say(f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; {hint}")
             return self._report(run, learner)
 
     def _suggestion(self) -> Training:
