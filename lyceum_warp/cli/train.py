@@ -41,9 +41,7 @@ from lyceum_warp.viz.policy_videos import policy_video
 
 _FINAL_EPISODES = 32
 
-_SETTINGS: dict[str, Any] = {
-    "iterations": 100, "target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
-}  # fmt: skip
+_SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
 """The defaults of the settings that may change when a run is resumed."""
 
 _KEPT = {
@@ -194,8 +192,8 @@ class Train:
             raise ValueError("--take-over has no effect without --resume: omit it")
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
-        settings, defaults = {}, _SETTINGS if source else _SETTINGS | {"iterations": self._suggestion().iterations}
-        for name, default in defaults.items():
+        settings: dict[str, Any] = {}
+        for name, default in _SETTINGS.items():
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
         if self.resume is None:
             settings["target_return"] = self.target_return
@@ -205,14 +203,15 @@ class Train:
             if not team.leads:  # one process prints the messages of all
                 logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
             with team.together():  # check all options before the folder is created
-                learner, folder, entries = self._learner(source, team)
-            leads, total = learner.team.leads, settings["iterations"]
+                configuration = self.configuration(source, team)
+                learner, folder, entries = self._learner(configuration, source, team)
+            leads, total = team.leads, configuration.iterations
             hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
             try:
                 run = train(
                     learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
                     take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
-                    display=Display(console), **settings,
+                    display=Display(console), iterations=total, **settings,
                 )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -233,14 +232,6 @@ class Train:
                 say(f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; {hint}")
             return self._report(run, learner)
 
-    def _suggestion(self) -> Training:
-        """Return the training that the task suggests. With another --algorithm, return only that algorithm."""
-        assert self.task is not None
-        suggestion = find_task(self.task).training
-        if self.algorithm in (None, suggestion.algorithm):
-            return suggestion
-        return Training(algorithm=self.algorithm)
-
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
         words = given(self.env) | given(self.physics)
@@ -248,7 +239,10 @@ class Train:
             if value is not None:
                 words[name] = value
         if source is None:
-            suggestion = self._suggestion()
+            assert self.task is not None
+            suggestion = find_task(self.task).training
+            if self.algorithm not in (None, suggestion.algorithm):
+                suggestion = Training(algorithm=self.algorithm)
             few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes an update for each step of each world
             nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
             options = EnvOptions(nworld=nworld, device="cpu")
@@ -259,7 +253,8 @@ class Train:
                 except (KeyError, TypeError, ValueError) as error:
                     raise ValueError(f"the attribute training of the task {self.task} is not valid: {error}") from error
             base = Configuration(
-                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested
+                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested,
+                iterations=suggestion.iterations,
             )  # fmt: skip
         else:
             base = Configuration.of(source)
@@ -281,11 +276,13 @@ class Train:
             hyperparameters=self.hyperparameters.on_top_of(known, algorithm),
             seed=base.seed if self.seed is None else None,
             threads=base.threads if self.threads is None else self.threads,
+            iterations=base.iterations if self.iterations is None else self.iterations,
         )  # fmt: skip
 
-    def _learner(self, source: Run | None, team: Team) -> tuple[Learner, Path, dict[str, Any]]:
+    def _learner(
+        self, configuration: Configuration, source: Run | None, team: Team
+    ) -> tuple[Learner, Path, dict[str, Any]]:
         """Make the learner. Return it with the run's folder and additional entries for config.json."""
-        configuration = self.configuration(source, team)
         if self.out is not None and team.leads:
             Run.check_free(self.out)
         policy = value = None

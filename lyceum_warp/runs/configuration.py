@@ -71,6 +71,7 @@ class Configuration:
     seed: int | None = None
     """Seed of the algorithm. None means the environment's seed."""
     threads: int = 1
+    iterations: int = 100
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
@@ -93,6 +94,7 @@ class Configuration:
                 task=config["task"], params=params, options=options, algorithm=name,
                 hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
                 seed=config.get(f"{name}_seed"), threads=config["threads"],
+                iterations=config.get("iterations", 100),
             )  # fmt: skip
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             text = f"{run.folder / 'config.json'} is not the configuration of a training run ({error})"
