@@ -151,13 +151,12 @@ def train(
                 if leads:
                     kept, files = task_copy(env)
                     run = Run.create(folder, run.config | {"kept": kept}, files=files)
-            check = shown.enter_context(run_lock(run.folder, take_over=take_over)) if leads else None
+            if leads:
+                run.check = shown.enter_context(run_lock(run.folder, take_over=take_over))
             if resume:
                 _load_checkpoint(run, learner, settings)
-        saver = Saver(
-            run if leads else None, check, learner, keep_every=keep_every, save_every=save_every,
-            saved=learner.iteration if resume else -1,
-        )  # fmt: skip
+        saved = learner.iteration if resume else -1
+        saver = Saver(run if leads else None, learner, keep_every=keep_every, save_every=save_every, saved=saved)
         callbacks: list[Callback] = []
         if leads:
             board = shown.enter_context(TensorBoard(run.folder, env)) if tensorboard else None

@@ -5,7 +5,7 @@ import csv
 import json
 import logging
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,8 @@ class Run:
     """Path of ``transfer.json``, the verdict of ``lw.transfer`` on the last policy."""
     task_folder: Path
     """Path of the folder ``task``: copies of the task's file, modules and model, unless they are in the package."""
+    check: Callable[[], None]
+    """Raises an error if another process has taken over the run's lock. ``lw.train`` sets it."""
 
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
@@ -76,6 +78,7 @@ class Run:
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
         self.replay, self.task_folder = folder / "replay", folder / _TASK
+        self.check = lambda: None
 
     @property
     def task_name(self) -> str:

@@ -5,25 +5,25 @@ parts with new steps, each to a new file. Old files are deleted after the checkp
 therefore always contain the checkpoint's steps.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.replay import Replay
 from lyceum_warp.runs.checkpoints import FORMAT, read_checkpoint, write_content
+from lyceum_warp.runs.folder import Run
 
 _PARTS = 64
 
 
-def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, check: Callable[[], None] | None) -> None:
+def write_replay(run: Run | None, replay: Replay, team: Team, since: int) -> None:
     """Write the parts of the replay buffer that have new steps. All ranks must call this function.
 
     Args:
-        folder: The folder of the files; None on ranks that do not write.
+        run: The run; None on ranks that do not write.
         replay: The replay buffer.
         team: The processes.
         since: Number of stored steps at the last save.
-        check: Checks the run's lock before each write; None if ``folder`` is None.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):
@@ -33,11 +33,11 @@ def write_replay(folder: Path | None, replay: Replay, team: Team, since: int, ch
             for name, part in replay.rows(first, end).items()
         }
         with team.together():
-            if folder is not None and check is not None:
-                check()
-                folder.mkdir(exist_ok=True)
+            if run is not None:
+                run.check()
+                run.replay.mkdir(exist_ok=True)
                 content = {"lyceum_warp": FORMAT, "first": first, "rows": rows}
-                write_content(folder / _name(start, end), content, durable=True)
+                write_content(run.replay / _name(start, end), content, durable=True)
 
 
 def clean_replay(folder: Path, replay: Replay) -> None:

@@ -2,21 +2,11 @@
 
 import math
 import time
-from collections.abc import Callable
 
 from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.replay_files import clean_replay, write_replay
-
-SAVE_SECONDS = 30.0
-"""Maximum seconds between saves, unless saves are slow (see ``LONG``)."""
-
-SHARE = 100
-"""Usual time between saves, as a multiple of the last save's duration."""
-
-LONG = 20
-"""Minimum time between saves, as a multiple of the last save's duration."""
 
 
 class Saver:
@@ -24,14 +14,13 @@ class Saver:
 
     Metrics, a new best policy, and a policy in a numbered file are written after each iteration. The last policy and
     the complete state are saved together. The time between two saves is 100 times the duration of the last save, but at
-    most 30 s. For example, saves of 20 ms happen every 2 s and take 1 % of the time. After ``kill -9``, the run resumes
-    from the last save.
+    most 30 s, and at least 20 times this duration. For example, saves of 20 ms happen every 2 s and take 1 % of the
+    time. After ``kill -9``, the run resumes from the last save.
 
     All ranks have a saver and make the same calls. Only rank 0 writes.
 
     Args:
         run: The run; None on ranks that do not write.
-        check: Checks the run's lock before every write; None if ``run`` is None.
         learner: The algorithm.
         keep_every: Iterations between two policies in numbered files; 0 saves none.
         save_every: Iterations between two saves; 0 to save by time.
@@ -43,7 +32,6 @@ class Saver:
     def __init__(
         self,
         run: Run | None,
-        check: Callable[[], None] | None,
         learner: Learner,
         *,
         keep_every: int = 0,
@@ -51,7 +39,7 @@ class Saver:
         saved: int = -1,
     ) -> None:
         self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
-        self.saved, self._check = saved, check
+        self.saved = saved
         best = None if run is None else run.best_score()
         self._best = -math.inf if best is None else best[1]
         self._before = policy_content(learner.iteration, learner.policy, learner.value)
@@ -64,8 +52,8 @@ class Saver:
         Returns:
             The iteration's return, or None.
         """
-        assert self.run is not None and self._check is not None
-        self._check()
+        assert self.run is not None
+        self.run.check()
         self.run.append(iteration.row())
         learner, name = self.learner, self.learner.best_by
         score = getattr(iteration, name)
@@ -91,7 +79,7 @@ class Saver:
         """Check whether it is time to save."""
         if self.save_every:
             return self.learner.iteration % self.save_every == 0
-        wait = max(min(SAVE_SECONDS, SHARE * self._seconds), LONG * self._seconds)
+        wait = max(min(30.0, 100 * self._seconds), 20 * self._seconds)
         return time.perf_counter() - self._when >= wait
 
     def save(self) -> None:
@@ -100,10 +88,10 @@ class Saver:
         learner, run, replay = self.learner, self.run, self.learner.replay
         state = learner.state_dict()  # on all ranks, because it gathers their worlds
         if replay is not None:
-            write_replay(None if run is None else run.replay, replay, learner.team, self._stored, self._check)
+            write_replay(run, replay, learner.team, self._stored)
         with learner.team.together():
-            if run is not None and self._check is not None:
-                self._check()
+            if run is not None:
+                run.check()
                 run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
                 if replay is not None:
                     clean_replay(run.replay, replay)
