@@ -141,12 +141,10 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Parse a task's parameters from the values of a repeated flag.
+    """Parse a task's parameters from the values of a repeated flag, each NAME=VALUE.
 
-    Args:
-        texts: The strings, each NAME=VALUE.
-        command: The command's arguments. If NAME is an option instead of a parameter, the error names its flag.
-        instead: Flags with another name than the option, by option name.
+    If NAME is an option instead, the error names the command's flag. ``instead`` lists flags with another name than the
+    option.
     """
     found: dict[str, Any] = {}
     for text in texts:

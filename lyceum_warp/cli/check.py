@@ -1,7 +1,6 @@
 """Check that a task follows the rules of an environment: lyceum-warp check."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Annotated
 
 import tyro
@@ -9,7 +8,7 @@ import tyro
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
 from lyceum_warp.cli.display import say
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.testing import CHECKS, Context, check_task
+from lyceum_warp.testing import CHECKS, check_task
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,7 +42,12 @@ class Check:
 
     def run(self) -> int:
         words = vars(self.env) | given(self.physics) | parameters(self.param, self)
-        checks = [_check(name) for name in self.rule] or CHECKS
+        known = {check.__name__.removeprefix("check_"): check for check in CHECKS}
+        for rule in self.rule:
+            if rule not in known:
+                hint = did_you_mean(rule, known, f"there are {', '.join(known)}")
+                raise ValueError(f"there is no rule {rule!r}: {hint}")
+        checks = [known[rule] for rule in self.rule] or CHECKS
         try:
             report = check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **words)
         except AssertionError as error:
@@ -51,11 +55,3 @@ class Check:
             return 1
         say(str(report))
         return 0
-
-
-def _check(rule: str) -> Callable[[Context], None]:
-    checks = {check.__name__.removeprefix("check_"): check for check in CHECKS}
-    if rule not in checks:
-        hint = did_you_mean(rule, checks, f"there are {', '.join(checks)}")
-        raise ValueError(f"there is no rule {rule!r}: {hint}")
-    return checks[rule]

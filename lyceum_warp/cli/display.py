@@ -125,12 +125,10 @@ _COLUMNS = [
 
 
 def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
-    """Make a table that fits the console's width: wrap text in the first column and, if necessary, omit columns.
+    """Make a table of columns by heading that fits the console's width.
 
-    Args:
-        console: The output.
-        columns: The cells of each column, by its heading. All columns but the first contain numbers.
-        omit: Headings of the columns that may be omitted, in this order.
+    The first column's text wraps; all others contain numbers. If necessary, columns in ``omit`` are left out, in this
+    order.
     """
     table = Table()
     for count in range(len(omit) + 1):

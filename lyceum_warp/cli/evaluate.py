@@ -165,13 +165,8 @@ def run_worlds(
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
-    Args:
-        run: The run.
-        words: Options that replace the run's. With the engine auto and no device, the worlds run on the CPU.
-        params: Parameters that replace the run's.
-        nworld: Number of worlds.
-        task: Another task to use instead, with its own default options and parameters.
-        trust: Whether to execute the run's task even if the run was not made by this user on this machine.
+    With another task, the defaults are the task's. With the engine auto and no device, the worlds run on the CPU. For
+    ``trust``, see ``run_env``.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)

@@ -16,10 +16,7 @@ _CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:
     """Parse the options of a command, and return an instance of its class.
 
-    Args:
-        command: The command's class. --help describes only the options in its attribute ``USUAL``, if it has one.
-        prog: The command's name, for messages.
-        words: The arguments.
+    --help describes only the options in the class's attribute ``USUAL``, if it has one.
     """
     if {"-h", "--help"} & set(words):
         _print_help(command, prog)

@@ -36,12 +36,7 @@ _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
 def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
     """Generate the text of a task file, in ruff's format.
 
-    Args:
-        file: The name of the file.
-        class_name: The name of the task's class.
-        source: The model as a Python expression, such as ``"robot.xml"`` with its quotes.
-        title: The description of the model in the docstring.
-        model: The compiled model.
+    ``source`` is the model as a Python expression, such as ``"robot.xml"`` with its quotes.
     """
     fields, parts, put = _observation(model)
     sizes = ", ".join(f'"{name}": {size}' for name, size in parts.items())

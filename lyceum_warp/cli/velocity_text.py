@@ -156,7 +156,7 @@ class Walker:
 
 
 def velocity_text(file: str, class_name: str, source: str, title: str, walker: Walker) -> str:
-    """Generate the text of a robot's task file; see ``task_text`` for the other arguments."""
+    """Generate the text of a robot's task file, as ``task_text`` does."""
     biped = len(walker.feet) == 2
     model, new = walker.model, [foot for foot in walker.feet if foot.element]
     fastest = round(0.4 * float(np.sqrt(9.81 * walker.height)), 1)

@@ -109,14 +109,10 @@ class Configuration:
         task: str | None = None,
         trust: bool = False,
     ) -> Learner:
-        """Make the learner.
+        """Make the learner of one of the processes.
 
-        Args:
-            team: The processes that train together.
-            run: The run that provides the task. A file that has moved or changed is replaced by the run's copy.
-            networks: The initial policy and value function; None for new networks.
-            task: Another task to use instead.
-            trust: Whether to execute the task even if the run was not made by this user on this machine.
+        The run, if there is one, provides the task, unless another task is given. New networks are made if none are
+        given. For ``trust``, see ``run_env``.
         """
         try:
             if self.threads < 1:
@@ -146,11 +142,8 @@ class Configuration:
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
     """Load a learner's initial policy and value function from a run, and the iteration at which they were saved.
 
-    Args:
-        run: The run.
-        which: Policy of the run, or None to resume the run. A resumed learner makes its networks from the
-            hyperparameters, so None is returned for them. The exceptions are networks with a ``limit``, and runs that
-            started from another run.
+    If ``which`` is None, the run is resumed. A resumed learner makes its networks from the hyperparameters, so None is
+    returned for them. The exceptions are networks with a ``limit``, and runs that started from another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

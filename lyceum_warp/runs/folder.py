@@ -43,16 +43,11 @@ log = logging.getLogger(__name__)
 
 @document_attributes
 class Run:
-    """The folder of a training run.
-
-    Args:
-        folder: The folder.
-        config: The content of ``config.json``.
-    """
+    """The folder of a training run."""
 
     config: dict[str, Any]
-    """The task, its parameters, the engine, its physics, the seed and all hyperparameters; the versions of the packages
-    and of Python, the machine, the commit."""
+    """The content of ``config.json``: the task, its parameters, the engine, its physics, the seed and all
+    hyperparameters; the versions of the packages and of Python, the machine, the commit."""
     metrics: Path
     """Path of ``metrics.csv``, with one row per iteration."""
     policy: Path

@@ -17,17 +17,12 @@ class Saver:
     most 30 s, and at least 20 times this duration. For example, saves of 20 ms happen every 2 s and take 1 % of the
     time. After ``kill -9``, the run resumes from the last save.
 
-    All ranks have a saver and make the same calls. Only rank 0 writes.
-
-    Args:
-        run: The run; None on ranks that do not write.
-        learner: The algorithm.
-        keep_every: Iterations between two policies in numbered files; 0 saves none.
-        save_every: Iterations between two saves; 0 to save by time.
-        saved: Number of the last saved iteration; -1 before the first save.
+    All ranks have a saver and make the same calls. Ranks without a run do not write. ``lw.train`` describes
+    ``keep_every`` and ``save_every``.
     """
 
     saved: int
+    """Number of the last saved iteration; -1 before the first save."""
 
     def __init__(
         self,

@@ -111,17 +111,11 @@ def run_env(
     task: str | None = None,
     trust: bool = False,
 ) -> Env:
-    """Make an environment for a run's task.
+    """Make an environment for a run's task, or for another given task.
 
     A file or a model that has moved or changed since the run started is replaced by the run's copy, with a warning in
-    the log. Tasks of the package are used in their current version.
-
-    Args:
-        run: The run.
-        options: Options of the environment.
-        params: Parameters of the task.
-        task: Another task to use instead.
-        trust: Whether to execute the task and read the files even if this user did not make the run on this machine.
+    the log. Tasks of the package are used in their current version. With ``trust``, the task is executed and files are
+    read even if this user did not make the run on this machine.
 
     Raises:
         ValueError: The task does not fit the run, or the run is not trusted.
@@ -185,13 +179,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
-    """Log how an environment's task and model differ from the run's.
-
-    Args:
-        run: The run.
-        env: The environment.
-        model: Whether to compare the compiled models, which also depend on the physics options.
-    """
+    """Log how an environment's task differs from the run's, and its compiled model, which depends on the physics."""
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
     # a task's file may also be the training script, and then a change may be unrelated to the task

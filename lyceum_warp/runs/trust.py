@@ -24,14 +24,9 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
-    """Check that this user made a run on this machine or trusts it.
+    """Check that this user made a run on this machine or trusts it. With ``trust``, record that the user trusts it.
 
-    Args:
-        folder: The run's folder.
-        config: Content of the run's config.json.
-        named: The file to name in the error message.
-        runs: Whether the command executes the run's task, or only reads files.
-        trust: Whether to trust and record the run.
+    The error names the file that the command would execute (``runs``) or read.
     """
     if os.path.exists(_record(folder, config)):
         return

@@ -29,11 +29,7 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
 
 
 class RowFile:
-    """Stores one row of results per setting in a file.
-
-    Args:
-        identity: Only rows with this identity are used; see ``identity``.
-    """
+    """Stores one row of results per setting in a file, and uses only rows with the given identity."""
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path, self.identity = path, json.loads(json.dumps(identity))
