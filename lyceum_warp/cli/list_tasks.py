@@ -90,7 +90,7 @@ def _entry(name: str) -> _Entry:
         task = entry.task = find_task(name)
         text = vars(task).get("__doc__") or inspect.getdoc(sys.modules[task.__module__]) or ""
         about = text.partition("\n")[0]
-        entry.about = (about.partition(": ")[2] or about).rstrip(".")
+        entry.about = (about.partition(": ")[2] or about).rstrip(".") or _UNKNOWN
         entry.about += f" (physics: {', '.join(task.physics)})" * bool(task.physics)
         entry.source = _source(task)
     except Exception as error:  # importing a broken task file may raise any error

@@ -112,11 +112,14 @@ def test_a_task_with_a_missing_extra_is_listed_without_its_sizes(
 def test_broken_task_is_listed_with_its_error(
     broken: object, shown: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(find_task("hopper"), "obs", broken)
+    task = find_task("hopper")
+    monkeypatch.setattr(task, "obs", broken)
+    monkeypatch.setattr(task, "__doc__", None)
+    monkeypatch.setattr(sys.modules[task.__module__], "__doc__", None)
     assert cli.main(["tasks", "hop"]) == 0
     out, error = capsys.readouterr()
     assert error == "" and rows(out)["hopper"][0] == "-"
-    assert shown in out
+    assert shown in out and "\n    - (physics: fast)\n" in out
 
 
 @pytest.mark.long
