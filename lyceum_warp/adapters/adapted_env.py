@@ -1,6 +1,6 @@
-"""Make the environment, the seeds and the renderer that an adapter uses."""
+"""Make or check the environment that an adapter uses, and split values by world."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -8,10 +8,6 @@ import torch
 from lyceum_warp.env import Env, make
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
-from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.pictures import WorldPictures
-
-_SEEDS = 2**31
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
 """Options of ``lw.make`` that are arguments of adapters, under another name."""
@@ -33,30 +29,6 @@ def environment_of(
     if task.autoreset is not autoreset:
         raise ValueError(f"the environment has autoreset={task.autoreset}: make it with autoreset={autoreset}")
     return task
-
-
-def pictures_of(
-    env: Env, render_mode: str | None, camera: CameraChoice, size: tuple[int, int]
-) -> tuple[WorldPictures, dict[str, Any]]:
-    """Make an environment's renderer, and the ``metadata`` for Gymnasium and Stable-Baselines3."""
-    if render_mode not in (None, "rgb_array"):
-        raise ValueError(f"there is no render_mode {render_mode!r}: use 'rgb_array', or None for no pictures")
-    metadata = {"render_modes": ["rgb_array"], "render_fps": max(1, round(1 / env.timestep))}
-    return WorldPictures(env, camera=camera, size=size), metadata
-
-
-class ResetSeeds:
-    """Chooses the seed of each reset. The first one is random unless the user gave a seed."""
-
-    def __init__(self, *, seeded: bool) -> None:
-        self._seeded = seeded
-
-    def __call__(self, given: Any, drawn: Callable[[], Any]) -> int | None:
-        """Return the seed of a reset, or None to continue the random streams."""
-        if given is None and self._seeded:
-            return None
-        self._seeded = True
-        return whole_number("seed", drawn() if given is None else given, low=0, high=2**128) % _SEEDS
 
 
 def per_world(value: Any, nworld: int) -> list[Any]:

@@ -3,10 +3,8 @@
 from typing import Any
 
 import numpy as np
-import torch
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of
-from lyceum_warp.adapters.step_results import HostArrays, Observations
+from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
 
@@ -34,19 +32,16 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
     """
 
     def __init__(self, task: str | type[Task] | Env, *, flat_observation: bool = False, **words: Any) -> None:
-        self.env = environment_of(task, 1, words, autoreset=False)
+        self._world = GymnasiumEnv(task, dict_obs=False, **words)
+        self.env = self._world.env
         self._parts = {"observations": slice(None)} if flat_observation else self.env.obs_space.parts
-        self._observations = Observations(self.env, dict_obs=False)
-        self._host = HostArrays(self.env, one_world=True)
-        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
         self._ended = True
 
     def reset(self) -> dm_env.TimeStep:
         """Start a new random episode. Reward and discount of its first time step are None."""
-        self.env.rand_reset(self._seeds(None, lambda: np.random.SeedSequence().entropy))
+        obs, _ = self._world.reset()
         self._ended = False
-        (obs,) = self._host.of(self.env.obs)
-        return dm_env.restart(self._split(obs[0]))
+        return dm_env.restart(self._split(obs))
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         """Advance the world by one step, or start the next episode.
@@ -59,17 +54,13 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         """
         if self._ended:
             return self.reset()
-        self._host.set_action(action)
-        env = self.env
-        env.step()
-        buffers: list[torch.Tensor] = [*self._observations.current, env.reward, env.terminated, env.truncated]
-        obs, reward, terminated, truncated = (array[0] for array in self._host.of(*buffers))
-        self._ended = bool(terminated or truncated)
+        obs, reward, terminated, truncated, _ = self._world.step(action)
+        self._ended = terminated or truncated
         if terminated:
-            return dm_env.termination(float(reward), self._split(obs))
+            return dm_env.termination(reward, self._split(obs))
         if truncated:
-            return dm_env.truncation(float(reward), self._split(obs))
-        return dm_env.transition(float(reward), self._split(obs))
+            return dm_env.truncation(reward, self._split(obs))
+        return dm_env.transition(reward, self._split(obs))
 
     def observation_spec(self) -> dict[str, specs.Array]:
         """Describe the parts of an observation by their shapes."""

@@ -1,20 +1,23 @@
 """Adapt many worlds to Gymnasium's VectorEnv."""
 
+from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
-from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
-from lyceum_warp.adapters.step_results import HostArrays, Observations, StepResults
+from lyceum_warp.adapters.adapted_env import environment_of, per_world
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import check_tensor, described
+from lyceum_warp.spaces import Space
+from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.validate import check_tensor, described, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.viz.cameras import CameraChoice
-
-AutoresetMode = gymnasium.vector.AutoresetMode
+from lyceum_warp.viz.pictures import WorldPictures
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -65,7 +68,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         task: str | type[Task] | Env,
         num_envs: int | None = None,
         *,
-        autoreset_mode: gymnasium.vector.AutoresetMode | str | None = None,
+        autoreset_mode: AutoresetMode | str | None = None,
         torch: bool = False,
         copy: bool = True,
         dict_obs: bool | None = None,
@@ -83,24 +86,29 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         except ValueError:
             known = ", ".join(mode.value for mode in AutoresetMode)
             raise ValueError(f"there is no autoreset_mode {autoreset_mode!r}: use one of {known}") from None
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"there is no render_mode {render_mode!r}: use 'rgb_array', or None for no pictures")
         if max_episode_steps is not None:
             words["horizon"] = max_episode_steps
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self.env = environment_of(task, num_envs, words, autoreset=same_step)
-        self.num_envs = self.env.nworld
+        self.env = env = environment_of(task, num_envs, words, autoreset=same_step)
+        self.num_envs = env.nworld
         self.render_mode = render_mode
-        self._pictures, metadata = pictures_of(self.env, render_mode, camera, render_size)
-        self.metadata = metadata | {"autoreset_mode": self.autoreset_mode}
-        self._observations = Observations(self.env, dict_obs=dict_obs)
-        self.single_observation_space = observation_space(self.env, dict_obs=self._observations.dict_obs)
-        self.single_action_space = box(self.env.action_space)
-        self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, self.num_envs)
-        self._host = None if torch else HostArrays(self.env, copy=copy)
-        self._copy = copy
-        self._results = StepResults(self.env, self._observations, self._given)
-        self._seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
-        self._ended = self.env.done.clone()
+        self.metadata = {
+            "render_modes": ["rgb_array"], "render_fps": max(1, round(1 / env.timestep)),
+            "autoreset_mode": self.autoreset_mode,
+        }  # fmt: skip
+        self._pictures = WorldPictures(env, camera=camera, size=render_size)
+        self._dict_obs = len(env.obs_groups) > 1 if dict_obs is None else dict_obs
+        groups: dict[str, gymnasium.Space[Any]] = {name: _box(space) for name, space in env.obs_spaces.items()}
+        self.single_observation_space = gymnasium.spaces.Dict(groups) if self._dict_obs else groups["policy"]
+        self.single_action_space = _box(env.action_space)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._torch, self._copy = torch, copy
+        self._staged = _staging(env.action)
+        self._seeded = isinstance(task, Env) or "seed" in words
+        self._ended = env.done.clone()
         self._reset_once = False
 
     @property
@@ -122,8 +130,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             ResetNeeded: A partial reset came before the first full reset.
             ValueError: The seed is not a whole number, or an option is unknown or has the wrong shape or type.
         """
-        mask = self._mask(options)
-        own_seed = self._seeds(seed, lambda: self.np_random_seed)
+        mask, own_seed = self._mask(options), None
+        if seed is not None or not self._seeded:
+            drawn = self.np_random_seed if seed is None else seed
+            own_seed = whole_number("seed", drawn, low=0, high=2**128) % 2**31
+        self._seeded = True
         super().reset(seed=seed)
         self.env.rand_reset(own_seed, mask)
         self._ended.copy_(self.env.done)
@@ -144,10 +155,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if not self._reset_once:
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
         env = self.env
-        if self._host is None:
+        if self._torch:
             env.action.copy_(_tensor(actions, env.action).detach())
         else:
-            self._host.set_action(actions)
+            check_array(actions, env.action.shape)
+            np.copyto(self._staged.numpy(), actions, casting="same_kind")
+            if self._staged is not env.action:
+                env.action.copy_(self._staged, non_blocking=True)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.action.masked_fill_(self._ended[:, None], 0.0)  # a NaN in an ignored action is not a fault
         env.step()
@@ -187,30 +201,54 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if hasattr(self, "_pictures"):  # Gymnasium also closes an environment whose constructor failed
             self._pictures.close()
 
-    def _given(self, *buffers: torch.Tensor) -> list[Any]:
-        if self._host is not None:
-            return list(self._host.of(*buffers))
-        return [buffer.clone() for buffer in buffers] if self._copy else list(buffers)
+    def _results(self) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Return observations, rewards, terminations, truncations and infos, in one transfer from the device."""
+        env = self.env
+        groups, infos = dict(env.obs_groups), {"eval": env.eval, "done_reason": env.done_reason}
+        if not env.autoreset:
+            # a fault always resets a world, whose row is then already the first of the next episode
+            done = env.done[:, None]
+            groups = {name: torch.where(done, env.final_obs_groups[name], obs) for name, obs in groups.items()}
+        if env.task.functions["success"] is not None:
+            infos["success"] = env.success
+        tables = {}
+        if env.metrics:
+            tables = {"metrics": torch_view(env.worlds.metrics), "episode_metrics": env.episode_metric_sums}
+        found = self._given({
+            "obs": self._shown(groups), "reward": env.reward, "terminated": env.terminated,
+            "truncated": env.truncated, "infos": infos, "tables": tables,
+        })  # fmt: skip
+        for name, table in found.pop("tables").items():
+            found["infos"][name] = dict(zip(env.metrics, table.T, strict=True))
+        return tuple(found.values())
+
+    def _shown(self, groups: Any) -> Any:
+        return dict(groups) if self._dict_obs else groups["policy"]
+
+    def _given(self, buffers: Any) -> Any:
+        """Convert buffers in nested dicts to arrays or tensors for the caller."""
+        if self._torch:
+            return _mapped(buffers, lambda buffer: buffer.clone() if self._copy else buffer)
+        if not self.env.action.is_cuda:
+            return _mapped(buffers, lambda buffer: buffer.numpy().copy() if self._copy else buffer.numpy())
+        copies = _mapped(buffers, lambda buffer: buffer.to("cpu", non_blocking=True))
+        torch.cuda.current_stream(self.device).synchronize()
+        return _mapped(copies, torch.Tensor.numpy)
 
     def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
-        final_info = dict(infos)
-        if self._host is None:
-            final_obs = self._observations.formed(self._given(*self._observations.final))
+        final_info, last = dict(infos), self._shown(self.env.final_obs_groups)
+        if self._torch:
+            final_obs = self._given(last)
         elif ended.any():
-            final_obs = self._rows_of_ended(ended)
+            (worlds,) = ended.nonzero()
+            index = torch.from_numpy(worlds).to(self.device)
+            rows = self._given(_mapped(last, itemgetter(index)))
+            final_obs = np.full(self.num_envs, None, dtype=object)
+            for i, world in enumerate(worlds):
+                final_obs[world] = _mapped(rows, itemgetter(i))
         else:
             return
         infos |= {"final_obs": final_obs, "_final_obs": ended, "final_info": final_info, "_final_info": ended}
-
-    def _rows_of_ended(self, ended: np.ndarray) -> np.ndarray:
-        """Return the final observation of each ended world, and None for each other world."""
-        (worlds,) = ended.nonzero()
-        index = torch.from_numpy(worlds).to(self.device)
-        values = self._given(*(final[index] for final in self._observations.final))
-        rows = np.full(self.num_envs, None, dtype=object)
-        for world, row in zip(worlds, self._observations.rows(values), strict=True):
-            rows[world] = row
-        return rows
 
     def _mask(self, options: dict[str, Any] | None) -> torch.Tensor | None:
         if unknown := [name for name in options or {} if name != "reset_mask"]:
@@ -226,8 +264,34 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return mask
 
 
+def check_array(actions: Any, shape: tuple[int, ...]) -> None:
+    """Check that actions are an array of real numbers of a shape."""
+    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind != "f":
+        array = isinstance(actions, np.ndarray)
+        given = f"a {actions.dtype} array of shape {actions.shape}" if array else described(actions)
+        raise ValueError(f"actions must be a float32 array of shape {tuple(shape)}, not {given}")
+
+
 def _tensor(actions: Any, like: torch.Tensor) -> torch.Tensor:
     if not isinstance(actions, torch.Tensor):
         raise ValueError(f"actions must be {described(like)}, not {described(actions)}, because of torch=True")
     check_tensor(actions, "actions", like)
     return actions
+
+
+def _staging(action: torch.Tensor) -> torch.Tensor:
+    """Return pinned memory for actions on a GPU, or the buffer itself on the CPU."""
+    return torch.empty(action.shape, pin_memory=True) if action.is_cuda else action
+
+
+def _box(space: Space) -> gymnasium.spaces.Box:
+    """Make a Box for one world's vector. The bounds are infinite if the space has none."""
+    low, high = (-np.inf if space.low is None else space.low), (np.inf if space.high is None else space.high)
+    return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.float32)
+
+
+def _mapped(values: Any, function: Callable[[Any], Any]) -> Any:
+    """Apply a function to the values in nested dicts."""
+    if isinstance(values, dict):
+        return {name: _mapped(value, function) for name, value in values.items()}
+    return function(values)

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
+from gymnasium.vector import AutoresetMode
 
-from lyceum_warp.adapters.adapted_env import ResetSeeds, environment_of, per_world, pictures_of
-from lyceum_warp.adapters.gymnasium_spaces import box, observation_space
-from lyceum_warp.adapters.step_results import HostArrays, Infos, Observations
+from lyceum_warp.adapters.adapted_env import per_world
+from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
 from lyceum_warp.env import Env
 from lyceum_warp.task import Task
-from lyceum_warp.viz.cameras import CameraChoice
 
 try:
     from stable_baselines3.common.monitor import Monitor
@@ -37,38 +35,25 @@ class StableBaselines3VecEnv(VecEnv):
         task: A task, as in ``lw.make``, or an ``Env``.
         num_envs: Number of worlds; by default one, or the number in the given environment.
         dict_obs: Whether observations are dicts of all observation groups.
-        render_mode: "rgb_array" for pictures, or None.
-        camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
-        render_size: Width and height of pictures in pixels, even numbers.
-        **words: Options and parameters for ``lw.make``.
+        **options: ``render_mode``, ``camera`` and ``render_size``, as in ``GymnasiumVectorEnv``, and options and
+            parameters for ``lw.make``.
 
     Raises:
         FileNotFoundError: The package with the task's model is not installed.
     """
 
     def __init__(
-        self,
-        task: str | type[Task] | Env,
-        num_envs: int | None = None,
-        *,
-        dict_obs: bool = False,
-        render_mode: str | None = None,
-        camera: CameraChoice = None,
-        render_size: tuple[int, int] = (480, 480),
-        **words: Any,
+        self, task: str | type[Task] | Env, num_envs: int | None = None, *, dict_obs: bool = False, **options: Any
     ) -> None:
-        self.render_mode = render_mode  # VecEnv's constructor reads render_mode
-        self.env = env = environment_of(task, num_envs, words, autoreset=True)
-        self._pictures, metadata = pictures_of(env, render_mode, camera, render_size)
-        self._observations = Observations(env, dict_obs=dict_obs)
-        self._host, self._infos = HostArrays(env), Infos(env)
-        super().__init__(env.nworld, observation_space(env, dict_obs=dict_obs), box(env.action_space))
-        self.metadata: dict[str, Any] = {**self.metadata, **metadata}
-        self._own_seeds = ResetSeeds(seeded=isinstance(task, Env) or "seed" in words)
-        self._returns, self._lengths = np.zeros(env.nworld), np.zeros(env.nworld, dtype=int)
-        self._no_infos: list[dict[str, Any]] = [{} for _ in range(env.nworld)]
+        self._worlds = worlds = GymnasiumVectorEnv(
+            task, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, dict_obs=dict_obs, **options
+        )
+        self.env, self.render_mode = worlds.env, worlds.render_mode  # VecEnv's constructor reads render_mode
+        super().__init__(worlds.num_envs, worlds.single_observation_space, worlds.single_action_space)
+        self.metadata: dict[str, Any] = {**self.metadata, **worlds.metadata}
+        self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
+        self._no_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._start = time.time()
-        self._reset_once = False
 
     def reset(self) -> Any:
         """Start new random episodes in all worlds, and return the first observations.
@@ -78,39 +63,42 @@ class StableBaselines3VecEnv(VecEnv):
         """
         if options := next(filter(None, self._options), None):
             raise ValueError(f"reset has no option {next(iter(options))!r}: do not call set_options")
-        seed = self._own_seeds(self._seeds[0], lambda: int(np.random.randint(2**31 - 1)))
-        self.env.rand_reset(seed)
+        obs, _ = self._worlds.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._returns[:], self._lengths[:] = 0.0, 0
-        self._reset_once = True
-        return self._observations.formed(list(self._host.of(*self._observations.current)))
+        return obs
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Set the actions of the next step, (num_envs, nact), float32.
-
-        Raises:
-            RuntimeError: ``reset`` was not called yet.
-            ValueError: The actions have the wrong shape or type.
-        """
-        if not self._reset_once:
-            raise RuntimeError("there was no reset before this step: call reset() first")
-        self._host.set_action(actions)
+        """Set the actions of the next step, (num_envs, nact), float32."""
+        self._actions = actions
 
     def step_wait(self) -> Any:
-        """Advance every world by one step."""
-        env, count = self.env, self._observations.count
-        env.step()
-        *values, reward, done = self._host.of(*self._observations.current, env.reward, env.done)
-        self._returns += reward
+        """Advance every world by one step.
+
+        Raises:
+            ResetNeeded: ``reset`` was not called yet.
+            ValueError: The actions have the wrong shape or type.
+        """
+        obs, rewards, terminations, truncations, infos = self._worlds.step(self._actions)
+        self._returns += rewards
         self._lengths += 1
-        infos = self._no_infos.copy()
+        done, listed = terminations | truncations, self._no_infos.copy()
         if done.any():
-            self._add_ends(infos, done.nonzero()[0])
-        return self._observations.formed(values[:count]), reward, done, infos
+            final, seconds = infos["final_info"], round(time.time() - self._start, 6)
+            final.pop("metrics", None)
+            for world in done.nonzero()[0].tolist():
+                listed[world] = {
+                    "terminal_observation": infos["final_obs"][world],
+                    "TimeLimit.truncated": not terminations[world],
+                    "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
+                    **_of_world(final, world),
+                }
+            self._returns[done], self._lengths[done] = 0.0, 0
+        return obs, rewards, done, listed
 
     def close(self) -> None:
         """End the rendering subprocess."""
-        self._pictures.close()
+        self._worlds.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Render a picture of each world, (height, width, 3) uint8. Return a list of None if ``render_mode`` is None.
@@ -118,7 +106,7 @@ class StableBaselines3VecEnv(VecEnv):
         Raises:
             NoVideoError: This machine cannot render.
         """
-        return [None] * self.num_envs if self.render_mode is None else self._pictures()
+        return self._worlds.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Read a parameter of the task, or an attribute of the ``Env`` or of this adapter, for each world.
@@ -156,24 +144,6 @@ class StableBaselines3VecEnv(VecEnv):
     def _chosen(self, value: Any, indices: Any) -> list[Any]:
         rows = per_world(value, self.num_envs)
         return [rows[i] for i in self._get_indices(indices)]
-
-    def _add_ends(self, infos: list[dict[str, Any]], worlds: np.ndarray) -> None:
-        env, count = self.env, self._observations.count
-        index = torch.from_numpy(worlds).to(env.obs.device)
-        buffers = [*self._observations.final, env.terminated, *self._infos.tensors]
-        values = self._host.of(*(buffer[index] for buffer in buffers))
-        rows, terminations = self._observations.rows(values[:count]), values[count]
-        said = self._infos.named(values[count + 1 :])
-        said.pop("metrics", None)
-        seconds = round(time.time() - self._start, 6)
-        for i, world in enumerate(worlds.tolist()):
-            infos[world] = {
-                "terminal_observation": rows[i],
-                "TimeLimit.truncated": not terminations[i],
-                "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
-                **_of_world(said, i),
-            }
-        self._returns[worlds], self._lengths[worlds] = 0.0, 0
 
 
 def _of_world(infos: dict[str, Any], i: int) -> dict[str, Any]:
