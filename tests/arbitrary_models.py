@@ -41,7 +41,7 @@ def actuated(*actuators: str) -> str:
 
 SDF = '<flag/></option><option sdf_iterations="2" sdf_initpoints="8">'
 
-MOVING = {
+MODELS = {
     "free and ball joints": text(
         BALL.format(z=0.1)
         + '<body pos="1 0 1"><joint name="ball" type="ball" damping=".1"/><geom size=".1" pos="0 0 -.3"/></body>',
@@ -103,9 +103,6 @@ MOVING = {
         SDF,
     ),
     "sleep": text(BALL.format(z=0.1) + ARM, option='<flag sleep="enable"/>'),
-}
-
-SENSING = {
     "position sensors": text(
         ARM + '<body pos="1 0 .5"><joint name="lift" type="slide" axis="0 0 1" range="-.01 .5" limited="true"/>'
         '<geom size=".1"/></body>',
@@ -132,7 +129,6 @@ SENSING = {
         MOTOR + '<sensor><jointpos joint="hinge" nsample="4" delay=".012"/><jointvel joint="hinge" nsample="4" '
         'interval=".02"/><accelerometer site="end" nsample="4" interval=".015" delay=".01"/></sensor>',
     ),
-    "no sensors": text(ARM),
 }
 
 PLUGINS = {

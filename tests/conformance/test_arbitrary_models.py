@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from arbitrary_models import ARM, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
+from arbitrary_models import ARM, MODEL_CHECKS, MODELS, PLUGINS, actuated, text
 
 import lyceum_warp as lw
 from lyceum_warp import Row
@@ -24,21 +24,19 @@ OPTIONS: dict[str, dict[str, Any]] = {
 class World:
     qpos: Row[float]
     qvel: Row[float]
+    sensordata: Row[float]
 
 
 @wp.struct
 class Params:
-    dt: float
     noise: float = 0.05
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    nq = s.qpos.shape[0]
-    for i in range(nq):
-        obs[i] = s.qpos[i]
-    for i in range(s.qvel.shape[0]):
-        obs[nq + i] = s.qvel[i]
+    k = lw.put(obs, 0, s.qpos)
+    k = lw.put(obs, k, s.qvel)
+    lw.put(obs, k, s.sensordata)
 
 
 @wp.func
@@ -52,64 +50,25 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
         s.qvel[i] = lw.uniform(rng, -p.noise, p.noise)
 
 
-class Moving(lw.Task):
+class Made(lw.Task):
     horizon = 15
 
 
-@wp.struct
-class SensingWorld:
-    qpos: Row[float]
-    qvel: Row[float]
-    sensordata: Row[float]
-
-
-@wp.func
-def sense(s: SensingWorld, p: Params, obs: Row[float]):
-    obs[0] = s.qvel[0]
-    for i in range(s.sensordata.shape[0]):
-        obs[1 + i] = s.sensordata[i]
-
-
-@wp.func
-def judge(s0: SensingWorld, action: Row[float], s1: SensingWorld, p: Params) -> float:
-    return s1.qvel[0]
-
-
-@wp.func
-def start_sensing(s: SensingWorld, p: Params, rng: Row[wp.uint32]):
-    for i in range(s.qvel.shape[0]):
-        s.qvel[i] = lw.uniform(rng, -p.noise, p.noise)
-
-
-class Sensing(lw.Task):
-    horizon = 15
-
-
-def moving(model: str) -> type[lw.Task]:
+def task_with(model: str) -> type[lw.Task]:
     spec = mujoco.MjSpec.from_string(model)
-    compiled = spec.copy().compile()
-    return type("Moving", (Moving,), {"model": spec, "obs": {"position": compiled.nq, "velocity": compiled.nv}})
+    made = spec.copy().compile()
+    obs = {"position": made.nq, "velocity": made.nv, "sensors": made.nsensordata}
+    return type("Made", (Made,), {"model": spec, "obs": obs})
 
 
-def sensing(model: str) -> type[lw.Task]:
-    spec = mujoco.MjSpec.from_string(model)
-    obs = {"velocity": 1, "sensors": spec.copy().compile().nsensordata}
-    own = {"World": SensingWorld, "observe": sense, "reward": judge, "randomize": start_sensing}
-    return type("Sensing", (Sensing,), {"model": spec, "obs": obs, **own})
-
-
-@pytest.mark.quick("flex-warp", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco")
+@pytest.mark.quick(
+    "flex-warp", "sleep-mujoco", "mocap-warp", "keyframes-mujoco", "delays-warp", "equalities-mujoco",
+    "delayed sensors-warp", "welds and sensors-mujoco",
+)  # fmt: skip
 @pytest.mark.parametrize("engine", OPTIONS)
-@pytest.mark.parametrize("model", MOVING.values(), ids=MOVING)
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_task_with_an_arbitrary_model_passes_check_task(model: str, engine: str) -> None:
-    check_task(moving(model), engine=engine, **OPTIONS[engine])
-
-
-@pytest.mark.quick("delayed sensors-warp", "welds and sensors-mujoco")
-@pytest.mark.parametrize("engine", OPTIONS)
-@pytest.mark.parametrize("model", SENSING.values(), ids=SENSING)
-def test_task_with_sensors_passes_check_task(model: str, engine: str) -> None:
-    check_task(sensing(model), engine=engine, **OPTIONS[engine])
+    check_task(task_with(model), engine=engine, **OPTIONS[engine])
 
 
 # these models use features that MuJoCo Warp lacks, such as plugins
@@ -118,12 +77,12 @@ def test_task_with_sensors_passes_check_task(model: str, engine: str) -> None:
 @pytest.mark.quick("Actuator plugins not supported")
 @pytest.mark.parametrize("model", PLUGINS.values(), ids=PLUGINS)
 def test_task_that_only_the_mujoco_engine_supports_passes_check_task(model: str) -> None:
-    check_task(moving(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
+    check_task(task_with(model), engine="mujoco", nworld=2, steps=20, frame_skip=2, checks=MODEL_CHECKS)
 
 
 @pytest.mark.parametrize(("reason", "model"), PLUGINS.items())
 def test_model_that_the_warp_engine_does_not_support_raises_a_one_line_error(reason: str, model: str) -> None:
-    task = moving(model)
+    task = task_with(model)
     with pytest.raises(ValueError, match=f"MuJoCo Warp refuses the model: .*{reason}.*; .* use engine='mujoco'$"):
         lw.make(task, engine="warp")
 
@@ -143,7 +102,7 @@ FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedg
 def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujoco() -> None:
     seen = []
     for engine in ("mujoco", "warp"):
-        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
+        env = lw.make(task_with(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
         for _ in range(3):
             env.action.fill_(0.3)
             env.step()
@@ -165,7 +124,7 @@ def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines()
     """The engine also accepts boolean values."""
     ends = []
     for engine in ("mujoco", "warp"):
-        env = lw.make(moving(RICH), engine=engine, nworld=2, fields=["eq_active"])
+        env = lw.make(task_with(RICH), engine=engine, nworld=2, fields=["eq_active"])
         env.reset()
         env.field("eq_active")[1, 0] = True
         env.engine.commit(wp.full(2, True, dtype=bool))
@@ -184,12 +143,12 @@ def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines()
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_a_rollout_accepts_an_empty_field(engine: str) -> None:
-    env = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False, seed=1)
+    env = lw.make(task_with(text(ARM)), engine=engine, nworld=2, autoreset=False, seed=1)
     rollout = lw.OpenLoop(env, 3)
     rollout.state.copy_(env.get_state()[0])
     rollout.actions.zero_()
     rollout.run()
-    live = lw.make(sensing(SENSING["no sensors"]), engine=engine, nworld=2, autoreset=False)
+    live = lw.make(task_with(text(ARM)), engine=engine, nworld=2, autoreset=False)
     live.set_state(rollout.state.expand(2, -1).contiguous())
     for t in range(3):
         live.step(torch.zeros_like(live.action))
@@ -201,16 +160,8 @@ def test_a_rollout_accepts_an_empty_field(engine: str) -> None:
 
 
 @wp.struct
-class PushedWorld:
-    qpos: Row[float]
-    qvel: Row[float]
+class PushedWorld(World):
     qfrc_applied: Row[float]
-
-
-@wp.func
-def look(s: PushedWorld, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-    obs[1] = s.qvel[0]
 
 
 @wp.func
@@ -218,23 +169,12 @@ def push(s: PushedWorld, action: Row[float], p: Params, ctrl: Row[float]):
     s.qfrc_applied[0] = action[0]
 
 
-@wp.func
-def start_pushed(s: PushedWorld, p: Params, rng: Row[wp.uint32]):
-    s.qvel[0] = lw.uniform(rng, -p.noise, p.noise)
-
-
-@wp.func
-def judge_pushed(s0: PushedWorld, action: Row[float], s1: PushedWorld, p: Params) -> float:
-    return s1.qvel[0]
-
-
-class Pushed(lw.Task):
-    World, observe, control, randomize, reward = PushedWorld, look, push, start_pushed, judge_pushed
+class Pushed(Made):
+    World, control = PushedWorld, push
     model = mujoco.MjSpec.from_string(text(ARM, ""))
-    obs = {"position": 1, "velocity": 1}
+    obs = {"position": 2, "velocity": 2}
     actions = {"push": 1}
     action_range = (-1.0, 1.0)
-    horizon = 15
 
 
 @pytest.mark.quick("mujoco")

@@ -45,28 +45,6 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
     assert 10 < env.success.sum() < n - 10
 
 
-def test_task_succeeds_after_more_than_20_steps_at_the_goal() -> None:
-    """The count of steps at the goal is part of the state. A reset clears it."""
-    env = lw.make("adroit_pen", engine="mujoco", nworld=3, horizon=0, goal_similarity=-2.0, goal_distance=10.0)
-    still = torch.zeros(3, 24)
-    for i in range(25):
-        env.step(still)
-        assert env.success.tolist() == 3 * [i >= 20]
-    state = env.get_state()
-    assert env.state_space.split(state)["steps_at_goal"].tolist() == 3 * [[25.0]]
-    env.rand_reset(mask=torch.tensor([True, False, False]))
-    assert env.success.tolist() == [False, True, True]
-    for _ in range(20):
-        env.step(still)
-        assert env.success.tolist() == [False, True, True]
-    env.step(still)
-    assert env.success.all()
-    env.reset()
-    assert not env.success.any()
-    env.set_state(state)
-    assert env.success.all()
-
-
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
     upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of both angles' cosines

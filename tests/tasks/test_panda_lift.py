@@ -17,12 +17,6 @@ def cube(env: lw.Env) -> np.ndarray:
     return positions(env)[0][:, 9:]
 
 
-def put_cube(env: lw.Env, height: float) -> None:
-    state = env.get_state()
-    env.state_space.split(state)["qpos"][:, 9:] = torch.tensor([0.3, 0.5, height, 1.0, 0.0, 0.0, 0.0])
-    env.set_state(state)
-
-
 def test_robot_is_a_panda_with_the_published_hand(shared_env: SharedEnv) -> None:
     model = shared_env("panda_lift").model
     assert (model.nq, model.nv, model.nu, model.na) == (16, 15, 8, 8)
@@ -98,31 +92,12 @@ def test_reward_is_a_weighted_sum_of_terms_between_0_and_1(
         np.testing.assert_allclose(env.eval, positions(env)[0][:, height] - rest, atol=1e-6)
 
 
-def test_task_succeeds_after_ten_consecutive_steps_above_the_goal() -> None:
-    """A cube is above the goal for 7 steps if it falls from 0.5 m, and for 13 steps from 1.6 m."""
-    env = lw.make("panda_lift", engine="mujoco", nworld=1, autoreset=False, horizon=0)
-    for height, steps in ((0.5, 0), (1.6, 4)):
-        env.rand_reset(0)
-        put_cube(env, height)
-        successes = []
-        for i in range(25):
-            env.step(torch.zeros(1, 8))
-            successes.append(bool(env.success))
-            if i == 10:
-                state = env.get_state()
-        assert sum(successes) == steps and not any(successes[:9])
-    assert not env.success
-    env.set_state(state)
-    assert env.success
-
-
 @pytest.mark.usefixtures("freed")
-@pytest.mark.parametrize("area", [None, (0.4, 0.5, 0.0, 0.3)])
-def test_random_resets_change_the_position_and_yaw_of_the_cube(area: tuple[float, ...] | None) -> None:
-    env = lw.make("panda_lift", engine="mujoco", nworld=2000, **({} if area is None else {"area": area}))
+def test_random_resets_change_the_position_and_yaw_of_the_cube() -> None:
+    x0, x1, y0, y1 = area = np.array([0.4, 0.5, 0.0, 0.3])
+    env = lw.make("panda_lift", engine="mujoco", nworld=2000, area=area)
     env.rand_reset(0)
     found = cube(env)
-    x0, x1, y0, y1 = np.array(area or (0.45, 0.65, -0.15, 0.15))
     yaw = 2.0 * np.arctan2(found[:, 6], found[:, 3])
     middle = [(2 * found[:, 0] - x0 - x1) / (x1 - x0), (2 * found[:, 1] - y0 - y1) / (y1 - y0), yaw / np.pi]
     check_uniform(np.stack(middle, axis=1) / (1.0 + 1e-6))

@@ -2,13 +2,11 @@ from collections import defaultdict
 
 import numpy as np
 import pytest
-import warp as wp
 from conftest import TaskFile
 from term_calls import KERNELS
 
 import lyceum_warp as lw
-from lyceum_warp import Row, terms
-from lyceum_warp.binding.writes import find_writes, written_fields
+from lyceum_warp import terms
 
 
 def test_argument_name_has_one_type_and_one_documented_meaning_in_all_functions() -> None:
@@ -19,88 +17,6 @@ def test_argument_name_has_one_type_and_one_documented_meaning_in_all_functions(
                 kinds[argument].add(str(kind))
     assert {argument for argument, found in kinds.items() if len(found) > 1} == {"row"}  # numbers or vectors
     assert {*kinds} == {*terms.ARGUMENTS}
-
-
-@wp.struct
-class World:
-    qpos: Row[float]
-    qvel: Row[float]
-    sensordata: Row[float]
-    body_mass: Row[float]
-    body_ipos: Row[wp.vec3]
-    body_inertia: Row[wp.vec3]
-    body_iquat: Row[lw.quat]
-    contact_time: Row[float]
-    air_time: Row[float]
-    swing_time: Row[float]
-    peak_height: Row[float]
-    swing_height: Row[float]
-    history: Row[float]
-    delay: Row[float]
-    drawn_velocity: Row[wp.vec3]
-    heading_target: Row[float]
-    heading_controlled: Row[float]
-    standing: Row[float]
-    command_timer: Row[float]
-    encoder_bias: Row[float]
-
-
-@wp.func
-def reads_only(s: World, action: Row[float], joint_qpos: wp.array[int], obs: Row[float]):
-    obs[0] = terms.upright(terms.gravity(s.qpos), 0.2)
-    obs[1] = terms.foot_slip(s.sensordata, joint_qpos, s.contact_time, 1.0)
-    obs[2] = terms.read_history(s.history, 2, 1, 0) + terms.delayed_action(action, s.history, s.delay, 0)
-    obs[3] = terms.velocity_command(
-        s.drawn_velocity, s.heading_target, s.heading_controlled, s.standing, terms.heading(s.qpos), 0.5, 1.0
-    )[0]
-    terms.gather(obs, s.qvel, joint_qpos)
-
-
-@wp.func
-def clocks(s: World, contacts: wp.array[int]):
-    terms.run_contact_clocks(s.sensordata, contacts, s.contact_time, s.air_time, 0.005)
-    terms.run_clocks(0, True, s.contact_time, s.air_time, s.swing_time, 0.005)
-
-
-@wp.func
-def swings(s: World, action: Row[float]):
-    terms.follow_swing(0, s.qpos[2], s.contact_time, s.peak_height, s.swing_height, 0.02)
-    terms.push_history(s.history, action)
-    terms.run_timer(s.command_timer, 0.02)
-
-
-@wp.func
-def draws(s: World, rng: Row[wp.uint32]):
-    if terms.is_due(s.command_timer):
-        terms.draw_velocity(s.drawn_velocity, wp.vec3(-1.0), wp.vec3(1.0), rng)
-        terms.draw_heading(s.heading_target, s.heading_controlled, 0.3, rng)
-        terms.draw_flag(s.standing, 0.1, rng)
-        terms.draw_forward_only(s.drawn_velocity, 0.2, 0.3, rng)
-        terms.draw_timer(s.command_timer, wp.vec2(3.0, 8.0), rng)
-    terms.push(s.qpos, s.qvel, wp.vec3(0.5), wp.vec3(0.5), rng)
-
-
-@wp.func
-def robots(s: World, rng: Row[wp.uint32]):
-    terms.draw_row(s.encoder_bias, -0.1, 0.1, rng)
-    terms.draw_inertia(
-        s.body_mass, s.body_ipos, s.body_inertia, s.body_iquat, 1, 0.1, wp.vec3(0.1), wp.vec3(0.1), wp.vec3(0.1), rng
-    )
-
-
-@pytest.mark.parametrize(
-    ("function", "fields"),
-    [
-        (reads_only, ""),
-        (clocks, "contact_time air_time swing_time"),
-        (swings, "peak_height swing_height history command_timer"),
-        (draws, "drawn_velocity heading_target heading_controlled standing command_timer qvel"),
-        (robots, "encoder_bias body_mass body_ipos body_inertia body_iquat"),
-    ],
-)
-def test_field_passed_to_a_function_that_writes_it_counts_as_written(function: wp.Function, fields: str) -> None:
-    assert written_fields(function) == {*fields.split()}
-    assert {write.use for write in find_writes(function)} <= {None}
 
 
 TASK = """
