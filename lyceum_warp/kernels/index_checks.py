@@ -9,9 +9,6 @@ from typing import Any
 
 import warp as wp
 
-MOST_ROUNDS = wp.constant(1_000_000)
-"""A ``while`` loop with more iterations is reported as endless."""
-
 
 @wp.func(inline=False)
 def note(report: wp.array2d[int], place: int, index: int, size: int):
@@ -47,11 +44,3 @@ def element(report: wp.array2d[int], place: int, values: Any, index: Any):
     The instrumented source passes the call as the argument ``values``, so that the call runs only once.
     """
     return values[at(report, place, index, len(values))]
-
-
-@wp.func
-def is_endless(report: wp.array2d[int], place: int, rounds: int) -> bool:
-    """Return whether a loop has exceeded ``MOST_ROUNDS``, in this run or an earlier one."""
-    if rounds > MOST_ROUNDS:
-        note(report, place, rounds, 0)
-    return report[place, 0] > 0

@@ -99,8 +99,8 @@ def check_task(
         return Env(task, **{"nworld": nworld, "device": device, "engine": engine, "seed": seed, **options, **changes})
 
     a = make()
-    ctx = Context(a, make(), make, steps, seed, a.task.name, a.engine.name)
-    report = Report(ctx.task, ctx.engine, a.device.alias, nworld, unused=unused(a.task))
+    ctx = Context(a, make(), make, steps, seed)
+    report = Report(a.task.name, a.engine.name, a.device.alias, nworld, unused=unused(a.task))
     broken = []
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")

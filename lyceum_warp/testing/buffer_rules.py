@@ -9,11 +9,16 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 def check_spaces(ctx: Context) -> None:
     """A space has its buffer's shape and type, its parts cover all columns, and its bounds are in order."""
     env = ctx.a
+    ctx.that(env.obs is env.obs_groups["policy"], "the group policy is not env.obs")
+    ctx.that(env.final_obs is env.final_obs_groups["policy"], "the final group policy is not env.final_obs")
     pairs = {
-        "obs": (env.obs_space, env.obs), "action": (env.action_space, env.action),
-        "reward": (env.reward_space, env.reward), "eval": (env.eval_space, env.eval),
-        "state": (env.state_space, env.get_state()), "final_obs": (env.obs_space, env.final_obs),
+        "action": (env.action_space, env.action), "reward": (env.reward_space, env.reward),
+        "eval": (env.eval_space, env.eval), "state": (env.state_space, env.get_state()),
     }  # fmt: skip
+    for name, space in env.obs_spaces.items():
+        pairs[f"obs group {name}"] = space, env.obs_groups[name]
+        pairs[f"final obs group {name}"] = space, env.final_obs_groups[name]
+        ctx.equal(env.get_obs(group=name), env.obs_groups[name], f"get_obs of the group {name}")
     for name, (space, buffer) in pairs.items():
         ctx.that(
             buffer.shape == (env.nworld, *space.shape) and buffer.dtype == space.dtype,

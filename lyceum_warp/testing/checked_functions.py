@@ -1,7 +1,6 @@
 """Copy a task's functions with a bounds check for every index, and make kernels that run the copies.
 
-A copy also counts the iterations of each ``while`` loop, and otherwise computes the same numbers. Native functions
-(``wp.func_native``) are C++ and cannot be checked.
+Native functions (``wp.func_native``) are C++ and cannot be checked.
 """
 
 import ast
@@ -22,26 +21,22 @@ _SHAPES = ("shape", "strides")
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """An index or a loop in a function's source."""
+    """An index in a function's source."""
 
     function: str
     text: str
     where: str
     verb: str
-    """The kind of access: reads, writes or loops."""
+    """The kind of access: reads or writes."""
 
     def problem(self, index: int, size: int) -> str:
-        """Describe an index out of range or an endless loop."""
-        if self.verb == "loops":
-            rounds = int(index_checks.MOST_ROUNDS)
-            return f"{self.function} is still in its loop {self.text!r} after {rounds} rounds ({self.where})"
+        """Describe an index out of range."""
         there = f"there are {size} elements, 0 to {size - 1}" if size else "there are no elements"
         return f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and {there}"
 
 
 _HELPERS = {
     "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
-    "bounds_is_endless": index_checks.is_endless,
 }  # fmt: skip
 """Functions that the copies call, with names that a task hardly uses."""
 
@@ -151,7 +146,6 @@ class _Rewriter(ast.NodeTransformer):
     def __init__(self, checked: CheckedFunctions, source: FunctionSource) -> None:
         self.checked, self.source = checked, source
         self.callees: list[int] = []
-        self.loops = 0
         self.writes = False
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> ast.AST:
@@ -249,17 +243,6 @@ class _Rewriter(ast.NodeTransformer):
         constant = negative and isinstance(index.operand, ast.Constant)  # type: ignore[attr-defined]
         size = _call("len", _loaded(base))
         return _call("bounds_from_end" if constant else "bounds_at", _name("bounds_report"), place, index, size)
-
-    def visit_While(self, node: ast.While) -> list[ast.stmt]:
-        place = self.checked.place(self.source, node, f"while {ast.unparse(node.test)}", "loops")
-        self.loops += 1
-        rounds = f"bounds_rounds_{self.loops}"
-        node = self.generic_visit(node)  # type: ignore[assignment]
-        count = ast.parse(
-            f"{rounds} = int(0)\n{rounds} += 1\nif bounds_is_endless(bounds_report, {place}, {rounds}):\n    break"
-        ).body
-        node.body = [*count[1:], *node.body]
-        return [count[0], node]
 
 
 def _name(name: str) -> ast.Name:

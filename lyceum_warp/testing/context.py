@@ -32,8 +32,6 @@ class Context:
     """Makes another environment with the same options, except for given changes."""
     steps: int
     seed: int
-    task: str
-    engine: str
     rule: str = ""
 
     def fail(self, problem: str, world: int = 0) -> NoReturn:
@@ -41,7 +39,7 @@ class Context:
         state, parts = self.a.get_state()[world], self.a.state_space.parts
         values = ", ".join(f"{name} {state[part].tolist()}" for name, part in parts.items())
         where = f"with seed {self.seed}, world {world} in step {int(state[parts['step']])} of its episode: {values}"
-        what = f"{self.task} on the {self.engine} engine breaks the rule {self.rule!r}: {problem}"
+        what = f"{self.a.task.name} on the {self.a.engine.name} engine breaks the rule {self.rule!r}: {problem}"
         raise AssertionError(f"{what}\n  {where}")
 
     def that(self, holds: bool | torch.Tensor, problem: str) -> None:
@@ -109,6 +107,12 @@ class Context:
         """Fail unless two results of ``run`` are equal bit for bit."""
         for name in wanted:
             self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
+
+    def same_worlds(self, mask: torch.Tensor, what: str) -> None:
+        """Fail unless the results and the states of selected worlds are equal in both environments."""
+        for name in OUTCOMES:
+            self.equal(getattr(self.a, name)[mask], getattr(self.b, name)[mask], f"{name} of {what}")
+        self.equal(self.a.get_state()[mask], self.b.get_state()[mask], f"the state of {what}")
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:

@@ -1,26 +1,31 @@
 """Check that a fault ends its world's episode and changes no other world."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 
 from lyceum_warp.done import Done
-from lyceum_warp.env import Env
-from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
+from lyceum_warp.testing.context import SHORT, Context
 
 
-def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, what: str) -> None:
+def _check_fault(ctx: Context, part: str, value: float) -> None:
+    """Write a value into the first number of one world's action or of a part of its state, and step."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
+    what, reason = f"{value} in {part}", Done.ACTION if part == "action" else Done.NAN
     ctx.restart()
     others = ~ctx.mask(bad)
     for action in ctx.actions(5):
         a.step(action)
         b.step(action)
-    good, counts, actions = a.obs[bad].clone(), a.fault_counts, ctx.actions(SHORT, 1)
+    good = {name: obs[bad].clone() for name, obs in a.obs_groups.items()}
+    counts, actions = a.fault_counts, ctx.actions(SHORT, 1)
     for env in (a, b):
         env.action.copy_(actions[0])
-    spoil(a, bad)
+    if part == "action":
+        a.action[bad, 0] = value
+    else:
+        state = a.get_state()
+        state[bad, a.state_space.parts[part].start] = value
+        a.set_state(state, ctx.mask(bad), check=False)
     a.step()
     b.step()
     found = Done(int(a.done_reason[bad]))
@@ -30,16 +35,16 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
     ctx.that(a.reward[bad] == 0, f"{what}: the reward is {a.reward[bad].item()}")
     ctx.that(not a.success[bad], f"{what}: it counts as a success")
     ctx.that(torch.isfinite(a.eval[bad]), f"{what}: eval is {a.eval[bad].item()}")
-    ctx.equal(a.final_obs[bad], good, f"{what}: final_obs against the last good observation")
+    for name, obs in good.items():
+        final = a.final_obs_groups[name][bad]
+        ctx.equal(final, obs, f"{what}: the final group {name} against the last good observation")
     ctx.that(a.time[bad] == 0, f"{what}: the world was not reset, its time is {a.time[bad].item()}")
     name = str(reason.name).lower()
     ctx.that(a.fault_counts[name] == counts[name] + 1, f"{what}: counted {counts} before, {a.fault_counts} after")
     ctx.finite(a, f"after {what}")
     again = diverges = False
     for i, action in enumerate(actions[1:]):
-        for key in OUTCOMES:
-            ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{what}: {key} of other worlds, step {i}")
-        ctx.equal(a.get_state()[others], b.get_state()[others], f"{what}: the state of other worlds, step {i}")
+        ctx.same_worlds(others, f"other worlds, {what}, step {i}")
         a.step(action)
         b.step(action)
         ctx.finite(a, f"{i + 1} steps after {what}")
@@ -49,25 +54,18 @@ def _check_fault(ctx: Context, spoil: Callable[[Env, int], None], reason: Done, 
 
 
 def check_bad_state(ctx: Context) -> None:
-    """A state with NaN or a magnitude above 1e10 ends its world's episode, and changes no other world."""
+    """A state with NaN or a magnitude above 1e10 ends its world's episode, and changes no other world.
+
+    The final observation of every group is then the last valid one.
+    """
     for part, value in (("qpos", np.nan), ("qvel", np.nan), ("qvel", np.inf), ("qpos", 1e11), ("qvel", -1e11)):
-
-        def spoil(env: Env, world: int, part: str = part, value: float = value) -> None:
-            state = env.get_state()
-            state[world, env.state_space.parts[part].start] = value
-            env.set_state(state, ctx.mask(world), check=False)
-
-        _check_fault(ctx, spoil, Done.NAN, f"{value} in {part}")
+        _check_fault(ctx, part, value)
 
 
 def check_bad_action(ctx: Context) -> None:
     """An action that is not finite counts as zero, ends its world's episode and changes no other world."""
     for value in (np.nan, np.inf, -np.inf):
-
-        def spoil(env: Env, world: int, value: float = value) -> None:
-            env.action[world, 0] = value
-
-        _check_fault(ctx, spoil, Done.ACTION, f"an action of {value}")
+        _check_fault(ctx, "action", value)
 
 
 def check_bad_warmstart(ctx: Context) -> None:
@@ -88,7 +86,7 @@ def check_bad_warmstart(ctx: Context) -> None:
             ctx.that(torch.isfinite(a.obs[bad]).all(), "the observation is not finite, but there is no fault")
         diverges = diverges or bool(ctx.faulty(b)[bad])
         ctx.that(i == 0 or diverges or not ctx.faulty(a)[bad], f"the world has another fault at step {i}")
-        ctx.equal(a.get_state()[bad + 1 :], b.get_state()[bad + 1 :], f"the state of other worlds at step {i}")
+        ctx.same_worlds(~ctx.mask(bad), f"other worlds at step {i}")
     ctx.finite(a, "after a warm start of NaN")
 
 
@@ -96,7 +94,8 @@ def check_not_finite(ctx: Context) -> None:
     """A reward or an observation that is not finite is a fault of its world, and changes no other world."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
-    names = [name for name, value in a.task.params.items() if name not in ("dt", "substep_dt") and _is_real(value)]
+    params = {name: value for name, value in a.task.params.items() if name not in ("dt", "substep_dt")}
+    names = [name for name, value in params.items() if isinstance(value, float) and np.isfinite(value)]
     with ctx.changed(a, b, graphs=False):  # parameters that differ between worlds need new graphs
         for name in names:
             kept = a.task.params[name]
@@ -114,12 +113,6 @@ def check_not_finite(ctx: Context) -> None:
                         ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
                     for key in ("reward", "obs", "final_obs"):
                         ctx.that(torch.isfinite(getattr(a, key)).all(), f"{key} is not finite {what}")
-                    for key in OUTCOMES:
-                        ctx.equal(getattr(a, key)[others], getattr(b, key)[others], f"{key} of other worlds {what}")
-                    ctx.equal(a.get_state()[others], b.get_state()[others], f"the state of other worlds {what}")
+                    ctx.same_worlds(others, f"other worlds {what}")
             finally:
                 a.set_params(**{name: kept})
-
-
-def _is_real(value: object) -> bool:
-    return isinstance(value, float) and np.isfinite(value)

@@ -1,4 +1,4 @@
-"""Check the optional parts of a task: groups of observations, noise, metrics, memory and events."""
+"""Check the optional parts of a task: noise, metrics, memory and events."""
 
 import torch
 
@@ -6,25 +6,6 @@ from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 from lyceum_warp.world_arrays import memory_columns
-
-
-def check_groups(ctx: Context) -> None:
-    """The group ``policy`` equals ``env.obs``. After a fault, every group keeps its last valid observation."""
-    a = ctx.a
-    ctx.that(a.obs is a.obs_groups["policy"], "the group policy is not env.obs")
-    ctx.that(a.final_obs is a.final_obs_groups["policy"], "the final group policy is not env.final_obs")
-    ctx.restart()
-    a.step(ctx.actions(1)[0])
-    good = {name: values.clone() for name, values in a.obs_groups.items()}
-    a.action[0] = torch.nan
-    a.step()
-    ctx.that(a.done[0], "an action of NaN is not a fault")
-    for name, space in a.obs_spaces.items():
-        final = a.final_obs_groups[name]
-        ctx.equal(final[0], good[name][0], f"the final group {name} after a fault")
-        for buffer in (a.obs_groups[name], final):
-            ctx.that(buffer.shape == (a.nworld, space.size), f"the group {name} is {tuple(buffer.shape)}")
-        ctx.equal(a.get_obs(group=name), a.obs_groups[name], f"get_obs of the group {name}")
 
 
 def check_noise(ctx: Context) -> None:

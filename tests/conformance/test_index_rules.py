@@ -151,11 +151,8 @@ def terminated_wrong(s: World, p: Params) -> bool:
 
 @wp.func
 def initialize_wrong(s: World, p: Params):
-    x = float(0.0)
-    while x < 2.0e6:
-        x += 1.0
     if s.count[2] > 1.0e30:
-        s.count[0] = x
+        s.count[0] = 1.0
 
 
 class Wrong(lw.Task):
@@ -184,7 +181,6 @@ MISTAKES = [
     rf"reward_wrong reads s1\.count\[1\] {AT} 1,",
     rf"terminated_wrong reads s\.qpos\[p\.where \+ 7\] {AT} 7,",
     rf"initialize_wrong reads s\.count\[2\] {AT} 2,",
-    r"initialize_wrong is still in its loop 'while x < 2000000\.0' after 1000000 rounds \(.*, line \d+\)",
 ]
 
 
@@ -192,7 +188,7 @@ def test_correct_functions_pass_the_index_rule() -> None:
     check_task(Right, engine="mujoco", steps=10, checks=[check_bounds])
 
 
-def test_index_rule_reports_indices_out_of_range_and_endless_loops() -> None:
+def test_index_rule_reports_all_indices_out_of_range() -> None:
     with pytest.raises(AssertionError, match="wrong on the mujoco engine breaks the rule 'bounds': ") as caught:
         check_task(Wrong, engine="mujoco", steps=10, checks=[check_bounds])
     message = str(caught.value)

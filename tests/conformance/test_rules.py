@@ -162,7 +162,7 @@ BREAKS: list[Break] = [
 """Patches that violate the rules on hopper."""
 
 FULL_BREAKS: list[Break] = [
-    ("groups", lw.Env, "step", then(another_critic)),
+    ("bad_state", lw.Env, "step", then(another_critic)),
     ("noise", Worlds, "_judge_state", count_steps_as_none),
     ("metrics", Worlds, "_clear", clear_all_but("metric_sums")),
     ("success_steps", Worlds, "_clear", clear_all_but("success_counts")),
@@ -217,7 +217,7 @@ def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task]
 
 
 def test_task_with_every_feature_passes_on_the_warp_engine() -> None:
-    rules = ("groups", "events", "inputs", "dynamics", "rejection")
+    rules = ("bad_action", "events", "inputs", "dynamics", "rejection")
     checks = [check for check in CHECKS if check.__name__.removeprefix("check_") in rules]
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)
 
