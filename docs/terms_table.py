@@ -1,4 +1,4 @@
-"""Write the tables of terms.md from lyceum_warp.terms: python docs/terms_table.py."""
+"""Write the tables of functions in terms.md from lyceum_warp.terms: python docs/terms_table.py."""
 
 import ast
 import inspect
@@ -8,7 +8,7 @@ from pathlib import Path
 from lyceum_warp import terms
 
 PAGE = Path(__file__).resolve().parent / "terms.md"
-PLACE = re.compile(r"(<!-- (functions|arguments) -->\n).*?(<!-- end -->)", re.DOTALL)
+PLACE = re.compile(r"(<!-- functions -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def cell(text: str) -> str:
@@ -35,16 +35,9 @@ def functions() -> list[str]:
     return lines[:-1]
 
 
-def arguments() -> list[str]:
-    """Make a table of all arguments."""
-    rows = [f"| `{name}` | {cell(meaning)} |" for name, meaning in terms.ARGUMENTS.items()]
-    return ["| argument | meaning |", "|---|---|", *rows]
-
-
 def written(page: str) -> str:
     """Return the page with up-to-date tables."""
-    tables = {"functions": functions(), "arguments": arguments()}
-    return PLACE.sub(lambda found: "\n".join([found[1], *tables[found[2]], "", found[3]]), page)
+    return PLACE.sub(lambda found: "\n".join([found[1], *functions(), "", found[2]]), page)
 
 
 if __name__ == "__main__":
