@@ -23,7 +23,6 @@ from lyceum_warp.testing import physics_rules as physics
 from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
-from lyceum_warp.testing.unused import unused
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +46,11 @@ class Report:
     nworld: int
     seconds: dict[str, float] = dataclasses.field(default_factory=dict)
     """Duration of each check in seconds, by the rule's name."""
-    unused: list[str] = dataclasses.field(default_factory=list)
-    """Functions that are never called, and memory that is never read."""
 
     def __str__(self) -> str:
         head = f"{self.task} on the {self.engine} engine ({self.device}, {self.nworld} worlds) keeps the rules:"
         rules = (f"  {name:<20} {value:6.2f} s" for name, value in self.seconds.items())
-        return "\n".join([head, *rules, *(f"unused: {line}" for line in self.unused)])
+        return "\n".join([head, *rules])
 
 
 def check_task(
@@ -100,7 +97,7 @@ def check_task(
 
     a = make()
     ctx = Context(a, make(), make, steps, seed)
-    report = Report(a.task.name, a.engine.name, a.device.alias, nworld, unused=unused(a.task))
+    report = Report(a.task.name, a.engine.name, a.device.alias, nworld)
     broken = []
     for check in checks:
         ctx.rule = check.__name__.removeprefix("check_")
