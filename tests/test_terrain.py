@@ -1,13 +1,11 @@
 import mujoco
 import numpy as np
 import pytest
-import torch
 from conftest import SharedEnv
 from terrain_task import KINDS, OnTerrain
 
 import lyceum_warp as lw
 from lyceum_warp.terrain import height_table
-from lyceum_warp.testing import check_task
 
 # the description
 
@@ -182,17 +180,3 @@ def test_ball_rests_on_every_kind_of_patch_at_the_height_in_the_table(shared_env
     assert np.ptp(obs[:, 2]) > 0.4
     # the engine's rangefinder measures the distance downwards; at x = 16 m and a slope of 5, float32 is exact to 2e-5 m
     np.testing.assert_allclose(obs[:, 3], obs[:, 4 + 21 * 21 // 2], atol=5e-5)
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_height_scan_of_a_state_is_equal_on_both_engines(shared_env: SharedEnv, engine: str) -> None:
-    states = shared_env(OnTerrain, nworld=8).get_state()
-    env = shared_env(OnTerrain, engine=engine, nworld=8)
-    env.set_state(states)
-    torch.testing.assert_close(env.obs[:, 4:], shared_env(OnTerrain, nworld=8).obs[:, 4:], rtol=0, atol=1e-6)
-
-
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_task_on_terrain_passes_check_task(engine: str) -> None:
-    check_task(OnTerrain, engine=engine, steps=20)

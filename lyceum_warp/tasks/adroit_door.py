@@ -24,7 +24,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     sparse: bool = False  # the reward is 10 for success, otherwise -0.1
     palm_weight: float = 0.1
     success_angle: float = 1.35  # rad; the hinge opens to 1.57

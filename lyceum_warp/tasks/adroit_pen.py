@@ -25,7 +25,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     sparse: bool = False  # the reward is 10 at the goal, otherwise -0.1
     goal_distance: float = 0.075
     goal_similarity: float = 0.95

@@ -26,7 +26,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     goal_height: float = 0.1
     rest_height: float = 0.0658  # the pot's height when it rests on the table, m
     place: wp.vec3 = wp.vec3(0.03, 0.03, 0.25)  # the initial pose's bounds: x, y (m) and yaw (rad)

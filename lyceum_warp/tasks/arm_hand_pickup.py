@@ -29,7 +29,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     far: float = 0.5  # m; larger distances count as this distance
     near: float = 0.03  # m; the goal is rewarded only while the palm is closer to the ball
     finger_weight: float = 0.1

@@ -19,7 +19,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     sparse: bool = False
     cart_range: wp.vec2 = wp.vec2(-0.25, 0.25)  # m, for balance
     cosine_range: wp.vec2 = wp.vec2(0.995, 1.0)  # bounds for the cosine of the pole's angle

@@ -18,7 +18,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     reset_noise_scale: float = 0.01
 
 

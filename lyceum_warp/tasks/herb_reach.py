@@ -23,7 +23,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     success_distance: float = 0.05
     precision_weight: float = 0.5
     ctrl_cost_weight: float = 0.01

@@ -23,7 +23,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     substep_dt: float
     uph_cost_weight: float = 1.0
     ctrl_cost_weight: float = 0.1

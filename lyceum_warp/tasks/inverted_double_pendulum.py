@@ -20,7 +20,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     healthy_reward: float = 10.0
     reset_noise_scale: float = 0.1
     tip: int = lw.site("tip")

@@ -28,7 +28,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     goal_height: float = 0.1
     half_size: float = 0.02  # of the cube, m
     area: wp.vec4 = wp.vec4(0.45, 0.65, -0.15, 0.15)  # initial x min, x max, y min, y max of the cube, m

@@ -14,7 +14,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     success_distance: float = 0.05
 
 

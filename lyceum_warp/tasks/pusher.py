@@ -19,7 +19,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     reward_near_weight: float = 0.5
     reward_dist_weight: float = 1.0
     reward_control_weight: float = 0.1

@@ -27,7 +27,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     success_distance: float = 0.05
     random_start: bool = False  # initial joints are random in the paper's text, zero in its code
     target_range: wp.vec3 = wp.vec3(0.3, 0.2, 0.25)

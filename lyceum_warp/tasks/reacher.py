@@ -19,7 +19,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     reward_dist_weight: float = 1.0
     reward_control_weight: float = 1.0
     success_distance: float = 0.019  # sum of both spheres' radii

@@ -24,7 +24,6 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
     success_distance: float = 0.03
     reach: float = 0.4  # largest distance of the ball from the origin, m
     diameter: float = 0.09

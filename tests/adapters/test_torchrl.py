@@ -50,18 +50,3 @@ def test_rollout_returns_the_values_of_the_wrapped_environment(mode: str, tensor
         torch.testing.assert_close(step["next", key][done], final[done], rtol=0, atol=0)
         ends += done.sum()
     assert ends >= N
-
-
-def test_collector_and_advantages_accept_the_environment() -> None:
-    from tensordict.nn import TensorDictModule
-    from torchrl.collectors import Collector
-    from torchrl.objectives.value import GAE
-
-    env = wrapped("SameStep", tensors=True, task="hopper")
-    policy = TensorDictModule(torch.nn.Linear(11, 3), in_keys=["observation"], out_keys=["action"])
-    value = TensorDictModule(torch.nn.Linear(11, 1), in_keys=["observation"], out_keys=["state_value"])
-    collector = Collector(env, policy, frames_per_batch=64, total_frames=128)
-    batches = [GAE(gamma=0.99, lmbda=0.95, value_network=value)(batch) for batch in collector]
-    collector.shutdown()
-    assert len(batches) == 2 and batches[1]["advantage"].shape == (N, 16, 1)
-    assert torch.isfinite(batches[1]["advantage"]).all()

@@ -207,15 +207,3 @@ def test_term_equals_its_formula(name: str) -> None:
     wanted = FORMULAS[name](**as_arrays)
     assert name == "alive" or len(np.unique(wanted)) > 1
     np.testing.assert_allclose(call(name, **values).result, wanted, rtol=2e-5, atol=2e-6)
-
-
-def test_dc_motor_brakes_above_its_no_load_speed_and_gives_any_torque_within_its_limits() -> None:
-    found = {
-        (torque, velocity): call(
-            "dc_motor_torque", torque=torque, joint_velocity=velocity,
-            saturation_torque=20.0, velocity_limit=10.0, effort_limit=15.0,
-        ).result[0]
-        for torque, velocity in ((5.0, 0.0), (30.0, 0.0), (30.0, 5.0), (30.0, 12.0), (-30.0, 5.0), (30.0, -5.0))
-    }  # fmt: skip
-    wanted = [5.0, 15.0, 10.0, -4.0, -15.0, 15.0]
-    np.testing.assert_allclose(list(found.values()), wanted, atol=1e-5)
