@@ -106,7 +106,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._torch, self._copy = torch, copy
-        self._staged = _staging(env.action)
         self._seeded = isinstance(task, Env) or "seed" in words
         self._ended = env.done.clone()
         self._reset_once = False
@@ -156,12 +155,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise gymnasium.error.ResetNeeded("there was no reset before this step: call reset() first")
         env = self.env
         if self._torch:
-            env.action.copy_(_tensor(actions, env.action).detach())
+            check_tensor(actions, "actions", env.action)
+            env.action.copy_(actions.detach())
         else:
             check_array(actions, env.action.shape)
-            np.copyto(self._staged.numpy(), actions, casting="same_kind")
-            if self._staged is not env.action:
-                env.action.copy_(self._staged, non_blocking=True)
+            env.action.copy_(torch.from_numpy(actions.astype(np.float32)))
         if self.autoreset_mode is AutoresetMode.NEXT_STEP:
             env.action.masked_fill_(self._ended[:, None], 0.0)  # a NaN in an ignored action is not a fault
         env.step()
@@ -270,18 +268,6 @@ def check_array(actions: Any, shape: tuple[int, ...]) -> None:
         array = isinstance(actions, np.ndarray)
         given = f"a {actions.dtype} array of shape {actions.shape}" if array else described(actions)
         raise ValueError(f"actions must be a float32 array of shape {tuple(shape)}, not {given}")
-
-
-def _tensor(actions: Any, like: torch.Tensor) -> torch.Tensor:
-    if not isinstance(actions, torch.Tensor):
-        raise ValueError(f"actions must be {described(like)}, not {described(actions)}, because of torch=True")
-    check_tensor(actions, "actions", like)
-    return actions
-
-
-def _staging(action: torch.Tensor) -> torch.Tensor:
-    """Return pinned memory for actions on a GPU, or the buffer itself on the CPU."""
-    return torch.empty(action.shape, pin_memory=True) if action.is_cuda else action
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:

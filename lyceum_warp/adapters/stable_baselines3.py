@@ -52,7 +52,6 @@ class StableBaselines3VecEnv(VecEnv):
         super().__init__(worlds.num_envs, worlds.single_observation_space, worlds.single_action_space)
         self.metadata: dict[str, Any] = {**self.metadata, **worlds.metadata}
         self._returns, self._lengths = np.zeros(self.num_envs), np.zeros(self.num_envs, dtype=int)
-        self._no_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         self._start = time.time()
 
     def reset(self) -> Any:
@@ -82,7 +81,7 @@ class StableBaselines3VecEnv(VecEnv):
         obs, rewards, terminations, truncations, infos = self._worlds.step(self._actions)
         self._returns += rewards
         self._lengths += 1
-        done, listed = terminations | truncations, self._no_infos.copy()
+        done, listed = terminations | truncations, list[dict[str, Any]]({} for _ in range(self.num_envs))
         if done.any():
             final, seconds = infos["final_info"], round(time.time() - self._start, 6)
             final.pop("metrics", None)

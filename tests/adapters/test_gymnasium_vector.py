@@ -262,7 +262,7 @@ def test_pictures_show_the_current_state_of_each_world(vector: Callable[..., Gym
         (
             True,
             np.zeros((4, 3), dtype=np.float32),
-            r"must be a float32 tensor .*, not a ndarray .*, because of torch=True",
+            r"must be a float32 tensor .*, not a ndarray of shape \(4, 3\)",
         ),
     ],
 )
