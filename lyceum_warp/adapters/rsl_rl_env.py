@@ -60,11 +60,6 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         self._episodes = torch.zeros((), device=self.device)
 
     @property
-    def unwrapped(self) -> Env:
-        """The environment itself."""
-        return self.env
-
-    @property
     def episode_length_buf(self) -> torch.Tensor:
         """Steps since the reset, (nworld,) int32, a live view.
 

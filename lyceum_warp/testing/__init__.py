@@ -20,7 +20,6 @@ from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import form_rules as form
 from lyceum_warp.testing import index_rules as indices
 from lyceum_warp.testing import physics_rules as physics
-from lyceum_warp.testing import reset_rules as resets
 from lyceum_warp.testing import state_rules as state
 from lyceum_warp.testing.context import OUTCOMES, Context
 
@@ -28,7 +27,7 @@ log = logging.getLogger(__name__)
 
 CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     value
-    for module in (buffers, state, episodes, indices, faults, form, physics, resets)
+    for module in (buffers, state, episodes, indices, faults, form, physics)
     for name, value in vars(module).items()
     if name.startswith("check_")
 )

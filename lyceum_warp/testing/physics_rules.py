@@ -1,4 +1,4 @@
-"""Check that a world's inputs, such as applied forces, and its own model fields affect its physics.
+"""Check that a world's inputs, such as applied forces, its own model fields and ``settle`` affect its physics.
 
 The engine must come closer to ``mj_step`` than ``mj_step`` without these inputs and fields.
 """
@@ -166,3 +166,21 @@ def check_dynamics(ctx: Context) -> None:
         elif name not in a.task.writes.get("initialize", ()):
             nominal = torch_view(flat(a.engine.nominal[name])).expand(a.nworld, -1).contiguous()
             ctx.equal(rows(a, name), nominal, f"{name} after reset")
+
+
+def check_settle(ctx: Context) -> None:
+    """An episode starts at time 0 after the substeps of ``settle``."""
+    a, b = ctx.a, ctx.b
+    nstep = a.task.task.settle
+    if nstep == 0:
+        return
+    ctx.restart()
+    b.worlds.set_mask(None)
+    for phase in b.worlds.reset_phases(randomly=True):
+        if phase.name != "settle":
+            phase.run()
+    a.rand_reset()
+    ctx.that((a.time == 0).all(), f"the time after a reset is {a.time.tolist()}")
+    start = b.get_state()
+    wanted, moved = predicted(a, start, nstep=nstep), start[:, a.state_space.parts["qpos"]].cpu().numpy()
+    closer(ctx, a.get_state(), wanted, moved, torch.ones_like(a.done), "settling")

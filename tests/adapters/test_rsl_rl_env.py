@@ -19,7 +19,7 @@ def env(shared_env: SharedEnv) -> lw.Env:
 def test_step_returns_all_observation_groups_without_copies(env: lw.Env) -> None:
     worlds = RslRlVecEnv(env)
     assert (worlds.num_envs, worlds.num_actions, worlds.max_episode_length) == (4, 1, 10)
-    assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered" and worlds.unwrapped is env
+    assert worlds.device == env.obs.device and worlds.cfg["task"] == "metered"
     obs, reward, done, extras = worlds.step(torch.ones(4, 1))
     assert isinstance(obs, TensorDict) and set(obs.keys()) == {"policy", "critic"}
     assert reward is env.reward and done is env.done
