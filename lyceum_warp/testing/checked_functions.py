@@ -5,11 +5,9 @@ Native functions (``wp.func_native``) are C++ and cannot be checked.
 
 import ast
 import copy
-import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from lyceum_warp.binding import sources
@@ -17,22 +15,6 @@ from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")
-
-
-@dataclasses.dataclass(frozen=True)
-class Place:
-    """An index in a function's source."""
-
-    function: str
-    text: str
-    where: str
-    verb: str
-    """The kind of access: reads or writes."""
-
-    def problem(self, index: int, size: int) -> str:
-        """Describe an index out of range."""
-        there = f"there are {size} elements, 0 to {size - 1}" if size else "there are no elements"
-        return f"{self.function} {self.verb} {self.text} out of range ({self.where}): the index is {index}, and {there}"
 
 
 _HELPERS = {
@@ -53,7 +35,8 @@ class CheckedFunctions:
 
     def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:
         self._module, self._views = module, views
-        self.places: list[Place] = []
+        self.places: list[str] = []
+        """Each index in the source, such as "observe reads s.qpos[7] out of range (hopper.py, line 40)"."""
         self._numbers: dict[wp.Function, int] = {}
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
@@ -74,12 +57,16 @@ class CheckedFunctions:
 
     def problems(self, report: wp.array) -> list[str]:
         """Describe the problems in a report, one per line."""
-        found: np.ndarray = report.numpy()
-        return list(dict.fromkeys(place.problem(*found[i, 1:]) for i, place in enumerate(self.places) if found[i, 0]))
+        found = []
+        for place, (errors, index, size) in zip(self.places, report.numpy(), strict=False):
+            there = f"there are {size} elements, 0 to {size - 1}" if size else "there are no elements"
+            if errors:
+                found.append(f"{place}: the index is {index}, and {there}")
+        return list(dict.fromkeys(found))
 
     def place(self, source: FunctionSource, node: ast.AST, text: str, verb: str) -> int:
-        """Add a row to the report, and return its index."""
-        self.places.append(Place(source.name, text, source.place(node), verb))
+        """Add a row to the report, and return its index. The verb is "reads" or "writes"."""
+        self.places.append(f"{source.name} {verb} {text} out of range ({source.place(node)})")
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
