@@ -6,6 +6,7 @@ import pytest
 import torch
 import warp as wp
 from arbitrary_models import ARM, MODEL_CHECKS, MODELS, PLUGINS, actuated, text
+from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import Row
@@ -89,20 +90,19 @@ def test_model_that_the_warp_engine_does_not_support_raises_a_one_line_error(rea
 
 # not every model has these fields
 
-RICH = text(
-    ARM
-    + '<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="2 0 3" radius=".02" mass=".1">'
-    '<contact selfcollide="none"/><edge equality="true"/></flexcomp>',
+RICH = task_with(text(
+    ARM + '<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="2 0 3" radius=".02" '
+    'mass=".1"><contact selfcollide="none"/><edge equality="true"/></flexcomp>',
     '<equality><connect name="hung" active="false" body1="hand" body2="world" anchor="0 0 0"/></equality>'
     + actuated('<motor name="push" joint="hinge" nsample="4" delay=".01"/>'),
-)
+))  # fmt: skip
 FIELDS = ("eq_active", "history", "plastic", "energy", "flexvert_xpos", "flexedge_length", "flexedge_velocity")
 
 
-def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujoco() -> None:
+def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujoco(shared_env: SharedEnv) -> None:
     seen = []
     for engine in ("mujoco", "warp"):
-        env = lw.make(task_with(RICH), engine=engine, nworld=2, fields=FIELDS, seed=1)
+        env = shared_env(RICH, engine=engine, nworld=2, fields=FIELDS)
         for _ in range(3):
             env.action.fill_(0.3)
             env.step()
@@ -120,11 +120,11 @@ def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujo
         torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
 
 
-def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines() -> None:
+def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines(shared_env: SharedEnv) -> None:
     """The engine also accepts boolean values."""
     ends = []
     for engine in ("mujoco", "warp"):
-        env = lw.make(task_with(RICH), engine=engine, nworld=2, fields=["eq_active"])
+        env = shared_env(RICH, engine=engine, nworld=2, fields=FIELDS)
         env.reset()
         env.field("eq_active")[1, 0] = True
         env.engine.commit(wp.full(2, True, dtype=bool))
@@ -148,11 +148,10 @@ def test_a_rollout_accepts_an_empty_field(engine: str) -> None:
     rollout.state.copy_(env.get_state()[0])
     rollout.actions.zero_()
     rollout.run()
-    live = lw.make(task_with(text(ARM)), engine=engine, nworld=2, autoreset=False)
-    live.set_state(rollout.state.expand(2, -1).contiguous())
+    env.set_state(rollout.state.expand(2, -1).contiguous())
     for t in range(3):
-        live.step(torch.zeros_like(live.action))
-        assert torch.equal(rollout.reward[t], live.reward)
+        env.step(torch.zeros_like(env.action))
+        assert torch.equal(rollout.reward[t], env.reward)
     assert rollout.reward.abs().min() > 0
 
 

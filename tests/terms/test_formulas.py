@@ -50,7 +50,7 @@ VALUES: dict[str, Any] = {
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
     "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
-"""Functions that make an argument's value: one shared value, or one entry per world."""
+"""Each argument's value: one shared value, or one entry per world."""
 
 
 def total(rows: np.ndarray) -> np.ndarray:
