@@ -15,7 +15,8 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, described, whole_number
 
-MEAN_SEED = 2**31 - 1
+_MEAN_SEED = 2**31 - 1
+_MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
 
 
 def evaluation_seed(seed: int) -> int:
@@ -148,24 +149,19 @@ class MeanPolicyEvaluation:
         self.env, self.episodes, self.team = env, episodes, team
         self._few: Env | None = None
 
-    def __call__(self, policy: torch.nn.Module) -> dict[str, float]:
-        """Return the means of ``MEAN_STATISTICS``."""
-        means = torch.zeros(len(MEAN_STATISTICS), dtype=torch.float64, device=self.env.obs.device)
-        if self.team.leads:
-            if self._few is None:
-                self._few = evaluation_worlds(self.env, self.episodes)
-            self._few.follow(self.env)
-            episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=MEAN_SEED)
-            parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
-            means.copy_(torch.stack([part.mean() for part in parts]))
-        self.team.copy_leader([means])
-        return dict(zip(MEAN_STATISTICS, means.tolist(), strict=True))
-
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
         """Add the results of an evaluation to the statistics, or None for each result if no evaluation is due."""
-        mean: dict[str, Any] = self(policy) if due else dict.fromkeys(MEAN_STATISTICS)
+        found: dict[str, Any] = dict.fromkeys(_MEAN_STATISTICS)
+        if due:
+            means = torch.zeros(len(found), dtype=torch.float64, device=self.env.obs.device)
+            if self.team.leads:
+                if self._few is None:
+                    self._few = evaluation_worlds(self.env, self.episodes)
+                self._few.follow(self.env)
+                episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=_MEAN_SEED)
+                parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
+                means.copy_(torch.stack([part.mean() for part in parts]))
+            self.team.copy_leader([means])
+            found = dict(zip(found, means.tolist(), strict=True))
         success = self.env.task.functions["success"] is not None
-        return {**statistics, **mean} | ({} if success else {"success": math.nan, "mean_success": None})
-
-
-MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
+        return {**statistics, **found} | ({} if success else {"success": math.nan, "mean_success": None})

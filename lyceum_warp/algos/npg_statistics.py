@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 
-from lyceum_warp.algos.rollout_statistics import Moments, OnPolicyIteration, pooled
+from lyceum_warp.algos.rollout_statistics import OnPolicyIteration, pooled
 from lyceum_warp.support.docstrings import document_attributes
 
 
@@ -54,8 +54,9 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str,
 
 def value_statistics(sums: Sequence[Mapping[str, float]], samples: int) -> dict[str, float]:
     """Compute ``value_error`` and ``explained_variance`` from each process's sums over its ``samples`` samples."""
-    n, mean, square = pooled([Moments(samples, part["target_mean"], part["target_square"]) for part in sums])
-    _, error_mean, error_square = pooled([Moments(samples, part["error_mean"], part["error_square"]) for part in sums])
+    sized = [{**part, "samples": samples} for part in sums]
+    n, mean, square = pooled(sized, "samples", "target_mean", "target_square")
+    _, error_mean, error_square = pooled(sized, "samples", "error_mean", "error_square")
     error, size = error_square + n * error_mean**2, square + n * mean**2
     return {
         "value_error": error / max(size, 1e-20 * n),

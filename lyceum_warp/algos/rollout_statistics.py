@@ -3,17 +3,14 @@
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any
 
 import torch
 
 from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.learner import NESTED, Iteration
+from lyceum_warp.algos.learner import METRIC_COLUMN, NESTED, STEP_METRIC_COLUMN, Iteration
 from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.support.docstrings import document_attributes
-
-Scalar: TypeAlias = Any
-"""A scalar tensor, or a float on the host."""
 
 
 @document_attributes
@@ -50,32 +47,6 @@ class OnPolicyIteration(SampledIteration):
     """Mean standard deviation of the policy's actions."""
 
 
-class EpisodeSums(NamedTuple):
-    """Statistics of the episodes that ended in one process's worlds.
-
-    ``return_square`` is the sum of the squared deviations of the returns from their mean. ``length`` and the following
-    fields are sums over the episodes.
-    """
-
-    episodes: Scalar
-    return_mean: Scalar
-    return_square: Scalar
-    return_min: Scalar
-    return_max: Scalar
-    length: Scalar
-    terminal_reward: Scalar
-    eval: Scalar
-    success: Scalar
-
-
-class Moments(NamedTuple):
-    """Number, mean and sum of squared deviations from the mean of a set of numbers."""
-
-    n: float
-    mean: float
-    square: float
-
-
 def gathered(
     rollout: Rollout, team: Team, numbers: Mapping[str, torch.Tensor]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -89,94 +60,67 @@ def gathered(
     Returns:
         The fields of ``SampledIteration`` that describe samples and episodes, by name; and ``numbers`` of each process.
     """
-    samples = [rollout.reward.double().mean(), rollout.faults.sum()]
-    scalars = [*samples, *finished(rollout), *metric_sums(rollout), *numbers.values()]
-    processes = team.gather(torch.stack([scalar.double() for scalar in scalars])[None]).tolist()
-    split = len(samples) + len(EpisodeSums._fields)
-    end = split + 2 * len(rollout.metrics)
-    rewards, faults = ([process[i] for process in processes] for i in range(len(samples)))
-    episodes = [EpisodeSums(*process[len(samples) : split]) for process in processes]
-    sums, count = [process[split:end] for process in processes], sum(part.episodes for part in episodes)
+    named = {**_sums(rollout), **numbers}
+    rows = team.gather(torch.stack([scalar.double() for scalar in named.values()])[None]).tolist()
+    processes = [dict(zip(named, row, strict=True)) for row in rows]
+    episodes, mean, square = pooled(processes, "episodes", "return_mean", "return_square")
+
+    def total(name: str) -> float:
+        return sum(process[name] for process in processes)
+
+    def by_episode(name: str) -> float:
+        return total(name) / episodes if episodes else math.nan
+
     statistics = {
-        "reward_mean": sum(rewards) / len(processes), "faults": round(sum(faults)), **episode_statistics(episodes),
-        **metric_means(count, sums, list(rollout.metrics)),
-    }  # fmt: skip
-    return statistics, [dict(zip(numbers, process[end:], strict=True)) for process in processes]
+        "reward_mean": total("reward") / len(processes),
+        "faults": round(total("faults")),
+        "return_mean": mean if episodes else math.nan,
+        "return_std": math.sqrt(square / episodes) if episodes else math.nan,
+        "return_min": min(process["return_min"] for process in processes) if episodes else math.nan,
+        "return_max": max(process["return_max"] for process in processes) if episodes else math.nan,
+        **{name: by_episode(name) for name in ("length_mean", "terminal_reward", "eval_mean", "success")},
+        "metrics": {name: by_episode(METRIC_COLUMN + name) for name in rollout.metrics},
+        "step_metrics": {name: total(STEP_METRIC_COLUMN + name) / len(processes) for name in rollout.metrics},
+    }
+    return statistics, [{name: process[name] for name in numbers} for process in processes]
 
 
-def finished(rollout: Rollout) -> EpisodeSums:
-    """Compute sums over the episodes that ended in a rollout."""
-    ended = _ended(rollout)
+def _sums(rollout: Rollout) -> dict[str, torch.Tensor]:
+    """Compute sums over the episodes that ended in a rollout, and means over all samples."""
+    ended = rollout.done & ~rollout.episode_return.isnan()
     returns = rollout.episode_return.double()
-    infinity = torch.inf
 
     def total(part: torch.Tensor) -> torch.Tensor:
         return part.double().masked_fill(~ended, 0.0).sum()
 
     episodes = ended.sum().double()
     mean = total(returns) / episodes.clamp_min(1.0)
-    return EpisodeSums(
-        episodes=episodes,
-        return_mean=mean,
-        return_square=total((returns - mean).square()),
-        return_min=returns.masked_fill(~ended, infinity).min(),
-        return_max=returns.masked_fill(~ended, -infinity).max(),
-        length=total(rollout.episode_length),
-        terminal_reward=total(rollout.reward),
-        eval=total(rollout.eval),
-        success=total(rollout.success),
-    )
-
-
-def metric_sums(rollout: Rollout) -> tuple[torch.Tensor, ...]:
-    """Sum the task's metrics over the ended episodes of a rollout, and average them over all samples.
-
-    Non-finite metrics count as zero.
-    """
-    ended = _ended(rollout)
-    sums = [sums.double().masked_fill(~ended, 0.0).sum() for sums in rollout.episode_metrics.values()]
-    return (*sums, *(steps.double().nan_to_num(0.0, 0.0, 0.0).mean() for steps in rollout.metrics.values()))
-
-
-def _ended(rollout: Rollout) -> torch.Tensor:
-    return rollout.done & ~rollout.episode_return.isnan()
-
-
-def metric_means(episodes: float, sums: Sequence[Sequence[float]], names: Sequence[str]) -> dict[str, Any]:
-    """Compute ``Iteration.metrics`` and ``Iteration.step_metrics``."""
-    totals = [sum(parts) for parts in zip(*sums, strict=True)]
-    ended, steps = totals[: len(names)], totals[len(names) :]
     return {
-        "metrics": {name: total / episodes if episodes else math.nan for name, total in zip(names, ended, strict=True)},
-        "step_metrics": {name: total / len(sums) for name, total in zip(names, steps, strict=True)},
-    }
+        "reward": rollout.reward.double().mean(),
+        "faults": rollout.faults.sum(),
+        "episodes": episodes,
+        "return_mean": mean,
+        "return_square": total((returns - mean).square()),
+        "return_min": returns.masked_fill(~ended, torch.inf).min(),
+        "return_max": returns.masked_fill(~ended, -torch.inf).max(),
+        "length_mean": total(rollout.episode_length),
+        "terminal_reward": total(rollout.reward),
+        "eval_mean": total(rollout.eval),
+        "success": total(rollout.success),
+        **{METRIC_COLUMN + name: total(sums) for name, sums in rollout.episode_metrics.items()},
+        **{STEP_METRIC_COLUMN + name: steps.double().nan_to_num(0.0, 0.0, 0.0).mean()
+           for name, steps in rollout.metrics.items()},
+    }  # fmt: skip
 
 
-def episode_statistics(sums: Sequence[EpisodeSums]) -> dict[str, float]:
-    """Compute statistics of the finished episodes of all processes; NaN if no episode ended."""
-    episodes, mean, square = pooled([Moments(part.episodes, part.return_mean, part.return_square) for part in sums])
-    if not episodes:
-        return dict.fromkeys(_EPISODE_STATISTICS, math.nan)
-    numbers = (
-        mean,
-        math.sqrt(square / episodes),
-        min(part.return_min for part in sums),
-        max(part.return_max for part in sums),
-        sum(part.length for part in sums) / episodes,
-        sum(part.terminal_reward for part in sums) / episodes,
-        sum(part.eval for part in sums) / episodes,
-        sum(part.success for part in sums) / episodes,
-    )
-    return dict(zip(_EPISODE_STATISTICS, numbers, strict=True))
+def pooled(parts: Sequence[Mapping[str, float]], *names: str) -> tuple[float, float, float]:
+    """Compute the size of the union of several sets, its mean, and its sum of squared deviations from the mean.
 
-
-_EPISODE_STATISTICS = (
-    "return_mean", "return_std", "return_min", "return_max", "length_mean", "terminal_reward", "eval_mean", "success",
-)  # fmt: skip
-
-
-def pooled(parts: Sequence[Moments]) -> Moments:
-    """Compute the moments of the union of several sets."""
-    n = sum(part.n for part in parts)
-    mean = sum(part.n * part.mean for part in parts) / n if n else 0.0
-    return Moments(n, mean, sum(part.square + part.n * (part.mean - mean) ** 2 for part in parts))
+    Args:
+        parts: Numbers of each set.
+        names: Names of a set's size, mean and sum of squared deviations.
+    """
+    sets = [[part[name] for name in names] for part in parts]
+    n = sum(size for size, _, _ in sets)
+    mean = sum(size * mean for size, mean, _ in sets) / n if n else 0.0
+    return n, mean, sum(square + size * (own - mean) ** 2 for size, own, square in sets)

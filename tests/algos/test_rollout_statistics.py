@@ -8,19 +8,9 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.algos.npg_statistics import prediction_sums, value_statistics
-from lyceum_warp.algos.rollout_statistics import (
-    EpisodeSums,
-    episode_statistics,
-    finished,
-    metric_means,
-    metric_sums,
-)
+from lyceum_warp.algos.rollout_statistics import gathered
 
 NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
-
-
-def floats(sums: EpisodeSums) -> EpisodeSums:
-    return EpisodeSums(*(number.item() for number in sums))
 
 
 @pytest.fixture(scope="module")
@@ -34,12 +24,22 @@ def rollout() -> lw.Rollout:
     return rollout
 
 
-def part_of(rollout: lw.Rollout, worlds: slice) -> Any:
-    return SimpleNamespace(
-        **{name: getattr(rollout, name)[:, worlds] for name in NAMES},
-        episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
-        metrics={name: values[:, worlds] for name, values in rollout.metrics.items()},
-    )
+def statistics(rollout: lw.Rollout, *shares: slice) -> dict[str, Any]:
+    """Gather the statistics of processes with the given shares of a rollout's worlds."""
+    rows: list[torch.Tensor] = []
+
+    def gather(row: torch.Tensor) -> torch.Tensor:
+        rows.append(row)
+        return torch.cat(rows)
+
+    for worlds in shares:
+        part: Any = SimpleNamespace(
+            **{name: getattr(rollout, name)[:, worlds] for name in NAMES}, faults=rollout.faults[worlds],
+            episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
+            metrics={name: values[:, worlds] for name, values in rollout.metrics.items()},
+        )  # fmt: skip
+        found, _ = gathered(part, SimpleNamespace(gather=gather), {})  # type: ignore[arg-type]
+    return found
 
 
 def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
@@ -54,10 +54,23 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
         "success": rollout.success[ended].float().mean(),
     }  # fmt: skip
     expected = {name: tensor.item() for name, tensor in tensors.items()}
-    assert episode_statistics([floats(finished(rollout))]) == pytest.approx(expected, rel=1e-5)
-    parts = [floats(finished(part_of(rollout, worlds))) for worlds in (slice(0, 1), slice(1, None))]
-    assert parts[0].episodes < parts[1].episodes
-    assert episode_statistics(parts) == pytest.approx(expected, rel=1e-5)
+    metrics = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
+    assert list(metrics) == ["forward", "effort"] and metrics["effort"] > 0.1
+    for shares in ([slice(None)], [slice(0, 1), slice(1, None)]):
+        found = statistics(rollout, *shares)
+        assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-5)
+        assert found["metrics"] == pytest.approx(metrics, rel=1e-5)
+    nothing = SimpleNamespace(**vars(rollout) | {"done": torch.zeros_like(rollout.done)})
+    found = statistics(nothing, slice(None))  # type: ignore[arg-type]
+    assert all(math.isnan(number) for number in (*(found[name] for name in expected), *found["metrics"].values()))
+
+
+def test_step_statistics_cover_all_samples(rollout: lw.Rollout) -> None:
+    steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
+    for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
+        found = statistics(rollout, *(slice(k, k + count) for k in range(0, rollout.env.nworld, count)))
+        assert found["step_metrics"] == pytest.approx(steps, rel=1e-5)
+        assert found["reward_mean"] == pytest.approx(rollout.reward.mean().item())
 
 
 def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
@@ -75,26 +88,6 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     )
 
 
-def test_metric_means_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The means of a rollout equal the pooled means of two subsets of its worlds, or NaN without episodes."""
-    ended = rollout.done & ~rollout.episode_return.isnan()
-    expected = {name: sums[ended].mean().item() for name, sums in rollout.episode_metrics.items()}
-    assert list(expected) == ["forward", "effort"] and expected["effort"] > 0.1
-
-    def means(*shares: slice) -> dict[str, Any]:
-        parts = [part_of(rollout, worlds) for worlds in shares]
-        sums = [[number.item() for number in metric_sums(part)] for part in parts]
-        return metric_means(sum(finished(part).episodes.item() for part in parts), sums, list(expected))
-
-    for shares in ([slice(None)], [slice(0, 1), slice(1, None)]):
-        assert means(*shares)["metrics"] == pytest.approx(expected, rel=1e-5)
-    steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
-        shares = [slice(k, k + count) for k in range(0, rollout.env.nworld, count)]
-        assert means(*shares)["step_metrics"] == pytest.approx(steps, rel=1e-5)
-    assert all(math.isnan(mean) for mean in metric_means(0.0, [[0.0] * 4], list(expected))["metrics"].values())
-
-
 def test_metrics_row_has_a_column_for_each_metric() -> None:
     env = lw.make(Metered, nworld=4)
     config = lw.NPGConfig(samples=400, hidden=(8,), value_hidden=(8,), mean_every=0)
@@ -106,12 +99,6 @@ def test_metrics_row_has_a_column_for_each_metric() -> None:
     wanted = ["metrics/forward", "metrics/effort", "step_metrics/forward", "step_metrics/effort"]
     assert "metrics" not in row and list(row)[-4:] == wanted
     assert row["metrics/effort"] == it.metrics["effort"] and row["return_mean"] == it.return_mean
-
-
-def test_mean_reward_covers_all_samples_even_if_no_episode_ended() -> None:
-    env = lw.make("point_mass", nworld=4, horizon=1000)
-    npg = lw.NPG(env, config=lw.NPGConfig(samples=40, rollout="segments", hidden=(4,), value_hidden=(4,)))
-    assert next(npg).reward_mean == pytest.approx(npg.rollout.reward.mean().item())
 
 
 def test_task_without_success_reports_no_success_rate() -> None:
