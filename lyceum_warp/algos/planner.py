@@ -19,15 +19,15 @@ With several plants, each plant has its own plan, and the planner rolls out the 
 samples of a single plan may leave most of a GPU, or most threads, idle.
 
 ``update`` selects how samples are weighted; the formula of step 4 is MPPI's (``mppi.py``). CEM (``cem.py``) weights the
-best samples equally and then fits the noise to them. Predictive sampling (``predictive_sampling.py``) takes the best
-sample. A custom update (``plan_update.py``) weights the samples, and may also fit parameters. With knots, the planner
-shifts, perturbs and averages the knots of a spline, and interpolates actions from them (``kernels/knots.py``).
+best samples equally and then fits the noise to them. Predictive sampling takes the best sample. A custom update
+(``plan_update.py``) weights the samples, and may also fit parameters. With knots, the planner shifts, perturbs and
+averages the knots of a spline, and interpolates actions from them (``kernels/knots.py``).
 """
 
 import copy
 import itertools
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -35,15 +35,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.cem import CrossEntropy
+from lyceum_warp.algos.cem import CrossEntropy, EliteWeights
 from lyceum_warp.algos.mppi import ExponentialWeights
 from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
-from lyceum_warp.algos.planner_state import checked_state, state_from_parts
 from lyceum_warp.algos.policy_check import check_value
-from lyceum_warp.algos.predictive_sampling import BestSample
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import Done
@@ -328,7 +326,7 @@ class Planner:
             ValueError: The state has the wrong shape or type, or is not finite.
         """
         self.env.check_process()
-        self._loop.state.copy_(checked_state(self.env, state, self._loop.state))
+        self._loop.state.copy_(self._checked(state))
         self._shift_view.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
             call()
@@ -339,8 +337,36 @@ class Planner:
             self._warn_of_failed_samples()
         return action
 
+    def _checked(self, state: torch.Tensor) -> torch.Tensor:
+        """Check the state to plan from, or the states of all plants, and unpack a single row."""
+        like = self._loop.state
+        if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
+            state = state[0]
+        if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
+            call = "plan.state_of(qpos=..., qvel=...)"
+            if like.ndim == 1:
+                which, hint = "a state", f"make it from its parts with {call}"
+            else:
+                which, hint = "the states", f"stack one {call} for each plant"
+            raise ValueError(
+                f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the "
+                f"same task, or {hint}. (With fields=[...], an environment's states may be longer.)"
+            )
+        # a check on a GPU would wait for the device; an unchecked non-finite state only makes all samples fail
+        if state.device.type != "cpu":
+            return state
+        values = state.numpy().ravel()
+        # a plan may take only a millisecond, so check with a fast dot product first
+        if not np.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
+            where = int(np.flatnonzero(~finite)[0])
+            plant, column = divmod(where, self.env.state_space.size)
+            parts = self.env.state_space.parts.items()
+            part = next(name for name, part in parts if part.start <= column < part.stop)
+            which = "the state" if like.ndim == 1 else f"the state of plant {plant}"
+            raise ValueError(f"{which} to plan from has {values[where]} in its {part!r}: states must be finite")
+        return state
+
     def _warn_of_failed_samples(self) -> None:
-        """Log that all samples of a plan failed, with the faults and a fix."""
         faults = Done(int(np.bitwise_or.reduce(self._loop.fault.cpu().numpy())))
         substep, frame_skip = self.env.model.opt.timestep, self.env.task.frame_skip
         if faults:
@@ -367,10 +393,7 @@ class Planner:
                 Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples),
                 self._fit_in_torch,
             ]  # fmt: skip
-        return self._sequence(parts)
-
-    def _sequence(self, parts: Iterable[Phase | Callable[[], None]]) -> Calls:
-        """Turn phases into as few graphs as possible; functions that use torch run between the graphs."""
+        # phases become as few graphs as possible; functions that use torch run between the graphs
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)
@@ -534,7 +557,21 @@ class Planner:
         Raises:
             ValueError: A part is unknown, or its value has the wrong size or is not a number.
         """
-        return state_from_parts(self.env, self._initial, parts)
+        space, state = self.env.state_space, self._initial.clone()
+        for name, value in parts.items():
+            if name not in space.parts:
+                raise ValueError(f"a state of {self.env.task.name!r} has no part {name!r}: it has {list(space.parts)}")
+            target = state[space.parts[name]]
+            try:
+                values = torch.as_tensor(value, dtype=torch.float64).ravel()
+            except (TypeError, ValueError, RuntimeError) as error:
+                raise ValueError(f"the part {name!r} of a state must be numbers, not {value!r}") from error
+            if values.shape != target.shape:
+                raise ValueError(f"the part {name!r} of a state has {len(target)} numbers, not {len(values)}")
+            target.copy_(values)
+        if "time" in parts and "step" not in parts:
+            state[space.parts["step"]] = torch.round(state[space.parts["time"]] / self.timestep)
+        return state
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -567,7 +604,7 @@ def _update_of(config: MPPIConfig) -> PlanUpdate:
     if config.update == "cem":
         assert config.elites is not None and config.min_noise is not None
         return CrossEntropy(config.elites, config.min_noise, config.noise_smoothing)
-    return ExponentialWeights(config.temperature) if config.update == "mppi" else BestSample()
+    return ExponentialWeights(config.temperature) if config.update == "mppi" else EliteWeights(1)
 
 
 class MPPI(Planner):  # noqa: D101
