@@ -16,32 +16,33 @@ LEAST = -math.inf
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
     """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
-    A field is a number, a bool, a ``Literal``, the widths of hidden layers (``tuple[int, ...]``) or the name of a group
-    of observations (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
+    Checked are numbers with bounds, bools, ``Literal``, the widths of hidden layers (``tuple[int, ...]``) and names of
+    groups of observations (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
     """
     for field in dataclasses.fields(config):
-        name, kind, value = field.name, field.type, getattr(config, field.name)
-        arguments = typing.get_args(kind)
-        if value is None and types.NoneType in arguments:
+        name, value = field.name, getattr(config, field.name)
+        kinds = (field.type, *typing.get_args(field.type))
+        words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
+        if value is None and types.NoneType in kinds:
             continue
-        if kind is bool:
+        if bool in kinds:
             check_flag(name, value)
-        elif words := [word for one in (kind, *arguments) if typing.get_origin(one) is Literal
-                       for word in typing.get_args(one)]:  # fmt: skip
-            check_word(name, value, words)
-        elif tuple[int, ...] in (kind, *arguments):
+        elif tuple[int, ...] in kinds:
             value = tuple(layer_sizes(value, name))
-        elif str in arguments:
+        elif field.type == str | None:
             if not isinstance(value, str):
                 raise ValueError(f"{name} must be the name of a group of observations, not {value!r}")
         elif name in bounds:
             bound = bounds[name]
             low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
-            if int in (kind, *arguments):
-                value = whole_number(name, value, low=int(low))
+            if int in kinds:
+                limit = {} if high == math.inf else {"high": int(high)}
+                value = whole_number(name, value, low=int(low), **limit)
             else:
                 value = finite_number(name, value, low=low, high=high)
+        elif words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type))):
+            check_word(name, value, words)
         object.__setattr__(config, name, value)

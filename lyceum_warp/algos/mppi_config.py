@@ -8,16 +8,20 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import torch
 
+from lyceum_warp.algos.hyperparameters import check_fields
 from lyceum_warp.algos.plan_update import PlanUpdate
-from lyceum_warp.kernels.knots import ORDERS
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_word, finite_number, whole_number
+from lyceum_warp.support.validate import check_word
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
-_SMALLEST = float(np.finfo(np.float32).tiny)
-"""The smallest normal float32; kernels compute in float32."""
+_BOUNDS: dict[str, float | tuple[float, float]] = {
+    "horizon": 1, "samples": 1, "models": 1, "iterations": (1, 100_000), "elites": 1, "knots": 1,
+    "discount": (0.0, 1.0),
+    # the smallest normal float32, because kernels compute in float32
+    "temperature": float(np.finfo(np.float32).tiny),
+}  # fmt: skip
 
 
 @document_attributes
@@ -85,46 +89,29 @@ class MPPIConfig:
 
     def __post_init__(self) -> None:
         """Check the settings that do not depend on a task."""
-        checked: dict[str, Any] = {
-            name: whole_number(name, getattr(self, name), low=1) for name in ("horizon", "samples", "models")
-        }
-        checked["iterations"] = whole_number("iterations", self.iterations, low=1, high=100_000)
-        checked["temperature"] = finite_number("temperature", self.temperature, low=_SMALLEST)
-        checked["noise"] = _noise(self.noise)
-        checked["smoothing"] = _smoothing(self.smoothing)
-        if self.discount is not None:
-            checked["discount"] = finite_number("discount", self.discount, low=0.0, high=1.0)
-        checked["fill"] = _fill(self.fill)
-        check_word("termination", self.termination, ("stop", "ignore"))
-        check_word("spline", self.spline, tuple(ORDERS))
-        check_word("between", self.between, ("hold", "linear"))
-        check_word("risk", self.risk, ("mean", "worst"))
         if not isinstance(self.update, PlanUpdate):
             updates = ("mppi", "cem", "predictive_sampling")
             check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
-        check_flag("nominal_model", self.nominal_model)
-        if self.include_plan is not None:
-            check_flag("include_plan", self.include_plan)
+        check_fields(self, _BOUNDS)
+        checked = {"noise": _noise(self.noise), "smoothing": _smoothing(self.smoothing), "fill": _fill(self.fill)}
         if self.min_noise is not None:
             checked["min_noise"] = _deviations("min_noise", self.min_noise)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         for name, most in (("elites", "samples"), ("knots", "horizon")):
-            if (value := getattr(self, name)) is not None:
-                checked[name] = whole_number(name, value, low=1)
-                if checked[name] > checked[most]:
-                    raise ValueError(f"{name}={checked[name]} must be at most {most}, which is {checked[most]}")
+            if (value := getattr(self, name)) is not None and value > getattr(self, most):
+                raise ValueError(f"{name}={value} must be at most {most}, which is {getattr(self, most)}")
         if self.spline != "cubic" and self.knots is None:
             raise ValueError(
                 f"spline={self.spline!r} interpolates between knots: give the number of knots, such as knots=4"
             )
-        if checked["models"] == 1 and self.risk != "mean":
+        if self.models == 1 and self.risk != "mean":
             raise ValueError(f"risk={self.risk!r} compares models: give the number of models, such as models=4")
-        if checked["models"] > 1 and self.nominal_model:
+        if self.models > 1 and self.nominal_model:
             raise ValueError(
-                f"models={checked['models']} draws model fields, but nominal_model=True does not: omit one of the "
-                "two settings"
+                f"models={self.models} draws model fields, but nominal_model=True does not: omit one of the two "
+                "settings"
             )
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
 
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
         """Return a copy with changed settings; a new ``update`` resets the old update's settings to defaults.
