@@ -41,12 +41,8 @@ class Team:
         # other threads, such as NCCL's, may call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
             function()
-        self.keep(graph)
-        return graph
-
-    def keep(self, graph: torch.cuda.CUDAGraph) -> None:
-        """Register a graph for ``release``."""
         self._graphs.add(graph)
+        return graph
 
     def release(self) -> None:
         """Reset all graphs, because NCCL does not shut down while a graph exists."""
@@ -156,23 +152,17 @@ class Captured:
             return
         with torch.cuda.device(self.device):
             if not self._warm:
-                with side_stream():
+                # before a capture, torch requires a run on a stream that is not the default stream
+                current, side = torch.cuda.current_stream(), torch.cuda.Stream()
+                side.wait_stream(current)
+                with torch.cuda.stream(side):
                     self.function()
+                current.wait_stream(side)
                 self._warm = True
                 return
             if self.graph is None:
                 self.graph = self.team.capture(self.function)
             self.graph.replay()
-
-
-@contextlib.contextmanager
-def side_stream() -> Iterator[None]:
-    """Run a block on a non-default CUDA stream, as torch requires before a capture."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        yield
-    torch.cuda.current_stream().wait_stream(stream)
 
 
 @contextlib.contextmanager

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.dense import DensePasses, DenseValue
-from lyceum_warp.algos.distributed import Team, side_stream
+from lyceum_warp.algos.distributed import Captured, Team
 from lyceum_warp.algos.timing import one_thread
 from lyceum_warp.algos.value import BOUND, ValueFunction
 
@@ -199,21 +199,10 @@ class CapturedStep:
         place = torch.arange(self.count * fit.batch, device=device).view(self.count, fit.batch)
         self.inside = (place < fit.samples).float()
         self.inside /= self.inside.sum(1, keepdim=True)
-        self.graph: Any = None
+        self.step = Captured(self.learn, fit.team, device)
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
         """Run an epoch with a permutation of all processes' samples."""
-        self.load(features, target, order)
-        done = 0
-        if self.graph is None:
-            done = min(3, self.count)
-            with torch.cuda.device(features.device):
-                self._capture(done)
-        for _ in range(done, self.count):
-            self.graph.replay()
-
-    def load(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Copy the samples and the order of an epoch."""
         self.features.copy_(features)
         self.target.copy_(target)
         filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
@@ -221,13 +210,8 @@ class CapturedStep:
         self.places.copy_(places)
         torch.mul(self.inside, own, out=self.weight)
         self.at.zero_()
-
-    def _capture(self, times: int) -> None:
-        """Run ``times`` steps without a graph, so that Adam allocates its moments; then capture the graph."""
-        with side_stream():
-            for _ in range(times):
-                self.learn()
-        self.graph = self.fit.team.capture(self.learn)
+        for _ in range(self.count):
+            self.step()
 
     def learn(self) -> None:
         """Learn from the next mini-batch."""

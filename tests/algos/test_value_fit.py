@@ -60,7 +60,7 @@ def test_gpu_captured_value_fit_equals_plain_launches() -> None:
         for obs, target in ((part[:, :5], part[:, 5]) for part in data):
             if captured:
                 fit(obs, torch.zeros(samples, device="cuda"), target, generator)
-                assert fit.captured is not None and fit.captured.graph is not None
+                assert fit.captured is not None and fit.captured.step.graph is not None
                 continue
             for _ in range(fit.epochs):
                 order = torch.randperm(samples, generator=generator, device="cuda")
