@@ -178,11 +178,61 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         if names := _differing_names([getattr(episode, name) for episode in episodes]):
             raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
+    seconds = _joined(episode.plan_times[1:] for episode in episodes)
+    times, misses = 1000 * seconds, int((seconds > deadline).sum())
+    failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
+    failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
+    samples = first.controller.get("samples")
+    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
+    ages, age_steps = (_joined(getattr(e, name) for e in episodes) for name in ("ages", "age_steps"))
+    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
+    timed = first.mode == "async"
+    returns = np.array([episode.episode_return for episode in episodes])
+    wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
+    successes = sum(episode.succeeded for episode in episodes)
+    low, high = wilson(successes, len(episodes))
     return ControlReport(
-        task=first.task, engine=first.engine, mode=first.mode, params=first.params, controller=first.controller,
-        versions=first.versions, **_outcome_statistics(episodes), **_plan_statistics(episodes, deadline),
-        **_sample_statistics(episodes), **_tick_statistics(episodes), **_age_statistics(episodes),
-    )  # fmt: skip
+        task=first.task,
+        engine=first.engine,
+        mode=first.mode,
+        episodes=len(episodes),
+        steps=steps,
+        plans=len(times),
+        first_plan_ms=1000 * max(float(episode.plan_times[0]) for episode in episodes),
+        plan_mean_ms=float(times.mean()) if len(times) else None,
+        plan_p50_ms=_quantile(times, 0.5, least=2),
+        plan_p90_ms=_quantile(times, 0.9, least=10),
+        plan_p99_ms=_quantile(times, 0.99, least=100),
+        plan_p99_9_ms=_quantile(times, 0.999, least=1000),
+        plan_max_ms=float(times.max()) if len(times) else None,
+        plan_jitter_ms=_std(times),
+        plans_per_second=_plans_per_second(episodes),
+        deadline_ms=1000 * deadline,
+        misses=misses,
+        miss_share=misses / len(times) if len(times) else None,
+        blind_plans=int((failed >= samples).sum()) if known else None,
+        known_plans=len(failed) if known else 0,
+        failed_share=float(failed.mean() / samples) if known else None,
+        effective_samples_mean=float(effective.mean()) if len(effective) else None,
+        tick_jitter_ms=_std(delays) if timed else None,
+        tick_delay_max_ms=float(delays.max()) if timed else None,
+        late_ticks=sum(int(episode.late.sum()) for episode in episodes) if timed else None,
+        age_mean_ms=1000 * float(ages.mean()),
+        age_max_ms=1000 * float(ages.max()),
+        age_steps_mean=float(age_steps.mean()),
+        age_steps_max=int(age_steps.max()),
+        real_time_factor=steps * first.timestep / wall,
+        episode_seconds_mean=wall / len(episodes),
+        return_mean=float(returns.mean()),
+        return_std=_std(returns),
+        eval_mean=float(np.mean([float(episode.evals[-1]) for episode in episodes])),
+        success=successes / len(episodes),
+        success_low=low,
+        success_high=high,
+        params=first.params,
+        controller=first.controller,
+        versions=first.versions,
+    )
 
 
 def _text(value: float | None, form: str, around: str = "{}", missing: str = "-") -> str:
@@ -203,10 +253,6 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# quantile, and number of plans that it needs
-_QUANTILES = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000)}
-
-
 def wilson(successes: int, trials: int) -> tuple[float, float]:
     """Compute Wilson's 95 % confidence interval of a proportion (Wilson 1927)."""
     z = 1.959963984540054
@@ -225,30 +271,14 @@ def _std(values: np.ndarray) -> float | None:
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
+def _quantile(times: np.ndarray, q: float, *, least: int) -> float | None:
+    return float(np.quantile(times, q)) if len(times) >= least else None
+
+
 def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
     names = dict.fromkeys(name for mapping in mappings for name in mapping)
     # compare texts, because NaN != NaN
     return [name for name in names if len({json.dumps(mapping.get(name)) for mapping in mappings}) > 1]
-
-
-def _plan_statistics(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
-    times = _joined(episode.plan_times[1:] for episode in episodes)
-    misses = int((times > deadline).sum())
-    return {
-        "plans": len(times),
-        "first_plan_ms": 1000 * max(float(episode.plan_times[0]) for episode in episodes),
-        "plan_mean_ms": 1000 * float(times.mean()) if len(times) else None,
-        **{
-            f"plan_{name}_ms": float(np.quantile(1000 * times, q)) if len(times) >= enough else None
-            for name, (q, enough) in _QUANTILES.items()
-        },
-        "plan_max_ms": 1000 * float(times.max()) if len(times) else None,
-        "plan_jitter_ms": _std(1000 * times),
-        "plans_per_second": _plans_per_second(episodes),
-        "deadline_ms": 1000 * deadline,
-        "misses": misses,
-        "miss_share": misses / len(times) if len(times) else None,
-    }
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
@@ -258,57 +288,3 @@ def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:
         plans += int((ends[1:] <= episode.wall_seconds).sum())  # the last plan may end after the plant has stopped
         seconds += episode.wall_seconds - max(0.0, float(ends[0]))
     return plans / seconds if plans and seconds > 0 else None
-
-
-def _sample_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
-    failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
-    samples = episodes[0].controller.get("samples")
-    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
-    return {
-        "blind_plans": int((failed >= samples).sum()) if known else None,
-        "known_plans": len(failed) if known else 0,
-        "failed_share": float(failed.mean() / samples) if known else None,
-        "effective_samples_mean": float(effective.mean()) if len(effective) else None,
-    }
-
-
-def _tick_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    if episodes[0].mode == "sync":
-        return {"tick_jitter_ms": None, "tick_delay_max_ms": None, "late_ticks": None}
-    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
-    return {
-        "tick_jitter_ms": _std(delays),
-        "tick_delay_max_ms": float(delays.max()),
-        "late_ticks": sum(int(episode.late.sum()) for episode in episodes),
-    }
-
-
-def _age_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    ages = _joined(episode.ages for episode in episodes)
-    age_steps = _joined(episode.age_steps for episode in episodes)
-    return {
-        "age_mean_ms": 1000 * float(ages.mean()),
-        "age_max_ms": 1000 * float(ages.max()),
-        "age_steps_mean": float(age_steps.mean()),
-        "age_steps_max": int(age_steps.max()),
-    }
-
-
-def _outcome_statistics(episodes: Sequence[Trajectory]) -> dict[str, Any]:
-    returns = np.array([episode.episode_return for episode in episodes])
-    wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
-    successes = sum(episode.succeeded for episode in episodes)
-    low, high = wilson(successes, len(episodes))
-    return {
-        "episodes": len(episodes),
-        "steps": steps,
-        "real_time_factor": steps * episodes[0].timestep / wall,
-        "episode_seconds_mean": wall / len(episodes),
-        "return_mean": float(returns.mean()),
-        "return_std": _std(returns),
-        "eval_mean": float(np.mean([float(episode.evals[-1]) for episode in episodes])),
-        "success": successes / len(episodes),
-        "success_low": low,
-        "success_high": high,
-    }
