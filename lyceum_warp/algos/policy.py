@@ -77,9 +77,7 @@ class GaussianPolicy(Normalized):
             self.shape["own"] = _class_name(self)
         self.network = network
         log_std = finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST)
-        self.log_std = nn.Parameter(
-            torch.full((nact,), finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST))
-        )
+        self.log_std = nn.Parameter(torch.full((nact,), log_std))
         self.mirror: PolicyMirror | None = None
 
     def use_mirror(self, reflections: Mapping[str, Reflection]) -> None:

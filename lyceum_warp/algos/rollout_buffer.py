@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import torch
 import warp as wp
@@ -15,6 +15,9 @@ from lyceum_warp.kernels import collect
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
+
+_Pair: TypeAlias = tuple[Any, wp.array]
+"""An array of an environment, and the buffer that stores it for each step."""
 
 _LARGE = 1e18
 """Maximum absolute observation, whose square fits into float32."""
@@ -105,8 +108,8 @@ class Rollout:
             self._return = wp.zeros(n, dtype=float)
             self._fault = wp.zeros(n, dtype=int)
         self.running_return, self.faults = torch_view(self._return), torch_view(self._fault)
-        self._rows_before: list[_Rows] = []
-        self._rows_after: list[_Rows] = []
+        self._rows_before: list[_Pair] = []
+        self._rows_after: list[_Pair] = []
         self.obs_groups, self.final_obs_groups = {"policy": self.obs}, {"policy": self.final_obs}
         for group in dict.fromkeys(groups):
             if group != "policy":
@@ -125,9 +128,10 @@ class Rollout:
         self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
 
-    def _stored(self, source: torch.Tensor, into: list["_Rows"]) -> torch.Tensor:
-        into.append(_Rows(source, self.steps, self.env.device))
-        return into[-1].stored
+    def _stored(self, source: torch.Tensor, into: list[_Pair]) -> torch.Tensor:
+        rows: wp.array = wp.zeros((self.steps, *source.shape), dtype=float, device=self.env.device)
+        into.append((wp.from_torch(source), rows))
+        return torch_view(rows)
 
     @torch.no_grad()
     def collect(self, policy: Sampler, noise: torch.Tensor) -> None:
@@ -240,24 +244,15 @@ class Rollout:
         dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))
         args = [self._index, *self._inputs, self._arrays]
         wp.launch(collect.store_inputs, dim, args, device=self.env.device)
-        for rows in self._rows_before:
-            rows.store(self._index)
+        self._launch_rows(self._rows_before)
 
     def _launch_outputs(self) -> None:
         dim = (self.env.nworld, self.env.obs_space.size)
         args = [self._index, *self._outputs, self._first_only, self._return, self._fault, self._arrays]
         wp.launch(collect.store_outputs, dim, args, device=self.env.device)
-        for rows in self._rows_after:
-            rows.store(self._index)
+        self._launch_rows(self._rows_after)
         wp.launch(collect.advance_index, 1, [self._index], device=self.env.device)
 
-
-class _Rows:
-    def __init__(self, source: torch.Tensor, steps: int, device: wp.Device) -> None:
-        self._source = wp.from_torch(source)
-        self._rows: wp.array = wp.zeros((steps, *source.shape), dtype=float, device=device)
-        self.stored = torch_view(self._rows)
-
-    def store(self, index: wp.array) -> None:
-        args = [index, self._source, self._rows]
-        wp.launch(collect.store_rows, self._source.shape, args, device=self._rows.device)
+    def _launch_rows(self, pairs: list[_Pair]) -> None:
+        for source, rows in pairs:
+            wp.launch(collect.store_rows, source.shape, [self._index, source, rows], device=self.env.device)

@@ -194,18 +194,18 @@ def _compared(
     first: str, second: str, one: tuple[Episodes, int], other: tuple[Episodes, int], margin: float
 ) -> Comparison:
     (a, faults), (b, other_faults) = one, other
-    differences = []
-    for quantity, before, after in (("return", a.returns, b.returns), ("length", a.lengths, b.lengths)):
-        x, y = before.double().numpy(), after.double().numpy()
-        centre, half = mean_interval(y - x)
-        differences.append(_difference(quantity, x, y, centre, half, margin * float(np.abs(x).mean())))
+    pairs = [
+        ("return", a.returns.double().numpy(), b.returns.double().numpy()),
+        ("length", a.lengths.double().numpy(), b.lengths.double().numpy()),
+    ]
+    measured: list[Any] = [(name, x, y, mean_interval(y - x), margin * np.abs(x).mean()) for name, x, y in pairs]
     ends = a.terminated.numpy() > 0, b.terminated.numpy() > 0
-    differences.append(_difference("terminated", *ends, *share_interval(*ends), margin))
-    return Comparison(first=first, second=second, faults=(faults, other_faults), differences=tuple(differences))
-
-
-def _difference(quantity: str, x: np.ndarray, y: np.ndarray, centre: float, half: float, margin: float) -> Difference:
-    return Difference(
-        quantity=quantity, first=float(x.mean()), second=float(y.mean()), low=centre - half, high=centre + half,
-        margin=margin,
+    measured.append(("terminated", *ends, share_interval(*ends), margin))
+    differences = tuple(
+        Difference(
+            quantity=name, first=float(x.mean()), second=float(y.mean()), low=centre - half, high=centre + half,
+            margin=float(most),
+        )
+        for name, x, y, (centre, half), most in measured
     )  # fmt: skip
+    return Comparison(first=first, second=second, faults=(faults, other_faults), differences=differences)
