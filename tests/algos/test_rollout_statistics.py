@@ -7,7 +7,7 @@ import torch
 from metered_task import Metered
 
 import lyceum_warp as lw
-from lyceum_warp.algos.npg_statistics import prediction_sums, value_statistics
+from lyceum_warp.algos.npg import prediction_sums, value_statistics
 from lyceum_warp.algos.rollout_statistics import gathered
 
 NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success")
