@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 
 from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
@@ -57,18 +58,20 @@ class TimedPlan:
         return self.step - self.ahead
 
 
-def check_arguments(env: Env, *, reset: bool, on_step: OnStep | None, on_abort: OnAbort | None) -> None:
-    """Check the arguments that both control loops share."""
+def begin_episode(
+    env: Env, controller: Controller, steps: int | None, seed: int | None, *, reset: bool, on_step: OnStep | None,
+    on_abort: OnAbort | None,
+) -> tuple[CheckedController, int, int]:  # fmt: skip
+    """Check the arguments that both control loops share, and reset the plant and the controller if ``reset`` is set.
+
+    Returns:
+        The controller, the maximum number of steps, and the number of steps since the plant's reset.
+    """
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     check_flag("reset", reset)
     check_kind("on_step", on_step, Callable | None, "a function")
     check_kind("on_abort", on_abort, Callable | None, "a function")
-
-
-def begin_episode(
-    env: Env, controller: CheckedController, steps: int | None, seed: int | None, *, reset: bool
-) -> tuple[int, int]:
-    """Reset the plant and the controller, unless ``reset`` is False."""
+    checked = CheckedController(controller, env)
     if env.nworld != 1 or env.autoreset:
         raise ValueError(
             "a control loop needs one world without automatic resets, not "
@@ -81,12 +84,12 @@ def begin_episode(
     limit = env.horizon if steps is None else whole_number("steps", steps, low=1)
     if reset:
         env.rand_reset(seed)
-        controller.reset(seed)
+        checked.reset(seed)
     elif seed is not None:
         raise ValueError(f"seed={seed} has no effect with reset=False: omit one of the two arguments")
     if env.done.item():
         raise ValueError("the current episode is already over: reset the environment, or omit reset=False")
-    return limit, 0 if reset else int(env.episode_step.item())
+    return checked, limit, 0 if reset else int(env.episode_step.item())
 
 
 class EpisodeCollector:

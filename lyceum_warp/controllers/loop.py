@@ -4,7 +4,6 @@ import time
 
 import torch
 
-from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.controllers.episode_collector import (
     EpisodeCollector,
@@ -12,7 +11,6 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
-    check_arguments,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
@@ -53,10 +51,8 @@ def control(
         ValueError: The environment has several worlds or automatic resets, or the episode is over or may never end. Or
             an action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
     """
-    check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     every = whole_number("replan_every", replan_every, low=1)
-    checked = CheckedController(controller, env)
-    limit, first = begin_episode(env, checked, steps, seed, reset=reset)
+    checked, limit, first = begin_episode(env, controller, steps, seed, reset=reset, on_step=on_step, on_abort=on_abort)
     episode = EpisodeCollector(env, checked, mode="sync", period=env.timestep, seed=seed)
     planned = max(first - 1, 0) // every * every
     plan = None

@@ -22,7 +22,6 @@ from lyceum_warp.controllers.episode_collector import (
     OnStep,
     TimedPlan,
     begin_episode,
-    check_arguments,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env import Env
@@ -108,14 +107,12 @@ def control_async(
             number is out of range, or an action has the wrong shape or is not finite.
         Exception: Any exception that the controller raises.
     """
-    check_arguments(env, reset=reset, on_step=on_step, on_abort=on_abort)
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     check_flag("predict", predict)
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if period > threading.TIMEOUT_MAX:
         raise ValueError(f"period must be at most {threading.TIMEOUT_MAX:g} seconds, not {period!r}")
-    checked = CheckedController(controller, env)
-    limit, first = begin_episode(env, checked, steps, seed, reset=reset)
+    checked, limit, first = begin_episode(env, controller, steps, seed, reset=reset, on_step=on_step, on_abort=on_abort)
     _capture_graphs(env)
     predictor = Predictor(env) if predict else None
     clock = Clock() if clock is None else clock
@@ -259,7 +256,7 @@ class PlannerThread:
         self._predictor = predictor
         self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
         self._plans: list[TimedPlan] = []
-        self._qualities: list[tuple[float, float]] = []  # quality of each plan, appended after the plan itself
+        self._qualities: dict[int, tuple[float, float]] = {}
         self._error: BaseException | None = None
         self._begun = threading.Event()  # set after the first plan or after an error
         # use SimpleQueue, which is implemented in C, so that no thread loses the GIL while it holds the queue's lock
@@ -307,11 +304,8 @@ class PlannerThread:
 
     def add_plans(self, episode: EpisodeCollector) -> None:
         """Add the thread's finished plans to an episode."""
-        qualities = list(self._qualities)
-        plans = self._plans[: len(qualities) + 1]  # the thread appends a plan before the plan's quality
-        qualities += [(math.nan, math.nan)] * (len(plans) - len(qualities))
-        for plan, quality in zip(plans, qualities, strict=True):
-            episode.add_plan(plan, quality)
+        for plan in list(self._plans):
+            episode.add_plan(plan, self._qualities.get(plan.index, (math.nan, math.nan)))
 
     # in the thread
 
@@ -350,9 +344,10 @@ class PlannerThread:
                 (state, obs), ahead = predicted, 1
         start = step + ahead
         actions = controller(state, obs, controller.passed(self._first + last, self._first + start), step)
-        self._plans.append(TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead))
-        # append the quality only after the plan, because the plant may be waiting for the plan
-        self._qualities.append(controller.quality())
+        plan = TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead)
+        self._plans.append(plan)
+        # read the quality only now, because the plant may be waiting for the plan
+        self._qualities[plan.index] = controller.quality()
         return start
 
 
