@@ -128,13 +128,7 @@ def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
 
 
 def plain(value: Any) -> Any:
-    """Convert a setting, an option or a parameter to a JSON value."""
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    if isinstance(value, Mapping):
-        return {str(name): plain(part) for name, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(part) for part in value]
+    """Convert a setting, an option or a parameter to a JSON value, as the argument ``default`` of ``json.dumps``."""
     if isinstance(value, mujoco.MjSpec):
         return f"MjSpec {value.modelname!r}"
     if isinstance(value, PlanUpdate):

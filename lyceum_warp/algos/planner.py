@@ -26,6 +26,7 @@ averages the knots of a spline, and interpolates actions from them (``kernels/kn
 
 import copy
 import itertools
+import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -164,7 +165,8 @@ class Planner:
             )
         self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
         self.horizon, self.samples = self.config.horizon, self.config.samples
-        self.settings = plain(options.given() | own_params | vars(self.config))
+        settings = options.given() | own_params | vars(self.config)
+        self.settings = json.loads(json.dumps(settings, default=plain))
         nworld = self.plants * self.samples * self.config.models
         with explained_worlds(self.config, self.plants):
             self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)

@@ -2,12 +2,14 @@
 
 import math
 from collections.abc import Collection, Mapping
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 import warp as wp
 
+from lyceum_warp.algos.dense import DensePolicy
 from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
@@ -21,14 +23,6 @@ _Pair: TypeAlias = tuple[Any, wp.array]
 
 _LARGE = 1e18
 """Maximum absolute observation, whose square fits into float32."""
-
-
-class Sampler(Protocol):
-    """A policy with a method ``sample`` like that of ``GaussianPolicy``."""
-
-    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> Any:
-        """Write actions (nworld, nact) into ``out``."""
-        ...
 
 
 @document_attributes
@@ -134,7 +128,7 @@ class Rollout:
         return torch_view(rows)
 
     @torch.no_grad()
-    def collect(self, policy: Sampler, noise: torch.Tensor) -> None:
+    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
         """Fill the buffer by running the policy for ``steps`` steps from the current states.
 
         Args:
