@@ -22,6 +22,10 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
+def test_planners_satisfy_the_protocol_of_planning_controllers() -> None:
+    assert isinstance(lw.MPPI("point_mass", horizon=2, samples=1), lw.PlanningController)
+
+
 def test_controller_that_is_not_callable_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': pass a function"):
         control(env, "towards")  # type: ignore[arg-type]
@@ -99,26 +103,20 @@ def test_planner_with_a_doubled_time_step_repeats_or_interpolates_actions(betwee
     torch.testing.assert_close(timed.actions[0], actions[0], rtol=0, atol=0)
 
 
-def test_trajectory_describes_a_function_by_its_name(env: lw.Env, tmp_path: Path) -> None:
+def test_trajectory_describes_the_controller_by_json_values(env: lw.Env, tmp_path: Path) -> None:
     def zeros(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
         return torch.zeros(2)
 
     episode = control(env, zeros, steps=1)
     assert episode.controller == {"name": "zeros"} and episode.seed is None
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).seed is None
-
-
-def test_trajectory_describes_settings_by_json_values(env: lw.Env, tmp_path: Path) -> None:
     episode = control(env, SamplingPlanner(0), steps=1)
     assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
     assert isinstance(episode.controller["odd"], str)
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
 
 
-def test_controller_accepts_a_task_with_a_multidimensional_action(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", engine="mujoco", autoreset=False)
-    trajectory = control(env, lambda state, obs: torch.zeros(12), steps=2, seed=0)
-    assert trajectory.actions.shape == (2, 12)
-    assert trajectory.action_names[0].endswith("[0]") and len(trajectory.action_names) == 12
+def test_error_names_the_column_of_an_action_with_several_columns(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", autoreset=False)
     with pytest.raises(ValueError, match=r"action '\w+\[11\]' at step 0 must be finite, not nan"):
         control(env, lambda state, obs: torch.cat((torch.zeros(11), torch.full((1,), math.nan))), steps=2, seed=0)

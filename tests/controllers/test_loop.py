@@ -3,7 +3,6 @@ import torch
 from toy_controllers import StepPlanner, hundredths, towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.loop import control
 
 
@@ -19,21 +18,11 @@ def test_control_returns_the_complete_episode(env: lw.Env) -> None:
     assert episode.obs.shape == (41, 6) and episode.actions.shape == (40, 2)
     assert episode.evals[-1] < episode.evals[0]
     assert episode.mode == "sync" and episode.period == episode.timestep == env.timestep
-
-
-def test_each_action_comes_from_a_plan_for_its_state(env: lw.Env) -> None:
-    episode = control(env, towards, seed=3)
+    # each action comes from a plan for its state
     assert torch.equal(episode.plan_of, torch.arange(40)) and not episode.age_steps.any() and not episode.late.any()
     assert torch.allclose(episode.actions[7], towards(episode.states[7], episode.obs[7]))
     assert (episode.ages >= episode.plan_times).all() and (episode.times.diff() > 0).all()
     assert float(episode.plan_times.sum()) < episode.wall_seconds
-
-
-def test_step_callback_is_called_after_each_step(env: lw.Env) -> None:
-    seen: list[ControlProgress] = []
-    episode = control(env, towards, seed=3, on_step=seen.append)
-    assert [progress.step for progress in seen] == list(range(1, 41))
-    assert seen[-1].eval == episode.evals[-1] and seen[4].age == episode.ages[4]
 
 
 def test_first_state_and_actions_replay_the_episode_exactly(env: lw.Env) -> None:
@@ -44,11 +33,6 @@ def test_first_state_and_actions_replay_the_episode_exactly(env: lw.Env) -> None
         assert torch.equal(env.get_state()[0], episode.states[k + 1])
         assert torch.equal(env.obs[0], episode.obs[k + 1])
         assert env.reward[0] == episode.rewards[k] and env.eval[0] == episode.evals[k]
-
-
-def test_equal_seeds_give_equal_episodes(env: lw.Env) -> None:
-    one, same, other = (control(env, towards, seed=seed, steps=3) for seed in (1, 1, 2))
-    assert torch.equal(one.states, same.states) and not torch.equal(one.states, other.states)
 
 
 def test_plan_is_shifted_by_one_step_except_after_a_reset(env: lw.Env) -> None:
@@ -87,15 +71,6 @@ def test_replanning_interval_counts_steps_of_the_plant(env: lw.Env) -> None:
     episode = control(env, planner, steps=8, replan_every=4)
     assert planner.shifts == [0, 2]
     assert hundredths(episode.actions[:, 1]) == [0, 0, 1, 1, 0, 0, 1, 1]
-
-
-def test_actions_of_an_mppi_plan_are_applied_until_the_next_plan() -> None:
-    plant = lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
-    plan = lw.MPPI("point_mass", horizon=6, samples=8)
-    whole = control(plant, plan, seed=1, steps=4, replan_every=4)
-    plan.reset(1)
-    plan(whole.states[0], shift=0)
-    assert torch.equal(whole.actions, plan.actions[:4])
 
 
 def test_replanning_interval_longer_than_the_plan_raises_an_error(env: lw.Env) -> None:

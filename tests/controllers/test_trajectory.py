@@ -80,9 +80,3 @@ def test_arrays_of_inconsistent_shapes_raise_an_error(episode: Trajectory, tmp_p
         np.savez(broken, **(arrays | change))
         with pytest.raises(ValueError, match=r"broken\.npz is broken, or is not a trajectory"):
             Trajectory.load(broken)
-
-
-def test_file_of_another_kind_raises_an_error(tmp_path: Path) -> None:
-    np.save(tmp_path / "array.npy", np.zeros(3))
-    with pytest.raises(ValueError, match="is broken, or is not a trajectory"):
-        Trajectory.load(tmp_path / "array.npy")
