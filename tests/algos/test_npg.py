@@ -164,12 +164,6 @@ def test_value_function_uses_the_observation_group_critic_if_it_exists() -> None
         lw.NPG(env, config=dataclasses.replace(SMALL, value_group="privileged"))
 
 
-def test_loading_a_state_with_another_number_of_worlds_raises_an_error(env: lw.Env) -> None:
-    npg = lw.NPG(env, config=SMALL)
-    with pytest.raises(ValueError, match="the state has 16 worlds, but the environment has 3"):
-        lw.NPG(lw.make("point_mass", nworld=3), config=SMALL).load_state_dict(npg.state_dict())
-
-
 def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
@@ -229,8 +223,6 @@ def test_invalid_npg_arguments_raise_an_error(env: lw.Env) -> None:
     broken.scale.fill_(math.nan)
     with pytest.raises(ValueError, match="the value function's 'scale' is not finite: omit the value function"):
         lw.NPG(env, value=broken)
-    with pytest.raises(ValueError, match="autoreset=True"):
-        lw.NPG(lw.make("point_mass", autoreset=False))
 
 
 WILD = """

@@ -98,6 +98,13 @@ def test_unsuitable_policy_raises_a_one_line_error(shared_env: SharedEnv, policy
     assert "\n" not in str(caught.value)
 
 
+def test_ppo_needs_no_second_derivative(shared_env: SharedEnv) -> None:
+    policy = lw.GaussianPolicy(6, 2, network=Net(Once.apply))
+    before = policy.network.last.weight.detach().clone()
+    next(lw.PPO(shared_env("point_mass", nworld=2), policy, config=lw.PPOConfig(num_steps=4, value_hidden=(4,))))
+    assert not torch.equal(policy.network.last.weight, before)
+
+
 def test_network_that_is_not_a_torch_module_raises_an_error() -> None:
     with pytest.raises(ValueError, match=r"network must be a module of torch \(torch.nn.Module\), not list"):
         lw.GaussianPolicy(6, 2, network=[64, 64])  # type: ignore[arg-type]

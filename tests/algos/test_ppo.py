@@ -1,6 +1,5 @@
 import copy
 import dataclasses
-import math
 from pathlib import Path
 from typing import Any
 
@@ -158,7 +157,7 @@ def test_entropy_weight_decreases_linearly(env: lw.Env) -> None:
     assert stds[1][0] == pytest.approx(stds[0][0]) and stds[1][2] > stds[0][2] + 0.02
 
 
-def test_training_continues_from_given_networks_and_from_a_user_network(env: lw.Env) -> None:
+def test_training_continues_from_given_networks(env: lw.Env) -> None:
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), time_orders=2, mean_every=0))
     next(npg)
     policy, value = copy.deepcopy(npg.policy).requires_grad_(False), copy.deepcopy(npg.value).requires_grad_(False)
@@ -167,25 +166,6 @@ def test_training_continues_from_given_networks_and_from_a_user_network(env: lw.
     assert not torch.equal(policy.network[0].weight, npg.policy.network[0].weight)
     assert not torch.equal(value.network[0].weight, npg.value.network[0].weight)
     assert ppo.settings()["activation"] == "tanh" and ppo.settings()["num_steps"] == 12
-
-    class Once(torch.autograd.Function):  # NPG would need a second derivative
-        @staticmethod
-        def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
-            return 1.0 * x
-
-        @staticmethod
-        @torch.autograd.function.once_differentiable
-        def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:
-            return gradient
-
-    class Net(torch.nn.Linear):
-        def forward(self, obs: torch.Tensor) -> torch.Tensor:
-            return Once.apply(super().forward(obs))
-
-    own = lw.GaussianPolicy(1, 1, network=Net(1, 1))
-    before = own.network.weight.detach().clone()
-    assert math.isfinite(next(lw.PPO(env, own, config=SMALL)).kl)
-    assert not torch.equal(own.network.weight, before)
 
 
 def test_ppo_run_writes_all_files_and_resumes(tmp_path: Path) -> None:

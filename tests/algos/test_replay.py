@@ -63,17 +63,6 @@ def test_n_step_returns_across_episode_ends_equal_a_plain_sum(steps: int, n_step
     assert (False, True) in ends and (steps == 7 or (True, False) in ends)
 
 
-def test_non_finite_values_are_not_stored(env: lw.Env) -> None:
-    replay, plain = filled(env, 7, bad=5)
-    assert plain[5]["truncated"][1] and plain[5]["reward"][1] == 0.0
-    batch = replay.at(torch.arange(len(replay)), n_step=1, gamma=0.9)
-    parts = (*batch.obs.values(), *batch.next_obs.values(), batch.action, batch.reward, batch.discount)
-    assert all(part.isfinite().all() for part in parts)
-    assert batch.discount[5 * 3 + 1] == pytest.approx(0.9)
-    # after a fault, the next observation is the last valid one
-    assert torch.equal(batch.next_obs["critic"][16], batch.obs["critic"][16])
-
-
 def test_replay_samples_are_uniform_and_reproducible(env: lw.Env) -> None:
     replay, _ = filled(env, 20)
     draws = [replay.sample(20_000, generator=torch.Generator().manual_seed(3)) for _ in range(2)]

@@ -31,10 +31,3 @@ def test_engines_are_equivalent_only_with_a_small_difference_and_enough_seeds() 
         a, b = random.normal(size=(2, 40, seeds))
         found = [equivalence.equivalence(one, other + difference)["verdict"] for one, other in zip(a, b, strict=True)]
         assert found.count(verdict) > 28
-
-
-def test_different_engines_are_rarely_called_equivalent() -> None:
-    random = np.random.default_rng(1)
-    a, b = random.normal(size=(2, 100, 20))
-    wrong = sum(equivalence.equivalence(x, y + 1.0)["verdict"] == "equivalent" for x, y in zip(a, b, strict=True))
-    assert wrong <= 10  # 5 are expected at the 5 % level; the estimated margin may add some
