@@ -1,7 +1,7 @@
 """Report every bitwise difference between the results of two checkouts.
 
     lyceum-warp bench compare main
-    lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach --out differences.json
+    lyceum-warp bench compare v0.1.0 HEAD --parts env plans --tasks hopper reach
     lyceum-warp bench compare ../before ../after --short --ignore '*/metrics.csv/new_column'
 
 OLD and NEW are git revisions or folders with a checkout; NEW is this working tree by default. Each checkout runs in a
@@ -14,12 +14,9 @@ Exit code: 0 without differences, 1 with differences, 2 for bad input.
 import contextlib
 import dataclasses
 import fnmatch
-import hashlib
-import importlib.metadata
 import io
 import json
 import os
-import platform
 import signal
 import subprocess
 import sys
@@ -36,7 +33,6 @@ import tyro
 ROOT = Path(__file__).resolve().parents[1]
 PROBE = ROOT / "bench" / "probes" / "checkout.py"
 PACKAGE = "lyceum_warp"
-PACKAGES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "numpy")
 LINES = 12
 
 Part = Literal["env", "plans", "learners", "commands"]
@@ -76,8 +72,6 @@ class Options:
     """Number of steps of an environment."""
     iterations: int = 10
     """Number of iterations of a learner."""
-    out: Path | None = None
-    """JSON file for all digests and differences."""
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
@@ -105,24 +99,10 @@ class Difference:
     """A difference between two arrays of the same name, or a failure of a checkout."""
 
     name: str
-    kind: Literal["numbers", "form", "added", "removed", "failure"]
     text: str
-    first: Mapping[str, int] = dataclasses.field(default_factory=dict)
-    """Index of the first different element, by the names of the axes."""
-    old: str = ""
-    new: str = ""
-    largest: float | None = None
-    """The largest absolute difference; None if it is not finite."""
-    count: int = 0
-    size: int = 0
 
 
 # arrays
-
-
-def digest(array: np.ndarray) -> str:
-    head = f"{array.dtype.str} {array.shape} ".encode()
-    return hashlib.sha256(head + np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
 def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -136,23 +116,20 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
-        return Difference(name, "form", f"{old.dtype} {old.shape} -> {new.dtype} {new.shape}")
+        return Difference(name, f"{old.dtype} {old.shape} -> {new.dtype} {new.shape}")
     if not old.size or not (which := unequal(old, new)).any():
         return None
     place = np.unravel_index(int(which.argmax()), old.shape)
     labels = [axes[i] if i < len(axes) else f"index {i - len(axes)}" for i in range(old.ndim)]
     if old.ndim == len(axes) + 1:
         labels[-1] = "index"
-    first = {label: int(i) for label, i in zip(labels, place, strict=True)}
-    where = ", ".join(f"{label} {i}" for label, i in first.items())
-    count, before, after = int(which.sum()), old[place], new[place]
-    text, largest = f"{before} -> {after}" + (f" at {where}" if where else ""), None
+    where = ", ".join(f"{label} {int(i)}" for label, i in zip(labels, place, strict=True))
+    text = f"{old[place]} -> {new[place]}" + (f" at {where}" if where else "")
     if old.dtype.kind != "U":
         with np.errstate(all="ignore"):
             gaps = np.abs(new.astype(np.float64) - old.astype(np.float64)).reshape(-1)[which]
-        text += f"; max |difference| {gaps.max():.6g}; {count:,} of {old.size:,} differ"
-        largest = float(gaps.max()) if np.isfinite(gaps.max()) else None
-    return Difference(name, "numbers", text, first, str(before), str(after), largest, count, old.size)
+        text += f"; max |difference| {gaps.max():.6g}; {which.sum():,} of {old.size:,} differ"
+    return Difference(name, text)
 
 
 def differences(
@@ -162,15 +139,11 @@ def differences(
     for name in names:
         whole = f"{unit}/{name}"
         if name not in new:
-            yield Difference(whole, "removed", f"removed: {old[name].dtype} {old[name].shape}")
+            yield Difference(whole, f"removed: {old[name].dtype} {old[name].shape}")
         elif name not in old:
-            yield Difference(whole, "added", f"added: {new[name].dtype} {new[name].shape}")
+            yield Difference(whole, f"added: {new[name].dtype} {new[name].shape}")
         elif (found := difference(whole, old[name], new[name], axes.get(name, ()))) is not None:
             yield found
-
-
-def below(arrays: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(f"{prefix}/"): array for name, array in arrays.items() if name.startswith(f"{prefix}/")}
 
 
 # checkouts
@@ -289,10 +262,11 @@ def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> It
 @dataclasses.dataclass
 class Report:
     ignore: Sequence[str]
-    units: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     found: list[Difference] = dataclasses.field(default_factory=list)
-    skipped: dict[str, str] = dataclasses.field(default_factory=dict)
-    """Messages about missing models, by the name of the unit."""
+    skipped: list[str] = dataclasses.field(default_factory=list)
+    """Names of the units whose models are missing."""
+    differing: int = 0
+    units: int = 0
     arrays: int = 0
     ignored: int = 0
 
@@ -302,19 +276,14 @@ class Report:
             return False
         return True
 
-    def add(
-        self, name: str, found: Sequence[Difference], seconds: float = 0.0, digests: Mapping[str, Any] | None = None
-    ) -> None:
-        """Add and print the differences of a unit, given the old and the new digest of each array."""
-        digests = digests or {}
+    def add(self, name: str, found: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
+        """Add and print the differences of a unit with the given number of arrays."""
         self.found += found
-        self.arrays += len(digests)
-        self.units.append({
-            "name": name, "seconds": round(seconds, 3), "digests": digests,
-            "differences": [dataclasses.asdict(each) for each in found],
-        })  # fmt: skip
+        self.differing += bool(found)
+        self.units += 1
+        self.arrays += arrays
         summary = f"{len(found)} differences" if found else "equal"
-        print(f"{name}: {summary}, {len(digests)} arrays, {seconds:.1f} s", flush=True)
+        print(f"{name}: {summary}, {arrays} arrays, {seconds:.1f} s", flush=True)
         for each in found[:LINES]:
             print(f"    {each.name.removeprefix(f'{name}/')}: {each.text}", flush=True)
         if len(found) > LINES:
@@ -326,7 +295,7 @@ def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Differ
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
-    return [Difference(name, "failure", f"{side} failed: {failure['text']}") for side, failure in failed.items()]
+    return [Difference(name, f"{side} failed: {failure['text']}") for side, failure in failed.items()]
 
 
 def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report) -> None:
@@ -336,8 +305,8 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
         side.ask(request)
     answers = {side.name: side.answer() for side in sides}
     if all(answer.get("failure", {}).get("missing") for answer in answers.values()):
-        report.skipped[unit.name] = answers["new"]["failure"]["text"]
-        print(f"{unit.name}: skipped, {report.skipped[unit.name]}", flush=True)
+        report.skipped.append(unit.name)
+        print(f"{unit.name}: skipped, {answers['new']['failure']['text']}", flush=True)
         return
     old, new = (
         {name: array for name, array in side.arrays().items() if report.kept(f"{unit.name}/{name}")} for side in sides
@@ -347,13 +316,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     if found:  # arrays that are missing after a failure are not additional differences
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
-    for side, arrays in (("old", old), ("new", new)):
-        for whole, other in answers[side].get("equal", ()):
-            under = {name.removeprefix(f"{whole}/"): labels for name, labels in axes.items()}
-            for each in differences(unit.name, below(arrays, whole), below(arrays, other), under):
-                found.append(dataclasses.replace(each, text=f"{side}, {whole} -> {other}: {each.text}"))
-    digests = {name: [digest(side[name]) if name in side else None for side in (old, new)] for name in {**old, **new}}
-    report.add(unit.name, found, time.perf_counter() - began, digests)
+    report.add(unit.name, found, time.perf_counter() - began, len({**old, **new}))
 
 
 def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
@@ -369,7 +332,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
         if task not in old and task not in new:
             raise ValueError(f"neither checkout has a task {task!r}: there are {', '.join(sorted({*old, *new}))}")
     one_sided = [
-        Difference(f"tasks/{task}", *(("added", "added") if task in new else ("removed", "removed")))
+        Difference(f"tasks/{task}", "added" if task in new else "removed")
         for task in wanted
         if (task in old) != (task in new) and report.kept(f"tasks/{task}")
     ]
@@ -384,49 +347,30 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
 # the program
 
 
-def written(report: Report, options: Options, checkouts: Mapping[str, str], seconds: float) -> dict[str, Any]:
-    return {
-        "checkouts": checkouts,
-        "options": dataclasses.asdict(options) | {"out": str(options.out)},
-        "machine": {"processor": platform.processor() or platform.machine(), "system": platform.platform()},
-        "versions": {name: importlib.metadata.version(name) for name in PACKAGES}
-        | {"python": platform.python_version()},
-        "seconds": round(seconds, 1),
-        "differences": len(report.found),
-        "skipped": report.skipped,
-        "units": report.units,
-    }
-
-
-def run(options: Options) -> int:
+def run(options: Options) -> Report:
     if options.steps < 1 or options.iterations < 2:
         raise ValueError("--steps must be at least 1 and --iterations at least 2, so that a run can be interrupted")
-    if options.out is not None and not options.out.resolve().parent.is_dir():
-        raise ValueError(f"there is no folder {options.out.resolve().parent} for --out")
     report, began = Report(options.ignore), time.perf_counter()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lyceum-warp-compare-")))
-        sides, checkouts = [], {}
+        sides = []
         for name, given in (("old", options.old), ("new", options.new)):
             for part in ("checkout", "files"):
                 (folder / name / part).mkdir(parents=True)
-            root, checkouts[name] = stack.enter_context(checkout(given, folder / name / "checkout"))
-            print(f"{name}: {checkouts[name]}", flush=True)
+            root, described = stack.enter_context(checkout(given, folder / name / "checkout"))
+            print(f"{name}: {described}", flush=True)
             sides.append(Side(name, root, folder / name / "files"))
             stack.callback(sides[-1].close)
         compare(options, sides, report)
     seconds = time.perf_counter() - began
-    if options.out is not None:
-        options.out.write_text(json.dumps(written(report, options, checkouts, seconds), indent=1) + "\n")
-    differing = sum(bool(unit["differences"]) for unit in report.units)
     if report.skipped:
         print(f"skipped, because of missing models: {', '.join(report.skipped)}")
     if report.ignored:
         print(f"excluded by --ignore: {report.ignored} names")
-    compared = f"{report.arrays:,} arrays in {len(report.units)} units, {seconds:.0f} s"
-    print(f"{len(report.found)} differences in {differing} units; {compared}" if report.found
+    compared = f"{report.arrays:,} arrays in {report.units} units, {seconds:.0f} s"
+    print(f"{len(report.found)} differences in {report.differing} units; {compared}" if report.found
           else f"no difference: {compared}")  # fmt: skip
-    return 1 if report.found else 0
+    return report
 
 
 def main(options: Options) -> int:
@@ -434,7 +378,7 @@ def main(options: Options) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):  # SIGTERM raises SystemExit, so temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:
-        return run(options)
+        return 1 if run(options).found else 0
     except ValueError as error:
         print(f"compare: {error}", file=sys.stderr)
         return 2

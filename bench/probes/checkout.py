@@ -28,7 +28,7 @@ import torch
 torch.set_num_threads(1)  # the order of a sum depends on the number of threads
 torch.manual_seed(0)
 
-LEARNERS = ("NPG", "PPO")
+LEARNERS = ("NPG", "PPO", "SAC")
 """A learner is compared if both checkouts have it."""
 
 
@@ -41,9 +41,6 @@ class Numbers:
 
     def __init__(self) -> None:
         self.axes: dict[str, list[str]] = {}
-        self.equal: list[tuple[str, str]] = []
-        """Pairs of name prefixes, such as those of the runs with and without an interruption, whose arrays must be
-        equal."""
         self._arrays: dict[str, Any] = {}
 
     def add(self, name: str, value: Any, *axes: str, along: str | None = None) -> None:
@@ -253,8 +250,12 @@ def learning(numbers: Numbers, *, task: str, engine: str, device: str, learner: 
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, seed=5)
-    more = {"config": lw.NPGConfig(samples=1024, mean_every=5, mean_episodes=2)} if learner == "NPG" else {}
-    learns = getattr(lw, learner)(env, seed=6, **more)
+    configs: dict[str, Any] = {
+        "NPG": lambda: lw.NPGConfig(samples=1024, mean_every=5, mean_episodes=2),
+        "PPO": lambda: lw.PPOConfig(),
+        "SAC": lambda: lw.SACConfig(warmup=200, num_steps=50, batch=32, mean_every=5, mean_episodes=2),
+    }
+    learns = getattr(lw, learner)(env, seed=6, config=configs[learner]())
     for _ in range(iterations):
         numbers.add("iterations", without_clocks(vars(next(learns))), along="iteration")
     for name in ("policy", "value"):
@@ -280,7 +281,6 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
                     numbers.add(f"{run}/metrics.csv", without_clocks(cells), along="row")
             for name in ("policy.pt", "best.pt"):
                 numbers.add(f"{run}/{name}", torch.load(Path(run, name), map_location="cpu", weights_only=True))
-    numbers.equal.append(("whole", "resumed"))
 
 
 def command(*words: str) -> None:
@@ -321,7 +321,7 @@ def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
         answer["failure"] = failure(error)
     np.savez(file, **numbers.arrays())
     gc.collect()  # free environments now, because they contain reference cycles
-    return {**answer, "axes": numbers.axes, "equal": numbers.equal}
+    return {**answer, "axes": numbers.axes}
 
 
 def main() -> None:
