@@ -15,8 +15,10 @@ import json
 import multiprocessing
 import os
 import queue
+import shutil
 import signal
 import statistics
+import subprocess
 import sys
 import threading
 import time
@@ -25,14 +27,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import measurements
 import torch
 import tyro
+
+from lyceum_warp.support.versions import versions
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "equivalence",
          "soak")  # fmt: skip
+
+HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
+"""Results are compared only if these are equal."""
+
+GPU_QUERY = {
+    "driver": "driver_version", "power_limit": "power.limit", "clock_sm": "clocks.sm", "clock_sm_max": "clocks.max.sm",
+    "clock_memory": "clocks.mem", "throttled": "clocks_event_reasons.active",
+}  # fmt: skip
+"""Fields of nvidia-smi, by the names in stored results."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
 """Results are compared only if the versions of these packages are equal."""
@@ -194,7 +206,7 @@ def append(path: Path, row: Row) -> None:
 
 
 def machine(row: Row) -> tuple[Any, ...]:
-    return tuple(row.provenance.get(name) for name in measurements.HARDWARE)
+    return tuple(row.provenance.get(name) for name in HARDWARE)
 
 
 def software(row: Row) -> tuple[Any, ...]:
@@ -285,7 +297,16 @@ def duration(seconds: float) -> str:
 
 
 def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
-    found = measurements.context(device)
+    found = versions(device)
+    if (program := shutil.which("nvidia-smi")) is not None and device.startswith("cuda"):
+        index = device.partition(":")[2] or "0"
+        query = f"--query-gpu={','.join(GPU_QUERY.values())}"
+        done = subprocess.run(
+            [program, f"--id={index}", query, "--format=csv,noheader"], capture_output=True, text=True
+        )
+        values = [value.strip() for value in done.stdout.strip().split(",")]
+        if done.returncode == 0 and len(values) == len(GPU_QUERY):
+            found |= dict(zip(GPU_QUERY, values, strict=True))
     peers = {}
     for package in experiment.packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
