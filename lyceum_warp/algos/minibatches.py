@@ -64,11 +64,6 @@ class Minibatches:
             torch.index_select(rows, 0, self.order, out=self._parts[name].flatten(0, 1))
         return self._parts
 
-    def run(self, epochs: int) -> None:
-        """Learn from the shuffled samples."""
-        for _ in range(epochs):
-            self.epoch()
-
     def _epoch(self) -> None:
         for i in range(self.count):
             self.learn({name: rows[i] for name, rows in self._parts.items()}, self.weight[i])

@@ -155,7 +155,6 @@ def _check_options(options: Mapping[str, Any]) -> None:
 
 
 def _hint(word: str, known: Sequence[str]) -> str:
-    """Suggest known names for an unknown parameter."""
     if word in SETTINGS or word in OPTIONS:  # given in params
         return f"it is {'a setting of MPPI' if word in SETTINGS else 'an option of its worlds'}: give it outside params"
     others = [setting for setting in SETTINGS if setting not in OPTIONS]

@@ -88,7 +88,6 @@ class MPPIConfig:
     """Combination of a sample's returns in several models: their mean or the smallest."""
 
     def __post_init__(self) -> None:
-        """Check the settings that do not depend on a task."""
         if not isinstance(self.update, PlanUpdate):
             updates = ("mppi", "cem", "predictive_sampling")
             check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
@@ -204,7 +203,6 @@ def _array(value: Any) -> np.ndarray | None:
 
 
 def _tuples(array: np.ndarray) -> Any:
-    """Convert an array to a hashable value: a float or tuples."""
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 

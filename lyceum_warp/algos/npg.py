@@ -224,7 +224,6 @@ class NPG(OnPolicyLearner):
         )
 
     def _check_updates(self, update: Mapping[str, float]) -> int:
-        """Count skipped updates, and raise an error after too many consecutive iterations with a skipped update."""
         parts = {"the step of the policy": update["finite"], "the fit of the value function": update["fitted"]}
         skipped = [part for part, finite in parts.items() if not finite]
         self._skipping = self._skipping + 1 if skipped else 0

@@ -90,7 +90,6 @@ class NPGConfig:
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         check_fields(self, _BOUNDS)
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")

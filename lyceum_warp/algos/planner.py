@@ -202,7 +202,6 @@ class Planner:
         self._made = True
 
     def _drawn_fields(self) -> list[str]:
-        """Return the names of the model fields that differ between the planner's models."""
         if self.config.models == 1:
             return []
         bound = self.env.task
@@ -216,7 +215,6 @@ class Planner:
         return drawn
 
     def _take_value(self, value: Value | None) -> None:
-        """Set the value function, and check that it fits the task's observations."""
         self.value, group = value, "policy"
         self._value_kernel, self._value_in_torch = None, False
         if isinstance(value, ValueFunction):
@@ -308,7 +306,6 @@ class Planner:
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
 
     def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
-        """Remove a buffer's axis for the plants if there is only one plant."""
         return rows.squeeze(axis) if self.plants == 1 else rows
 
     @torch.no_grad()
@@ -403,7 +400,6 @@ class Planner:
         return tuple(calls)
 
     def _perturb(self, first: bool) -> None:
-        """Shift the plans, and draw samples around the plans."""
         device = self.env.device
         if first and self._passed is not self._shift:
             passed = [self._shift, self.horizon, self._spline[0], self._phase, self._passed]
@@ -439,7 +435,6 @@ class Planner:
             wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
 
     def _add_up(self) -> None:
-        """Compute the samples' returns."""
         config, device = self.config, self.env.device
         if self._value_kernel is not None:
             values = [wp.from_torch(self._value_obs), self._terminal]
@@ -451,17 +446,14 @@ class Planner:
             wp.launch(planning.combine_models, self._nsample, combined, device=device)
 
     def _weigh(self) -> None:
-        """Compute the samples' returns and weights."""
         self._add_up()
         self._update.weigh(self._arrays)
 
     def _average_samples(self) -> None:
-        """Compute the new plan, the weighted mean of the samples."""
         plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
         launch_blocks(planning.average, self._plan.size, plan)
 
     def _average(self) -> None:
-        """Compute the new plan, and call the update's ``fit``."""
         self._average_samples()
         self._update.fit(self._arrays)
         self._interpolate(self._plan, self._actions)
@@ -488,7 +480,6 @@ class Planner:
         self._terminal_view.copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
-        """Compute the values of the samples' final states, (nworld,)."""
         obs, nworld = self._value_obs, self.env.nworld
         if isinstance(self.value, ValueFunction):
             steps = self._loop.states[:, self.env.state_space.parts["step"]] + self.horizon
@@ -595,12 +586,10 @@ def _view(array: Any) -> torch.Tensor | None:
 
 
 def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
-    """Write values into the masked rows, or into all rows without a mask, broadcasting if necessary."""
     target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))
 
 
 def _update_of(config: MPPIConfig) -> PlanUpdate:
-    """Make the update named in the settings, or copy the given object."""
     if isinstance(config.update, PlanUpdate):
         return copy.copy(config.update)
     if config.update == "cem":

@@ -264,7 +264,8 @@ class PPO(OnPolicyLearner):
             advantage /= (variance * (batch / max(batch - 1, 1))).sqrt() + 1e-8
         self._entropy_coef.fill_(config.entropy_weight(self.iteration + 1))
         self._losses.zero_()
-        self.minibatches.run(config.epochs)
+        for _ in range(config.epochs):
+            self.minibatches.epoch()
         team.copy_leader(self._parameters)
         self._apply_std()
 

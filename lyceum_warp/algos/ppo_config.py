@@ -94,7 +94,6 @@ class PPOConfig:
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        """Check every value."""
         check_fields(self, _BOUNDS)
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 

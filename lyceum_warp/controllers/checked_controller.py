@@ -141,10 +141,9 @@ def _check_call(controller: Any) -> None:
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
-    """Get a function's signature, or None for some C functions."""
     try:
         return inspect.signature(function)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # some C functions have none
         return None
 
 

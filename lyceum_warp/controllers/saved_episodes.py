@@ -27,9 +27,15 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
-        episodes[path] = Trajectory.load(path)
-        first = next(iter(episodes))
-        _check_same(first, episodes[first], path, episodes[path])
+        episodes[path] = other = Trajectory.load(path)
+        first, one = next(iter(episodes.items()))
+        if other.task != one.task:
+            raise ValueError(
+                f"{path} is an episode of the task {other.task!r}, and {first} of the task {one.task!r}: load the "
+                "files separately"
+            )
+        if difference := _difference(one.state_parts, other.state_parts):
+            raise ValueError(f"{path} has a different model than {first}: its states have {difference}")
     if not episodes:
         raise ValueError("there is no episode to load: pass at least one file")
     return episodes
@@ -102,16 +108,6 @@ def _files(paths: Iterable[str | Path]) -> list[Path]:
     return found
 
 
-def _check_same(first: Path, one: Trajectory, path: Path, other: Trajectory) -> None:
-    if other.task != one.task:
-        raise ValueError(
-            f"{path} is an episode of the task {other.task!r}, and {first} of the task {one.task!r}: load the files "
-            "separately"
-        )
-    if difference := _difference(one.state_parts, other.state_parts):
-        raise ValueError(f"{path} has a different model than {first}: its states have {difference}")
-
-
 def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
     """Describe how two state layouts differ, such as "qpos of 7 numbers, not 9", or return ""."""
     for name in {**wanted, **found}:
@@ -159,7 +155,6 @@ def _foreign(file: Path) -> str:
 
 
 def _is_private(group: int) -> bool:
-    """Return whether a group has only root or this user."""
     if group == 0:
         return True
     try:
