@@ -25,7 +25,7 @@ from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.ranking import Rankings
 
 IMPLICIT, EULER = {"integrator": "implicitfast"}, {"integrator": "euler"}
-ELLIPTIC, NO_NOSLIP = {"cone": "elliptic"}, {"solver": {"noslip_iterations": 0}}
+ELLIPTIC = {"cone": "elliptic"}
 
 
 def substeps(number: int, seconds: float) -> dict[str, Any]:
@@ -51,15 +51,7 @@ STUDIES = {
         6, 40, (iterations(2), iterations(1), ELLIPTIC, *(substeps(n, 0.05) for n in (3, 2, 1)),
                 substeps(1, 0.05) | IMPLICIT, IMPLICIT), {"samples": 32, "horizon": 20},
     ),
-    "hopper": Study(6, 50, (iterations(1), substeps(1, 0.008) | IMPLICIT, EULER), {"samples": 24, "horizon": 48}),
-    "humanoid": Study(
-        4, 50, (*(substeps(n, 0.015) | IMPLICIT for n in (1, 3, 2)), substeps(1, 0.015), IMPLICIT),
-        {"samples": 16, "horizon": 32, "knots": 4, "noise": 0.3, "temperature": 0.5},
-    ),
-    "adroit_pen": Study(
-        4, 50, (NO_NOSLIP, *(substeps(n, 0.01) | IMPLICIT for n in (1, 2)), iterations(1)),
-        {"samples": 48, "horizon": 24},
-    ),
+    "hopper": Study(6, 50, (iterations(1),), {"samples": 24, "horizon": 48}),
 }  # fmt: skip
 
 

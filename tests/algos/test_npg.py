@@ -382,16 +382,15 @@ def test_gpu_learner_continues_after_loading_a_state() -> None:
     assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
-@pytest.mark.quick("1.0")
-@pytest.mark.parametrize("kl_limit", [1.0, 1.5])  # a KL limit of 1.0 shortens many steps
-def test_optimized_iterations_equal_iterations_with_autograd(kl_limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_optimized_iterations_equal_iterations_with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
     """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
         for plain in (False, True):
             env = lw.make("hopper", nworld=8, seed=0, nthread=1)
-            npg = lw.NPG(env, config=lw.NPGConfig(samples=800, mean_every=0, kl_limit=kl_limit), seed=0)
+            # a KL limit of 1 shortens many steps
+            npg = lw.NPG(env, config=lw.NPGConfig(samples=800, mean_every=0, kl_limit=1.0), seed=0)
             if plain:
                 monkeypatch.setattr(DensePolicy, "of", lambda *args: None)
                 monkeypatch.setattr(DenseValue, "of", lambda *args: None)

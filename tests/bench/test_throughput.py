@@ -31,7 +31,9 @@ def test_throughput_is_measured_once_and_written_as_a_table(tmp_path: Path, caps
     assert all(row["result"]["env_steps_per_second"] > 0.0 for row in rows)
     assert {row["case"]["worlds"] for row in rows if row["case"]["part"] == "single"} == {1}
     assert cases["kept", "c"]["result"]["kept"] > 0.0
+    native, ours = (cases["sampling", name]["result"]["env_steps_per_second"] for name in ("native", "c"))
     printed = capsys.readouterr().out
+    assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
     assert "| task | native C | lyceum_warp, C engine | Gymnasium, SyncVectorEnv |" in printed
     assert "| task | Gymnasium | lyceum_warp, C engine |" in printed and "| cartpole | C | 64 |" in printed
     assert run("throughput", out, *words) == 0 and len(lines(out)) == len(rows)
@@ -41,19 +43,12 @@ def test_throughput_is_measured_once_and_written_as_a_table(tmp_path: Path, caps
     assert len([*tmp_path.glob("throughput-*.png")]) == 1
 
 
-def test_throughput_is_measured_for_several_numbers_of_cores_and_worlds(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "throughput.jsonl"
-    words = "--tasks cartpole --contestants native c --threads 1 --parts cores worlds".split()
-    assert run("throughput", out, *words) == 0
-    found = [(row["case"]["part"], row["case"]["contestant"], row["case"]["worlds"]) for row in lines(out)]
-    cores = [("cores", "native", 64), ("cores", "c", 64)]
-    assert found == [*cores, *(("worlds", "c", many) for many in (1, 8, 64))]
-    printed = capsys.readouterr().out
-    assert "| task | threads | native C | lyceum_warp, C engine |" in printed and "| cartpole | 8 |" in printed
-    native, ours = (row["result"]["env_steps_per_second"] for row in lines(out)[:2])
-    assert f"| {ours:,.0f}; {ours / native:.2f} |" in printed
+def test_every_library_is_measured_on_several_numbers_of_cores_and_worlds() -> None:
+    words = {"tasks": ("cartpole",), "contestants": ("native", "c"), "threads": 2, "parts": ("cores", "worlds")}
+    cases = throughput.cases(throughput.Options(short=True, **words))
+    found = [(case.part, case.contestant, case.worlds, case.threads) for case in cases]
+    cores = [("cores", name, 64 * threads, threads) for name in ("native", "c") for threads in (1, 2)]
+    assert found == [*cores, *(("worlds", "c", many, 2) for many in (1, 8, 64))]
 
 
 def test_dm_control_tasks_are_measured_with_equal_numbers_of_worlds_by_every_library() -> None:
