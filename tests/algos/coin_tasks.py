@@ -44,11 +44,6 @@ def paid_by_coin_after_action(s0: Coin, action: Row[float], s1: Coin, p: CoinPar
 
 
 @wp.func
-def paid_by_coin_before_action(s0: Coin, action: Row[float], s1: Coin, p: CoinParams) -> float:
-    return action[0] * s0.coin[0]
-
-
-@wp.func
 def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
     ctrl[0] = action[0]
 
@@ -69,9 +64,3 @@ class TossedAfterWithControl(TossedAfter):
     """The ``control`` function makes the engine run rollouts step by step."""
 
     control = copied
-
-
-class TossedBefore(TossedAfter):
-    """Tosses the coin one step before the action and stores it, so the planner can see it."""
-
-    reward = paid_by_coin_before_action

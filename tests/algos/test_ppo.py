@@ -79,9 +79,6 @@ def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: Sha
         assert it.return_recent == pytest.approx(sum(found) / len(found))
     assert it.samples == 3 * 48 == 3 * ppo.count and it.length_mean == 10.0 and it.faults == 0
     assert it.reward_mean == pytest.approx(rollout.reward.mean().item())
-    effort = rollout.episode_metrics["effort"][rollout.done].mean().item()
-    assert it.row()["metrics/effort"] == pytest.approx(effort)
-    assert it.row()["step_metrics/effort"] == pytest.approx(rollout.metrics["effort"].mean().item())
     assert it.learning_rate == pytest.approx(ppo.rate.item())
     old = torch.distributions.Normal(ppo._mean.double(), ppo._old_log_std.double().exp())
     new = torch.distributions.Normal(ppo.policy(rollout.obs).double(), ppo.policy.log_std.double().exp())
