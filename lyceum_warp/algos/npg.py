@@ -374,7 +374,7 @@ class NPG(OnPolicyLearner):
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
-        return super().state_dict() | {"optimizer": copy.deepcopy(self.fit.state_dict())}
+        return super().state_dict() | {"optimizer": copy.deepcopy(self.fit.optimizer.state_dict())}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``; see ``Learner``."""

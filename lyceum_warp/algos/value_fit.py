@@ -109,10 +109,6 @@ class ValueFit:
         self.team.sum(self.gradient)
         self.optimizer.step()
 
-    def state_dict(self) -> dict[str, Any]:
-        """Get the optimizer's state."""
-        return self.optimizer.state_dict()
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the optimizer's state on this device."""
         self.optimizer.load_state_dict(state)

@@ -39,66 +39,43 @@ def policy_episodes(
     rounds = -(-episodes // env.nworld)
     for number in range(rounds):
         env.rand_reset(seed if number == 0 else None)
-        batch = _Batch(env)
-        while not batch.ended:
-            batch.step(policy)
-            if progress is not None and batch.steps % 10 == 0:
-                progress(number * env.horizon + batch.steps, rounds * env.horizon)
+        states, obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
+        actions: list[torch.Tensor] = []
+        outcomes: list[torch.Tensor] = []
+        times: list[tuple[float, float, float]] = []  # action's time, duration of the policy's call, step's end
+        lengths, reasons = (torch.zeros(env.nworld, dtype=torch.long) for _ in range(2))
+        start = time.perf_counter()
+        while not (lengths > 0).all():
+            begun = time.perf_counter()
+            env.action.copy_(policy(env.obs))
+            actions.append(env.action.cpu().clone())
+            applied = time.perf_counter()
+            env.step()
+            states.append(env.get_state().cpu())
+            obs.append(env.final_obs.cpu().clone())
+            outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
+            times.append((applied - start, applied - begun, time.perf_counter() - start))
+            over = env.done.cpu() & (lengths == 0)
+            lengths[over] = len(actions)
+            reasons[over] = env.done_reason.cpu()[over].long()
+            if progress is not None and len(actions) % 10 == 0:
+                progress(number * env.horizon + len(actions), rounds * env.horizon)
         for world in range(min(env.nworld, episodes - number * env.nworld)):
-            place = {"world": env.first_world + world, "episode": number}
+            steps = int(lengths[world])
             own = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
-            params = {"params": origin["params"] | own}
-            yield batch.trajectory(world, seed=seed, controller=named | place, **origin | params)
-
-
-class _Batch:
-    def __init__(self, env: Env) -> None:
-        self.env = env
-        self._states, self._obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
-        self._actions: list[torch.Tensor] = []
-        self._outcomes: list[torch.Tensor] = []
-        # action's time, duration of the policy's call, step's end
-        self._times: list[tuple[float, float, float]] = []
-        self._lengths = torch.zeros(env.nworld, dtype=torch.long)
-        self._reasons = torch.zeros(env.nworld, dtype=torch.long)
-        self._start = time.perf_counter()
-
-    @property
-    def steps(self) -> int:
-        return len(self._actions)
-
-    @property
-    def ended(self) -> bool:
-        return bool((self._lengths > 0).all())
-
-    def step(self, policy: Callable[[torch.Tensor], torch.Tensor]) -> None:
-        env, begun = self.env, time.perf_counter()
-        env.action.copy_(policy(env.obs))
-        self._actions.append(env.action.cpu().clone())
-        applied = time.perf_counter()
-        env.step()
-        self._states.append(env.get_state().cpu())
-        self._obs.append(env.final_obs.cpu().clone())
-        self._outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
-        self._times.append((applied - self._start, applied - begun, time.perf_counter() - self._start))
-        over = env.done.cpu() & (self._lengths == 0)
-        self._lengths[over] = self.steps
-        self._reasons[over] = env.done_reason.cpu()[over].long()
-
-    def trajectory(self, world: int, **origin: Any) -> Trajectory:
-        env, steps = self.env, int(self._lengths[world])
-        states, obs = (torch.stack([row[world] for row in rows[: steps + 1]]) for rows in (self._states, self._obs))
-        rewards, evals, success = torch.stack([row[:, world] for row in self._outcomes[:steps]], 1)
-        times, policy_times, _ = (
-            torch.tensor(column, dtype=torch.float64) for column in zip(*self._times[:steps], strict=True)
-        )
-        return Trajectory(
-            states=states.double(), obs=obs, actions=torch.stack([row[world] for row in self._actions[:steps]]),
-            rewards=rewards, evals=evals, success=success > 0, times=times, ages=policy_times,
-            late=torch.zeros(steps, dtype=torch.bool), plan_of=torch.arange(steps), plan_steps=torch.arange(steps),
-            plan_starts=times - policy_times, plan_times=policy_times,
-            plan_failed=torch.full((steps,), torch.nan, dtype=torch.float64),
-            plan_effective=torch.full((steps,), torch.nan, dtype=torch.float64),
-            timestep=env.timestep, period=env.timestep, wall_seconds=self._times[steps - 1][2], mode="sync",
-            done_reason=int(self._reasons[world]), **origin,
-        )  # fmt: skip
+            rewards, evals, success = torch.stack([row[:, world] for row in outcomes[:steps]], 1)
+            applied_at, policy_times, ends = torch.tensor(times[:steps], dtype=torch.float64).unbind(1)
+            yield Trajectory(
+                states=torch.stack([row[world] for row in states[: steps + 1]]).double(),
+                obs=torch.stack([row[world] for row in obs[: steps + 1]]),
+                actions=torch.stack([row[world] for row in actions[:steps]]),
+                rewards=rewards, evals=evals, success=success > 0, times=applied_at, ages=policy_times,
+                late=torch.zeros(steps, dtype=torch.bool), plan_of=torch.arange(steps), plan_steps=torch.arange(steps),
+                plan_starts=applied_at - policy_times, plan_times=policy_times,
+                plan_failed=torch.full((steps,), torch.nan, dtype=torch.float64),
+                plan_effective=torch.full((steps,), torch.nan, dtype=torch.float64),
+                timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
+                done_reason=int(reasons[world]), seed=seed,
+                controller=named | {"world": env.first_world + world, "episode": number},
+                **origin | {"params": origin["params"] | own},
+            )  # fmt: skip

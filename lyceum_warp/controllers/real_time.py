@@ -312,9 +312,8 @@ class PlannerThread:
     def _run(self) -> None:
         try:
             with torch.no_grad():  # the calling thread's no_grad has no effect in this thread
-                last = 0
                 while (published := self._newest_state()) is not None:
-                    last = self._plan(*published, last)
+                    self._plan(*published)
                     self._begun.set()
         except BaseException as error:
             self._error = error
@@ -327,11 +326,9 @@ class PlannerThread:
             published = self._states.get()
         return published
 
-    def _plan(
-        self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None, last: int
-    ) -> int:  # fmt: skip
-        """Plan from a state, or from the predicted next state, and return the step of the plan's initial state."""
-        controller = self._controller
+    def _plan(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
+        """Plan from a state, or from the predicted next state."""
+        controller, last = self._controller, self._plans[-1].step if self._plans else 0
         if not self._plans:
             controller(state, obs, controller.passed(max(self._first - 1, 0), self._first), step)
             controller(state, obs, 0, step)
@@ -348,7 +345,6 @@ class PlannerThread:
         self._plans.append(plan)
         # read the quality only now, because the plant may be waiting for the plan
         self._qualities[plan.index] = controller.quality()
-        return start
 
 
 _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
