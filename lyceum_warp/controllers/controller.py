@@ -9,9 +9,8 @@ from lyceum_warp.env import Env
 
 
 class Controller(Protocol):
-    """A function that computes an action from the plant's state and observation.
+    """A function that computes an action from the state and the observation of the plant, an environment of one world.
 
-    The plant is an environment of one world.
     Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
     ``PlanningController`` lists optional attributes and methods.
     """
@@ -31,10 +30,9 @@ class Controller(Protocol):
 
 @runtime_checkable
 class PlanningController(Controller, Protocol):
-    """A controller that plans a sequence of actions and returns the first action, such as ``lw.MPPI``.
+    """A controller that plans a sequence of actions, such as ``lw.MPPI``; all attributes and methods are optional.
 
-    Attributes and methods are optional: implement only those that you need. There is no need to derive from
-    ``PlanningController``.
+    There is no need to derive from ``PlanningController``.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:

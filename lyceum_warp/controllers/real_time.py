@@ -56,17 +56,15 @@ def control_async(
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
     later steps. The controller plans in a second thread, from the newest state; it makes at most one plan per state.
 
-    Each step applies that action of the newest finished plan that was planned for this time; after the end of the plan,
-    its last action is held. This choice by time compensates for planning delays up to the length of the plan. The plant
-    waits for the first plan, so the first action has age 0. Later actions are at least one step old, and exactly one
-    step old if every plan takes less than a period.
+    Each step applies the newest finished plan's action for this time; after the end of the plan, its last action is
+    held. The plant waits for the first plan, so the first action has age 0. Later actions are at least one step old,
+    and exactly one step old if every plan takes less than a period.
 
-    With ``predict``, the controller plans from the state that is expected one step later, when the plan can first
-    apply. A copy of the plant predicts this state with the action that the plant is applying. The copy runs no events
-    of the task, such as pushes, and draws other random numbers than the plant. The first action of a plan that takes
-    less than a period is then applied to the state for which it was planned. Without ``predict``, this action comes too
-    late, and only the rest of the plan applies. If the copy's episode ends in the predicted step, the controller plans
-    from the measured state.
+    With ``predict``, a copy of the plant predicts the state after the current step, and the controller plans from this
+    state. The copy runs no events of the task, such as pushes, and draws other random numbers than the plant. The first
+    action of a plan that takes less than a period is then applied to the state for which it was planned; without
+    ``predict``, this action comes too late. If the copy's episode ends in the predicted step, the controller plans from
+    the measured state.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
@@ -94,8 +92,7 @@ def control_async(
             and the controller's last plan.
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
-            the first step. The trajectory's ``done_reason`` is 0. The loop raises the exception after calling
-            ``on_abort``.
+            the first step. Its ``done_reason`` is 0. The exception is then raised again.
         predict: Whether to plan from predicted states.
         clock: Replacement for the wall clock, for example to do other work while the plant waits.
 
