@@ -295,6 +295,7 @@ def test_plan_keeps_its_shifted_actions_if_all_samples_fail(
 def test_planner_with_unstable_physics_suggests_shorter_substeps(caplog: pytest.LogCaptureFixture) -> None:
     plan = MPPI(Picky, horizon=4, samples=8, noise=1e3, include_plan=False, limit=1e9, model=rail(1e10))
     plan(plan.state_of())
+    assert plan.sampled.abs().max() > 100.0, "the actions of this task have no bounds"
     (message,) = caplog.messages
     assert "all 8 samples of a plan of picky failed (faults: NAN" in message
     step = plan.env.model.opt.timestep
@@ -313,21 +314,6 @@ def test_failed_samples_are_not_among_the_best(update: str, elites: int | None) 
     torch.testing.assert_close(plan.weights[best], torch.full((count,), 1 / count))
     torch.testing.assert_close(plan.actions, plan.sampled[:, best].mean(1))
     assert plan.summary["effective_samples"] == pytest.approx(count)
-
-
-def test_actions_stay_within_the_control_ranges() -> None:
-    plan = MPPI("reach", noise=10.0, temperature=1e-3)
-    low, high = (torch.from_numpy(bound) for bound in (plan.env.action_space.low, plan.env.action_space.high))
-    plant, _ = reached(1)
-    for _ in range(4):
-        plant.step(plan(plant.get_state()[0])[None])
-        assert (plan.sampled >= low).all() and (plan.sampled <= high).all()
-        assert (plan.actions >= low).all() and (plan.actions <= high).all()
-        at_bounds = (plan.sampled == low) | (plan.sampled == high)
-        assert at_bounds.float().mean() > 0.5
-    free = MPPI(Picky, noise=10.0, horizon=4, limit=1e9)  # the task Picky has no control limits
-    free(free.state_of())
-    assert free.sampled.abs().max() > 10
 
 
 @pytest.mark.parametrize("fill", ["zero", "repeat", 0.5, [0.5, -0.25]])

@@ -261,18 +261,6 @@ class Wild(lw.Task):
 """
 
 
-@pytest.mark.parametrize("params, fault", [
-    ({"reward_size": math.inf}, "reward"), ({"chance": 0.01, "size": math.inf}, "observation"),
-])  # fmt: skip
-def test_a_reward_or_observation_that_is_not_finite_is_a_fault(
-    params: dict[str, float], fault: str, task_file: TaskFile
-) -> None:
-    npg = wild(task_file, params)
-    iterations = [next(npg) for _ in range(5)]
-    assert sum(it.faults for it in iterations) == npg.env.fault_counts[fault] > 0
-    assert all(math.isfinite(it.kl) and math.isfinite(it.value_error) for it in iterations)
-
-
 def wild(task_file: TaskFile, params: dict[str, float], **changes: object) -> lw.NPG:
     env = lw.make(str(task_file("wild.py", WILD)), nworld=4, **params)
     plain = {"mean_every": 0, "normalize": False, "activation": "relu", "value_activation": "relu"}

@@ -1,6 +1,5 @@
 import copy
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -163,20 +162,6 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
     assert not torch.equal(policy.network[0].weight, npg.policy.network[0].weight)
     assert not torch.equal(value.network[0].weight, npg.value.network[0].weight)
     assert ppo.settings()["activation"] == "tanh" and ppo.settings()["num_steps"] == 12
-
-
-def test_ppo_run_writes_all_files_and_resumes(tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    for iterations, resume in ((2, False), (4, True)):
-        env = lw.make(Metered, nworld=4, horizon=10)
-        run = lw.train(made(env), folder, iterations=iterations, resume=resume)
-    assert run.config["algorithm"] == "ppo" and run.config["ppo"]["hidden"] == [8]
-    rows = run.rows()
-    assert [row["mean_return"] is not None for row in rows] == [False, True, False, True]
-    assert {"return_recent", "kl", "value_loss", "time_update", "metrics/effort"} <= rows[0].keys()
-    assert lw.load(run, which="best").nact == 1 and lw.load_value(run).group == "critic"
-    with pytest.raises(ValueError, match="has clip 0.2, not 0.1, and a run keeps its settings"):
-        lw.train(made(env, clip=0.1), folder, iterations=9, resume=True)
 
 
 @pytest.mark.parametrize("words, message", [

@@ -21,6 +21,7 @@ def rollout() -> lw.Rollout:
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
+    rollout.faults[2] = 3
     return rollout
 
 
@@ -70,7 +71,7 @@ def test_step_statistics_cover_all_samples(rollout: lw.Rollout) -> None:
     for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
         found = statistics(rollout, *(slice(k, k + count) for k in range(0, rollout.env.nworld, count)))
         assert found["step_metrics"] == pytest.approx(steps, rel=1e-5)
-        assert found["reward_mean"] == pytest.approx(rollout.reward.mean().item())
+        assert found["faults"] == 3 and found["reward_mean"] == pytest.approx(rollout.reward.mean().item())
 
 
 def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:

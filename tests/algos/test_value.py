@@ -21,6 +21,8 @@ def test_value_function_has_the_discount_factor_of_its_training(tmp_path: Path) 
     del content["value"]["shape"]["discount"]  # earlier releases did not save the discount
     torch.save(content, run.policy)
     assert lw.load_value(run).discount is None
+    run.save(policy_content(0, npg.policy, lw.ValueFunction(3, (4,), group="critic")), {})
+    assert lw.load_value(run).group == "critic"
 
 
 def test_time_features_are_powers_of_the_step() -> None:
