@@ -121,26 +121,6 @@ def test_plan_of_a_plant_does_not_change_if_all_its_samples_fail(update: str) ->
         torch.testing.assert_close(actions[i], alone(states[i], shift=0))
 
 
-def test_planner_controls_every_world_of_an_environment() -> None:
-    env = lw.make("point_mass", nworld=4, seed=2, horizon=30)
-    state = env.get_state()
-    state[1, env.state_space.parts["step"]] = 10
-    env.set_state(state)
-    settings: dict[str, Any] = dict(task="point_mass", horizon=12, samples=64, temperature=0.1)
-    plan, alone = lw.MPPI(**settings, plants=4), lw.MPPI(**settings, seed=101)
-    far = (env.obs[:, :2] - env.obs[:, 4:6]).norm(dim=1)
-    for step in range(29):
-        state = env.get_state()
-        action = plan(state)
-        if step in (20, 21):
-            torch.testing.assert_close(action[1], alone(state[1]))
-        env.step(action)
-        assert env.done.tolist() == [False, step == 19, False, False]
-        plan.reset(100, where=env.done)
-    now = (env.obs[:, :2] - env.obs[:, 4:6]).norm(dim=1)
-    assert (now < 0.3 * far)[[0, 2, 3]].all()
-
-
 def test_invalid_states_and_masks_raise_a_one_line_error() -> None:
     with pytest.raises(ValueError, match="plants must be a whole number .*, not 0"):
         lw.MPPI("point_mass", plants=0)

@@ -78,18 +78,16 @@ def test_symmetry_losses_and_mirrored_samples_make_a_policy_more_symmetric(env: 
     assert max(found["loss"], found["augment"]) < 0.6 * found["none"]
 
 
-@pytest.mark.quick("exact")
-@pytest.mark.parametrize("symmetry", ["exact", "loss", "augment"])
-def test_a_symmetric_run_resumes_bit_for_bit(symmetry: str, tmp_path: Path) -> None:
+def test_a_symmetric_run_resumes_bit_for_bit(tmp_path: Path) -> None:
     def made() -> lw.PPO:
-        return lw.PPO(lw.make("point_mass", nworld=8), config=dataclasses.replace(CONFIG, symmetry=symmetry))
+        return lw.PPO(lw.make("point_mass", nworld=8), config=dataclasses.replace(CONFIG, symmetry="exact"))
 
     whole = lw.train(made(), tmp_path / "whole", iterations=4)
     lw.train(made(), tmp_path / "halves", iterations=2)
     halves = lw.train(made(), tmp_path / "halves", iterations=4, resume=True)
     one, other = (lw.load(run).state_dict() for run in (whole, halves))
     assert all(torch.equal(one[name], other[name]) for name in one)
-    with pytest.raises(ValueError, match=f"has symmetry {symmetry}, not none, and a run keeps its settings"):
+    with pytest.raises(ValueError, match="has symmetry exact, not none, and a run keeps its settings"):
         lw.train(lw.PPO(lw.make("point_mass", nworld=8), config=CONFIG), halves.folder, iterations=9, resume=True)
 
 

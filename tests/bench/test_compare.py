@@ -53,14 +53,6 @@ def test_changed_reward_and_broken_tasks_are_reported(tmp_path: Path, capsys: py
 
 
 @pytest.mark.long
-def test_comparison_of_a_working_tree_with_itself_finds_no_difference(capsys: pytest.CaptureFixture[str]) -> None:
-    options = compare.Options(str(ROOT), tasks=("point_mass",), **(QUICK | {"parts": ("env", "plans")}))
-    assert not compare.run(options).found
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[-1].startswith("no difference: ") and " arrays in 2 units" in lines[-1]
-
-
-@pytest.mark.long
 def test_a_package_that_cannot_be_imported_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = copied(tmp_path, {"__init__.py": ("import importlib\n", "raise RuntimeError('no package')\n")})
     assert compare.run(compare.Options(str(ROOT), str(copy), tasks=("point_mass",), **QUICK)).found
