@@ -1,8 +1,7 @@
 """Divide a planner's arguments into settings, options and parameters; their defaults are the task's ``planning``."""
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import task_name
-from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.engines.placement import place_samples
 from lyceum_warp.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.support.validate import check_kind, described, whole_number
@@ -111,20 +109,6 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
         return [whole_number("seed", one, low=0) for one in given]
     first = whole_number("seed", given, low=0, high=2**31 - plants)
     return range(first, first + plants)
-
-
-@contextlib.contextmanager
-def explained_worlds(config: MPPIConfig, plants: int) -> Iterator[None]:
-    """If the with block raises NotEnoughMemoryError, name the settings that determine the number of worlds.
-
-    Raises:
-        NotEnoughMemoryError: The worlds do not fit into memory.
-    """
-    try:
-        yield
-    except NotEnoughMemoryError as error:
-        product = f"{plants} * {config.samples} * {config.models}"
-        raise NotEnoughMemoryError(f"{error}, where nworld is plants * samples * models, {product}") from error
 
 
 def plain(value: Any) -> Any:

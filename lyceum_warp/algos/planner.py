@@ -38,7 +38,7 @@ import warp as wp
 
 from lyceum_warp.algos.cem import CrossEntropy, EliteWeights
 from lyceum_warp.algos.mppi import ExponentialWeights
-from lyceum_warp.algos.mppi_arguments import explained_worlds, plain, planner_arguments, plant_seeds
+from lyceum_warp.algos.mppi_arguments import plain, planner_arguments, plant_seeds
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
@@ -46,10 +46,12 @@ from lyceum_warp.algos.policy_check import check_value
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import Done
+from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import knots, planning
 from lyceum_warp.openloop import OpenLoop
+from lyceum_warp.options import EnvOptions
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
@@ -167,30 +169,11 @@ class Planner:
         self.horizon, self.samples = self.config.horizon, self.config.samples
         settings = options.given() | own_params | vars(self.config)
         self.settings = json.loads(json.dumps(settings, default=plain))
-        nworld = self.plants * self.samples * self.config.models
-        with explained_worlds(self.config, self.plants):
-            self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **own_params)
-        drawn = self._drawn_fields()
-        self.env.reset()
-        self.timestep, self.between = self.env.timestep, self.config.between
-        self._initial = self.env.get_state()[0]
-        # use nominal values for a robot, not values that startup drew
-        for name, row in self.env.engine.nominal.items():
-            self._initial[self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
-        if "lasting_memory" in self.env.task.writes.get("startup", ()):
-            self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
-        with wp.ScopedDevice(self.env.device):
-            self._keys = wp.zeros(nworld, dtype=wp.uint32)
-            shapes = {name: (self.config.models, self.env.state_space.parts[name]) for name in drawn}
-            fields = {
-                n: wp.zeros((rows, part.stop - part.start), dtype=wp.float64) for n, (rows, part) in shapes.items()
-            }
-        self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
-        with explained_worlds(self.config, self.plants):
-            self._loop = OpenLoop(
-                self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
-                states=self.plants,
-            )  # fmt: skip
+        try:
+            self._make_worlds(task, options, own_params)
+        except NotEnoughMemoryError as error:
+            product = f"{self.plants} * {self.samples} * {self.config.models}"
+            raise NotEnoughMemoryError(f"{error}, where nworld is plants * samples * models, {product}") from error
         self._update = _update_of(self.config)
         self._allocate()
         self._update.prepare(self._arrays)
@@ -200,6 +183,28 @@ class Planner:
         self.reset(seeds)
         self._warned = False
         self._made = True
+
+    def _make_worlds(self, task: type[Task], options: EnvOptions, params: Mapping[str, Any]) -> None:
+        nworld = self.plants * self.samples * self.config.models
+        self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **params)
+        drawn, parts = self._drawn_fields(), self.env.state_space.parts
+        self.env.reset()
+        self.timestep, self.between = self.env.timestep, self.config.between
+        self._initial = self.env.get_state()[0]
+        # use nominal values for a robot, not values that startup drew
+        for name, row in self.env.engine.nominal.items():
+            self._initial[parts[name]] = torch_view(flat(row))[0].double()
+        if "lasting_memory" in self.env.task.writes.get("startup", ()):
+            self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
+        with wp.ScopedDevice(self.env.device):
+            self._keys = wp.zeros(nworld, dtype=wp.uint32)
+            sizes = {name: parts[name].stop - parts[name].start for name in drawn}
+            fields = {name: wp.zeros((self.config.models, n), dtype=wp.float64) for name, n in sizes.items()}
+        self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
+        self._loop = OpenLoop(
+            self.env, self.horizon, keys=self._keys, nominal_model=self.config.nominal_model, models=fields,
+            states=self.plants,
+        )  # fmt: skip
 
     def _drawn_fields(self) -> list[str]:
         if self.config.models == 1:
