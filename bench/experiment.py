@@ -82,8 +82,6 @@ class Options:
     """Seeds, if the experiment uses any."""
     jobs: int = 1
     """Number of cases that run at the same time, each on separate cores; the experiment must allow this."""
-    dry_run: bool = False
-    """Print the cases and their durations without measuring."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,10 +331,6 @@ def run(experiment: Experiment, options: Options) -> int:
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are stored; the rest takes about {took}")
     if options.jobs != 1 and not (experiment.apart or experiment.parallel):
         raise ValueError(f"the cases of {experiment.name} compete for the cores: jobs must be 1")
-    if options.dry_run:
-        for case in left.values():
-            print(f"  {_text(case)}: {duration(experiment.estimate(case))}")
-        return 0
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
         os.truncate(path, size)

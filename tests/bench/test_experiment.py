@@ -126,14 +126,6 @@ def test_overview_lists_the_experiments(capsys: pytest.CaptureFixture[str]) -> N
     assert all(re.search(rf"^{name} +\S", out, re.MULTILINE) for name in experiment.NAMES)
 
 
-def test_dry_run_prints_cases_without_measuring_them(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert toy.main("--out", tmp_path / "toy.jsonl", "--tasks", "walk", "--dry-run") == 0
-    assert "task=walk repeat=1 contestant=missing: 60 s" in capsys.readouterr().out
-    assert not toy.measured and not (tmp_path / "toy.jsonl").exists()
-
-
 def test_results_file_with_invalid_lines_raises_an_error(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
