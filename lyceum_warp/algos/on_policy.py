@@ -22,12 +22,7 @@ from lyceum_warp.support.validate import check_kind
 
 @document_attributes
 class OnPolicyLearner(Learner):
-    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout.
-
-    Raises:
-        ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
-            trainable (``lyceum_warp.algos.policy_check``).
-    """
+    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout."""
 
     config_type: ClassVar[type]
     twice: ClassVar[bool]

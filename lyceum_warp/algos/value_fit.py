@@ -40,9 +40,8 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit the value function to returns, and return whether the result is finite.
+        """Fit the value function to returns, or restore it and return False if the result is not finite.
 
-        If it is not, all parameters and moments are restored.
         Targets are clipped to the value function's shift plus or minus ``BOUND`` times its scale. The generator must
         have the same state in every process.
         """

@@ -196,9 +196,6 @@ class Predictor:
     """Predicts the plant's next states, in a copy of the plant.
 
     As in planners' rollouts, no events run, and the random numbers are not those of the plant.
-
-    Args:
-        env: The plant; its state is used to capture graphs.
     """
 
     def __init__(self, env: Env) -> None:
@@ -237,13 +234,7 @@ def _frequent_thread_switches() -> Iterator[None]:
 class PlannerThread:
     """A thread that calls a controller with the newest published state.
 
-    Args:
-        controller: The controller.
-        clock: The clock of the control loop.
-        seed: Seed of the run.
-        first: Number of steps between the reset and the start of the run.
-        reset: Whether the run started with a reset.
-        predictor: Predicts the initial states of plans; None to plan from measured states.
+    ``first`` is the number of steps between the reset and the start of the run.
     """
 
     def __init__(
