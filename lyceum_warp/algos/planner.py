@@ -36,13 +36,14 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.cem import CrossEntropy, EliteWeights
+from lyceum_warp.algos.cem import CrossEntropy
 from lyceum_warp.algos.mppi import ExponentialWeights
 from lyceum_warp.algos.mppi_arguments import plain, planner_arguments, plant_seeds
 from lyceum_warp.algos.mppi_config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.plan_update import PlanSamples, PlanUpdate, launch_blocks
 from lyceum_warp.algos.policy_check import check_value
+from lyceum_warp.algos.predictive_sampling import BestSample
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.done import Done
@@ -600,7 +601,7 @@ def _update_of(config: MPPIConfig) -> PlanUpdate:
     if config.update == "cem":
         assert config.elites is not None and config.min_noise is not None
         return CrossEntropy(config.elites, config.min_noise, config.noise_smoothing)
-    return ExponentialWeights(config.temperature) if config.update == "mppi" else EliteWeights(1)
+    return ExponentialWeights(config.temperature) if config.update == "mppi" else BestSample()
 
 
 class MPPI(Planner):  # noqa: D101
