@@ -101,7 +101,7 @@ class PhysicsOptions:
     njmax: int | None = _for_engine(None)
     """Number of constraints of each world that fit into the Warp engine; by default twice the peak in random rollouts,
     and more for inactive equality constraints."""
-    deterministic: bool = _for_engine(False)
+    deterministic: bool | None = _for_engine(None)
     """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, this
     takes 5 to 18 times as much time and 5 to 7 times as much memory."""
 
@@ -116,9 +116,9 @@ class PhysicsOptions:
         _one_of("friction cone", self.cone, CONES)
         _one_of("integrator", self.integrator, INTEGRATORS)
         _one_of("Jacobian", self.jacobian, JACOBIANS)
-        check_flag("deterministic", self.deterministic)
-        if self.discardvisual is not None:
-            check_flag("discardvisual", self.discardvisual)
+        for name in ("discardvisual", "deterministic"):
+            if (flag := getattr(self, name)) is not None:
+                check_flag(name, flag)
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 

@@ -31,7 +31,7 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"solver": 4}, r"solver must be a dict of limits, such as solver=\{'iterations': 4\}, not 4"),
         ({"solver": {"itrations": 4}}, "solver has no limit 'itrations': it takes 'iterations', 'ls_iterations'"),
         ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 .*, not 0"),
-        ({"deterministic": None}, "deterministic must be True or False, not None"),
+        ({"deterministic": 0}, "deterministic must be True or False, not 0"),
         ({"nworld": True}, "nworld must be a whole number .*, not True"),
         ({"device": 0}, "device must be .* as 'cpu' or 'cuda:0', not int 0"),
         ({"model": 3}, "model must be .* a file or an MjSpec, not int 3"),
@@ -76,6 +76,9 @@ def test_keyword_arguments_override_the_options_of_named_physics() -> None:
     assert lw.make(Fast).options.physics == PhysicsOptions()
     for given in ({"physics": "fast", "cone": "elliptic"}, {"physics": PhysicsOptions(base="fast", cone="elliptic")}):
         assert lw.make(Fast, **given).options.physics == dataclasses.replace(FAST, cone="elliptic")
+    named = {"fast": PhysicsOptions(deterministic=True)}
+    for given, wanted in ((None, True), (False, False)):
+        assert PhysicsOptions(base="fast", deterministic=given).resolved(named).deterministic is wanted
     with pytest.raises(ValueError, match="^the task has no physics 'quick': it has 'exact', 'fast'$"):
         lw.make(Fast, physics="quick")
     with pytest.raises(ValueError, match="base must be .* as 'exact', not int 3"):

@@ -21,7 +21,7 @@ from lyceum_warp.engines.placement import (
 )
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
-ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None}
+ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None, "deterministic": None}
 
 
 @pytest.fixture(scope="module")
