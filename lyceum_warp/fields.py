@@ -130,22 +130,6 @@ _RANGES = (
 )  # fmt: skip
 """Fields with several rows per object, by name or prefix."""
 
-_COUNTS = {
-    _Kind.mjOBJ_ACTUATOR: "nactuator",
-    _Kind.mjOBJ_BODY: "nbody",
-    _Kind.mjOBJ_CAMERA: "ncam",
-    _Kind.mjOBJ_EQUALITY: "neq",
-    _Kind.mjOBJ_FLEX: "nflex",
-    _Kind.mjOBJ_GEOM: "ngeom",
-    _Kind.mjOBJ_JOINT: "njnt",
-    _Kind.mjOBJ_LIGHT: "nlight",
-    _Kind.mjOBJ_MATERIAL: "nmat",
-    _Kind.mjOBJ_PAIR: "npair",
-    _Kind.mjOBJ_SENSOR: "nsensor",
-    _Kind.mjOBJ_SITE: "nsite",
-    _Kind.mjOBJ_TENDON: "ntendon",
-}
-
 
 @dataclasses.dataclass(frozen=True)
 class Field:
@@ -303,7 +287,7 @@ def _called(kind: mujoco.mjtObj) -> str:
 def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
-        names = [mujoco.mj_id2name(model, kind, i) for i in range(getattr(model, _COUNTS[kind]))]
+        names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)]  # None beyond the last object
         known = ", ".join(sorted(n for n in names if n)) or "none with names"
         raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
     return index

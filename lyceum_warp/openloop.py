@@ -90,7 +90,10 @@ class OpenLoop:
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
                 f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
             )
-        self._keys, self._nominal_model, self._models = keys, nominal_model, dict(models or {})
+        nominal = {name: flat(row).numpy() for name, row in env.engine.nominal.items()} if nominal_model else {}
+        self._keys, self._models = keys, dict(models or {})
+        for name in nominal.keys() - self._models.keys():
+            self._models[name] = wp.array(nominal[name], dtype=wp.float64, device=env.device)
         rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=f"horizon {self.horizon}")
@@ -184,8 +187,6 @@ class OpenLoop:
     def _start(self) -> None:
         worlds, device = self.worlds, self.env.device
         wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
-        if self._nominal_model:
-            self._overwrite_model()
         for name, rows in self._models.items():
             args = [rows, self.env.state_space.parts[name].start, worlds.state]
             wp.launch(planning.overwrite_rows, (self.env.nworld, rows.shape[1]), args, device=device)
@@ -204,14 +205,6 @@ class OpenLoop:
         self._fault.zero_()
         args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
         wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
-
-    def _overwrite_model(self) -> None:
-        columns, states = self.env.state_space.parts, self.worlds.state
-        nominal: Mapping[str, wp.array] = self.env.engine.nominal
-        for name, row in nominal.items():
-            row = flat(row)
-            args = [row, columns[name].start, states]
-            wp.launch(planning.overwrite, (states.shape[0], row.shape[1]), args, device=self.env.device)
 
     def _transitions(self) -> list[Any]:
         """Get states before and after all transitions, the parameters, and the actions."""

@@ -38,8 +38,8 @@ class Engine(abc.ABC):
         initial: The initial state for ``reset``, (integration_size,); None for the model's initial state.
 
     Raises:
-        ValueError: A field is listed twice, as lagged and as current, the initial state has the wrong shape, or a model
-            field cannot differ between worlds of this model.
+        ValueError: A field is listed twice, as lagged and as current, or a model field cannot differ between worlds of
+            this model.
     """
 
     name: str
@@ -102,8 +102,6 @@ class Engine(abc.ABC):
         self.integration_size = _integration_size(model)
         self.state_size = self.integration_size + sum(field.size for field in self._saved())
         self.initial = _initial_state(model) if initial is None else np.array(initial, dtype=np.float64)
-        if self.initial.shape != (self.integration_size,):
-            raise ValueError(f"an initial state has the shape ({self.integration_size},), not {self.initial.shape}")
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
     def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:

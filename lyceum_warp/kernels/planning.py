@@ -47,13 +47,6 @@ def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64
 
 
 @wp.kernel(enable_backward=False)
-def overwrite(row_in: wp.array2d[float], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy a float32 row into every world's state, starting at column ``first``; launched over (nworld, size)."""
-    w, i = wp.tid()
-    state_out[w, first + i] = wp.float64(row_in[0, i])
-
-
-@wp.kernel(enable_backward=False)
 def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
     """Copy row w % rows into the state of world w, starting at column ``first``; launched over (nworld, size)."""
     w, i = wp.tid()

@@ -11,7 +11,7 @@ import warp as wp
 from mujoco.batch import Batch
 
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
+from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
@@ -78,8 +78,7 @@ class MujocoEngine(Engine):
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
         self.nthread = whole_number("nthread", nthread, low=0)
-        # if a subclass launches kernels over all worlds, every thread would repeat the launches
-        self.launch_threads = (self.nthread or cpu_cores()) if type(self) is MujocoEngine else 1
+        self.launch_threads = self.nthread or cpu_cores()
         self.native_model = copy.copy(model)
         # autoreset would hide a fault: MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -87,7 +86,6 @@ class MujocoEngine(Engine):
         # does not fit into the CPU's caches: the six tasks that need such stages were 4 to 33 % slower with 128 and
         # 1,024 worlds on two cores.
         self.batch = Batch(self.native_model, nworld, self.nthread)
-        self._errors_as_warnings = ErrorsAsWarnings(self.batch)
         self._rows = self._alias(self.batch.state)
         self._warning: wp.array = wp.array(self.batch.warning, dtype=int, device=device, copy=False)
         self._initial = self._rounded_initial()
@@ -174,20 +172,15 @@ class MujocoEngine(Engine):
 
     def step(self, nstep: int) -> None:
         if nstep not in self._steps:
-            self._steps[nstep] = self._graphs.sequence(self._own_phases(nstep))
+            self._steps[nstep] = self._graphs.sequence(self.step_phases(nstep))
         for call in self._steps[nstep]:
             call()
 
     def step_phases(self, nstep: int) -> list[Phase]:
-        # a subclass may override step
-        own = type(self).step is MujocoEngine.step
-        return self._own_phases(nstep) if own else super().step_phases(nstep)
-
-    def _own_phases(self, nstep: int) -> list[Phase]:
         return [
             Phase("inputs", self._take_inputs, by_world=True),
             Phase("physics", partial(self._advance, nstep), engine=True),
-            Phase("fields", self._show_fields, by_world=True),
+            Phase("fields", partial(self._read, self._last, self._everyone), by_world=True),
         ]
 
     def _take_inputs(self) -> None:
@@ -195,20 +188,15 @@ class MujocoEngine(Engine):
             launch_rows(widen, self._everyone, flat(self.arrays[field.name]), self._sources[field.name])
 
     def _advance(self, nstep: int) -> None:
-        with self._errors_as_warnings:
-            self.batch.step(nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
+        call_batch(self.batch, self.batch.step, nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
         if self._apart:
             self._copy(self._before_stage)
             self._disabled[...] = self._stage_flags
             try:
-                with self._errors_as_warnings:
-                    self.batch.forward(stage=self.stage)
+                call_batch(self.batch, self.batch.forward, stage=self.stage)
             finally:
                 self._disabled[...] = self._step_flags
             self._copy(self._after_stage, early=True)
-
-    def _show_fields(self) -> None:
-        self._read(self._last, self._everyone)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy the masked worlds' fields into float32 arrays; ``early`` skips sensors of the acceleration stage."""
@@ -224,7 +212,10 @@ class MujocoEngine(Engine):
         key = (len(controls), nstep, *buffers)
         if key not in self._rollouts:
             fields = [self.fields[name] for name in buffers if name not in self.dynamics]
-            self._rollouts[key] = self._native_rollout(len(controls), nstep, fields)
+            self._rollouts[key] = None
+            if is_exact(self.model, fields):
+                batch, dynamics = Batch(self.native_model, self.nworld, self.nthread), self.dynamics.values()
+                self._rollouts[key] = NativeRollout(batch, len(controls), nstep, fields, self.snapshots, dynamics)
         native = self._rollouts[key]
         if native is None:
             super().rollout(state, controls, nstep, buffers)
@@ -245,12 +236,6 @@ class MujocoEngine(Engine):
             return 0
         return 8 * steps * nstep * (self.model.nu + sum(field.size for field in fields)) + 8 * self.integration_size
 
-    def _native_rollout(self, steps: int, nstep: int, fields: list[Field]) -> NativeRollout | None:
-        if not is_exact(self.model, fields):
-            return None
-        batch = Batch(self.native_model, self.nworld, self.nthread)
-        return NativeRollout(batch, steps, nstep, fields, self.snapshots, self.dynamics.values())
-
     def apply_model(self, mask: wp.array) -> None:
         self._models.apply(self._values, self._on_host(mask))
 
@@ -258,8 +243,7 @@ class MujocoEngine(Engine):
         chosen = self._on_host(mask)
         if nstep == 0 or not chosen.any():
             return
-        with self._errors_as_warnings:
-            self.batch.step(ids=chosen, nstep=nstep)
+        call_batch(self.batch, self.batch.step, ids=chosen, nstep=nstep)
         self.batch.state[chosen, state_columns(self.model, "time")] = 0.0
         self._copy(self._state_fields, chosen)
 
@@ -306,8 +290,7 @@ class MujocoEngine(Engine):
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field], *, early: bool = False) -> None:
         chosen = self._on_host(mask)
         if stage > Stage.NONE and chosen.any():
-            with self._errors_as_warnings:
-                self.batch.forward(ids=chosen, stage=stage)
+            call_batch(self.batch, self.batch.forward, ids=chosen, stage=stage)
             self._copy(fields, chosen, early=early)
 
     # state

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
+from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.model_fields import ModelField
@@ -92,11 +92,9 @@ class NativeRollout:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
         # after a warning, a world stops and repeats its last row
-        with ErrorsAsWarnings(batch):
-            batch.rollout(nstep=self.control.shape[1], control=self.control, **self._outputs)
+        call_batch(batch, batch.rollout, nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
-            with ErrorsAsWarnings(batch):
-                batch.forward(stage=self.stage)
+            call_batch(batch, batch.forward, stage=self.stage)
         with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
             for field in self.fields:
                 self._copy(field, state, buffers[field.name])

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
-from lyceum_warp.engines.c.batch_faults import ErrorsAsWarnings
+from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.model_fields import ModelField
 
 
@@ -56,8 +56,7 @@ class WorldModels:
     def _set_const(self, worlds: np.ndarray) -> None:
         """Recompute constants. If MuJoCo rejects a world's values, count a warning and try again next time."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
-        with ErrorsAsWarnings(self.batch):
-            self.batch.set_const(worlds)
+        call_batch(self.batch, self.batch.set_const, worlds)
         self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > counted)[worlds]
 
 

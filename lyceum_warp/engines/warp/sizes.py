@@ -14,6 +14,8 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
+from lyceum_warp.engines.c.batch_faults import call_batch
+from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.kernels import faults
 from lyceum_warp.model_fields import ModelField
 
@@ -80,28 +82,18 @@ def warn_of_little_room(
 
     ``values`` are the model fields of the worlds. ``nconmax`` is an average over the worlds.
     """
-    own = copy.copy(model)
-    data = mujoco.MjData(own)
-    contacts, constraints = [], []
-    fields = [field for field in fields if field.size]
-    for w, state in enumerate(states[:_FIRST].astype(float)):
-        for field in fields:
-            value = values[field.name][w]
-            if field.option:
-                setattr(own.opt, field.name, value if value.size > 1 else float(value[0]))
-            else:
-                field.value(own)[...] = value
-        if fields:
-            mujoco.mj_setConst(own, data)
-        mujoco.mj_setState(own, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_forward(own, data)
-        contacts.append(data.ncon)
-        constraints.append(data.nefc)
-    if np.mean(contacts) > nconmax or max(constraints) > njmax:
+    batch = Batch(model, min(len(states), _FIRST))
+    contacts, constraints = batch.bind("ncon"), batch.bind("nefc")
+    WorldModels(batch, fields).apply(
+        {name: rows[: batch.nsim].reshape(batch.nsim, -1) for name, rows in values.items()}
+    )
+    batch.state[:] = states[: batch.nsim]
+    call_batch(batch, batch.forward)
+    if contacts.mean() > nconmax or constraints.max() > njmax:
         log.warning(
             "worlds begin with up to %d constraints and %.3g contacts on average, but njmax=%d and nconmax=%d: "
             "give make() larger values, or steps end with constraint_overflow or contact_overflow",
-            max(constraints), np.mean(contacts), njmax, nconmax,
+            constraints.max(), contacts.mean(), njmax, nconmax,
         )  # fmt: skip
 
 
