@@ -185,7 +185,7 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
     Options that only the Warp engine has are ignored.
     """
     named = {EXACT: PhysicsOptions(), **env.task.task.physics}
-    given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=False)
+    given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
     own = next((name for name, options in named.items() if options == given), "own")
     return named | {own: given}, own
 
