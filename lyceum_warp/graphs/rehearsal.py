@@ -12,34 +12,29 @@ from lyceum_warp.support.upstream import replaced_in_this_thread
 _lock = threading.RLock()
 
 
-class Rehearsal:
-    """Replaces Warp's launch functions, and lists the modules of launched kernels."""
-
-    def __init__(self) -> None:
-        self.modules: dict[tuple[Any, int | None], None] = {}
-        """Modules and block sizes (None for Warp's default) in launch order."""
-
-    def launch(self, kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
-        """List a kernel's module."""
-        # empty launches load no module, and generic kernels are compiled for argument types
-        if np.prod(dim) and not kernel.is_generic:
-            self.modules[kernel.module, block_dim] = None
-
-
 @contextlib.contextmanager
-def rehearse() -> Iterator[Rehearsal]:
-    """List this thread's launches instead of running the kernels; graph branches and loops run once.
+def rehearse() -> Iterator[dict[tuple[Any, int | None], None]]:
+    """List the modules of this thread's launches instead of running the kernels; graph branches and loops run once.
 
     Copies and allocations still run, so arrays may contain garbage afterwards. Only one thread can do this at a time;
     other threads launch kernels as usual.
+
+    Yields:
+        Modules and block sizes (None for Warp's default) in launch order, as the keys of a dict.
     """
-    rehearsal = Rehearsal()
-    functions: dict[str, Callable[..., None]] = {"launch": rehearsal.launch, "launch_tiled": rehearsal.launch}
+    modules: dict[tuple[Any, int | None], None] = {}
+
+    def launch(kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
+        # empty launches load no module, and generic kernels are compiled for argument types
+        if np.prod(dim) and not kernel.is_generic:
+            modules[kernel.module, block_dim] = None
+
+    functions: dict[str, Callable[..., None]] = dict.fromkeys(("launch", "launch_tiled"), launch)
     functions |= {"capture_while": _loop, "capture_if": _branch}
     # sorts and scans would read garbage
     functions |= dict.fromkeys(("radix_sort_pairs", "segmented_sort_pairs", "array_scan"), _nothing)
     with _lock, replaced_in_this_thread(functions):
-        yield rehearsal
+        yield modules
 
 
 def _loop(condition: Any, while_body: Any, stream: Any = None, **kwargs: Any) -> None:

@@ -35,7 +35,7 @@ def step():
 
 with rehearse() as rehearsal:
     step()
-print("rehearsed:", *sorted({module.name for module, _ in rehearsal.modules}), flush=True)
+print("rehearsed:", *sorted({module.name for module, _ in rehearsal}), flush=True)
 step()
 """
 
@@ -56,7 +56,7 @@ def test_a_rehearsal_lists_launches_without_running_them(arrays: tuple[wp.array,
         launch(*arrays)
         wp.capture_if(flag, on_true=lambda: launch(*arrays))
         wp.capture_while(flag, while_body=lambda: launch(*arrays))
-    assert list(rehearsal.modules) == [(fill_rows64.module, None)]
+    assert list(rehearsal) == [(fill_rows64.module, None)]
     assert not arrays[2].numpy().any()
     launch(*arrays)
     assert arrays[2].numpy().all()
@@ -83,12 +83,12 @@ def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.arra
             inside.set()
             release.wait(10)
             launch(*arrays)
-            order.append(("first", len(rehearsal.modules)))
+            order.append(("first", len(rehearsal)))
 
     def second() -> None:
         with rehearse() as rehearsal:
             launch(*arrays)
-            order.append(("second", len(rehearsal.modules)))
+            order.append(("second", len(rehearsal)))
 
     threads = [threading.Thread(target=first), threading.Thread(target=second)]
     threads[0].start()
