@@ -54,17 +54,6 @@ def test_field_has_the_type_of_its_elements_and_the_size_of_the_mujoco_array(
     assert field.size == np.size(getattr(mujoco.MjData(model), name))
 
 
-def test_error_of_an_unknown_field_suggests_similar_names(model: mujoco.MjModel) -> None:
-    with pytest.raises(ValueError, match="there is no field 'site_xpoz': did you mean site_xpos"):
-        describe(model, "site_xpoz")
-
-
-@pytest.mark.parametrize("name", ["subtree_linvel"])
-def test_field_that_needs_a_sensor_raises_an_error_without_one(name: str, model: mujoco.MjModel) -> None:
-    with pytest.raises(ValueError, match=f"MuJoCo computes the field {name!r} only for a sensor, .*fields="):
-        describe(model, name)
-
-
 @pytest.mark.parametrize(
     ("name", "element", "where"),
     [

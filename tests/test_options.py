@@ -34,6 +34,7 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"deterministic": 0}, "deterministic must be True or False, not 0"),
         ({"nworld": True}, "nworld must be a whole number .*, not True"),
         ({"device": 0}, "device must be .* as 'cpu' or 'cuda:0', not int 0"),
+        ({"engine": None}, "engine must be .* not NoneType None"),
         ({"model": 3}, "model must be .* a file or an MjSpec, not int 3"),
         ({"physics": 3}, "physics must be of type PhysicsOptions, as lw.PhysicsOptions.*, not int 3"),
     ],

@@ -166,18 +166,6 @@ def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
         assert torch.equal(one, other) and one.any()
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_captured_graphs_use_new_parameters_that_differ_between_worlds(engine: str) -> None:
-    env = lw.make("hopper", nworld=2, engine=engine)
-    action = torch.ones(2, 3)
-    for _ in range(3):
-        env.step(action)
-    env.set_params(ctrl_cost_weight=[0.0, 1.0])
-    env.reset()
-    env.step(action)
-    torch.testing.assert_close(env.reward[0] - env.reward[1], torch.tensor(3.0))
-
-
 def test_random_numbers_depend_on_the_world_index_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):

@@ -36,72 +36,32 @@ def test_error_of_a_function_with_other_arguments_shows_the_correct_line(name: s
     assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}{more}"
 
 
-WRONG_SIGNATURES = {
+CLASS = "class Tiny(lw.Task):"
+MISTAKES = {
     "another result": (
-        "def terminated(s: World, p: Params) -> float:\n    return 1.0",
+        CLASS, f"@wp.func\ndef terminated(s: World, p: Params) -> float:\n    return 1.0\n\n{CLASS}",
         r"terminated of the task 'tiny' must be written as terminated\(s: World, p: Params\) -> bool",
     ),
     "an argument missing": (
-        "def success(s: World) -> bool:\n    return True",
+        CLASS, f"@wp.func\ndef success(s: World) -> bool:\n    return True\n\n{CLASS}",
         r"success of the task 'tiny' must be written as success\(s: World, p: Params\) -> bool",
     ),
-}
-
-
-@pytest.mark.parametrize(("function", "message"), WRONG_SIGNATURES.values(), ids=WRONG_SIGNATURES)
-def test_function_with_wrong_result_or_missing_argument_raises_an_error(
-    function: str, message: str, tmp_path: Path
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        source_of(tmp_path, tiny_task.with_function(function))
-
-
-INCOMPLETE = {
     "no observe": ("def observe", "def look", r"the task 'tiny' has no observe\(s, p, obs\)"),
     "annotations as text": (
         "obs: Row[float]):", "obs: 'Row[float]'):", "observe of the task 'tiny' has annotations that are text"
     ),
+    "an ordinary class World": (
+        CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
+        "World of the task 'tiny' must be a Warp struct: decorate it with @wp.struct",
+    ),
+    "a misspelt attribute": (CLASS, f"{CLASS}\n    horzon = 10", "'horzon' in its class: did you mean horizon"),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("old", "new", "message"), INCOMPLETE.values(), ids=INCOMPLETE)
-def test_error_of_an_incomplete_file_names_the_missing_struct_or_function(
-    old: str, new: str, message: str, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("old", "new", "message"), MISTAKES.values(), ids=MISTAKES)
+def test_invalid_struct_function_or_attribute_raises_an_error(old: str, new: str, message: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=message):
         source_of(tmp_path, tiny_task.changed((old, new)))
-
-
-@pytest.mark.parametrize("name", ["World", "Params"])
-def test_ordinary_class_instead_of_a_warp_struct_raises_an_error(name: str, tmp_path: Path) -> None:
-    text = tiny_task.TINY.replace("    model =", f"    class {name}:\n        qpos: Row[float]\n\n    model =")
-    with pytest.raises(ValueError, match=f"{name} of the task 'tiny' must be a Warp struct: decorate it with @wp.st"):
-        source_of(tmp_path, text)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("sucess_steps = 10", "'sucess_steps' in its class: did you mean success_steps"),
-        ("horzon = 10", "'horzon' in its class: did you mean horizon"),
-    ],
-)
-def test_misspelt_task_attribute_raises_an_error(line: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        source_of(tmp_path, f"{tiny_task.TINY}    {line}\n")
-
-
-def test_functions_in_the_class_take_precedence_over_the_module(tmp_path: Path) -> None:
-    text = tiny_task.with_function(MEANT["evaluate"].replace("evaluate", "distance"))
-    source = source_of(tmp_path, f"{text}    evaluate = distance\n")
-    assert source.functions["evaluate"] is vars(source.task)["evaluate"]
-
-
-def test_a_subclass_inherits_functions_and_structs(tmp_path: Path) -> None:
-    file = tiny_task.write(tmp_path, f"{tiny_task.with_function(MEANT['reward'])}\nclass Other(Tiny):\n    pass\n")
-    first, second = (TaskSource(find_task(f"{file}:{name}"), name) for name in ("Tiny", "Other"))
-    assert first.functions == second.functions
-    assert (first.world, first.params) == (second.world, second.params)
 
 
 CRITIC = "@wp.func\ndef observe_critic(s: World, p: Params, obs: Row[float]):\n    obs[0] = s.qpos[0]\n\n"

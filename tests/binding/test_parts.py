@@ -100,16 +100,6 @@ def test_states_and_observations_contain_all_parts_in_order(engine: str) -> None
     assert env.obs[:, 5].tolist() == [6.0, 7.0]
 
 
-def test_parameter_that_would_change_the_sizes_of_parts_raises_an_error() -> None:
-    env = lw.make(Marked, places=[1.0, 2.0])
-    assert env.obs.shape == (1, 5)
-    env.set_params(places=[3.0, 4.0])
-    with pytest.raises(ValueError, match="^places would change the sizes of the observation's parts"):
-        env.set_params(places=[1.0, 2.0, 3.0])
-    env.reset()
-    assert env.obs[0, :2].tolist() == [3.0, 4.0]
-
-
 STRUCT = (
     'class Tiny(lw.Task):\n    model = "hopper.xml"\n    obs = {"x": 1}',
     'class Tiny(lw.Task):\n    model = "hopper.xml"',

@@ -188,22 +188,6 @@ def test_reset_does_not_change_faults_of_other_worlds() -> None:
     assert env.done_reason.tolist() == [0, 0, int(lw.Done.ENGINE_WARNING)]
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_integrator_and_solver_options_reach_the_engine(engine: str) -> None:
-    solver = {"iterations": 3, "ls_iterations": 7, "noslip_iterations": 2}
-    env = lw.make("point_mass", engine=engine, nworld=2, integrator="implicitfast", solver=solver)
-    for other in (env, env.replicate(nworld=1)):
-        options = other.model.opt
-        assert options.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-        assert (options.iterations, options.ls_iterations, options.noslip_iterations) == (3, 7, 2)
-        other.step()
-        assert torch.isfinite(other.obs).all()
-    if engine == "warp":
-        opt = env.engine.m.opt  # type: ignore[attr-defined]
-        assert (int(opt.integrator), opt.iterations, opt.ls_iterations) == (int(options.integrator), 3, 7)
-    assert lw.make("point_mass", engine=engine).model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-
-
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_listed_fields_are_computed_even_if_the_task_does_not_read_them(engine: str) -> None:
@@ -217,21 +201,6 @@ def test_listed_fields_are_computed_even_if_the_task_does_not_read_them(engine: 
     for task, name in (("hopper", "cfrc_ext"), ("hopper", "sensordata"), ("adroit_pen", "sensordata")):
         with pytest.raises(ValueError, match=f"'{name}' only for a sensor.*task's World.*fields=\\['{name}'\\]"):
             lw.make(task, engine=engine).field(name)
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_state_fields_are_those_of_the_last_step_after_a_rollout(engine: str) -> None:
-    """The C engine computes the whole rollout in one native call."""
-    env = lw.make("hopper", engine=engine, nworld=2, autoreset=False, frame_skip=2)
-    state = wp.from_torch(env.get_state())
-    controls = wp.full((3, 2, env.model.nu), 0.5, dtype=float, device="cpu")
-    qpos = wp.zeros((4, *env.engine.arrays["qpos"].shape), dtype=float, device="cpu")
-    start = env.field("qpos").clone()
-    env.engine.rollout(state, controls, 2, {"qpos": qpos})
-    assert torch.equal(wp.to_torch(qpos)[0], start)
-    assert torch.equal(wp.to_torch(qpos)[3], env.field("qpos")) and not torch.equal(env.field("qpos"), start)
-    assert env.field("time").tolist() == pytest.approx([6 * env.model.opt.timestep] * 2)
-    assert (wp.to_torch(env.engine.ctrl) == 0.5).all()
 
 
 def test_option_deterministic_has_no_effect_on_the_cpu() -> None:
@@ -250,25 +219,6 @@ def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
     model, data = engine.bare()
     assert (data.naconmax, data.njmax, model.opt.warn_overflow) == (engine.naconmax, engine.njmax, 0)
     assert lw.make("point_mass", engine="warp", nconmax=8).engine.naconmax == 8  # type: ignore[attr-defined]
-
-
-def test_partial_and_full_forward_passes_give_equal_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A partial pass computes only the restarting worlds."""
-    runs = []
-    for partial in (True, False):
-        monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
-        env = lw.make("half_cheetah", engine="warp", nworld=3, horizon=5, seed=1, frame_skip=2)
-        state = env.get_state()
-        state[1, env.state_space.parts["step"]] = 3
-        env.set_state(state)
-        run = []
-        for _ in range(8):
-            env.step(torch.full_like(env.action, 0.3))
-            run.append((env.done.clone(), env.obs.clone(), env.get_state()))
-        runs.append(run)
-    assert sum(int(done.sum()) for done, *_ in runs[0]) >= 4
-    for one, other in zip(*runs, strict=True):
-        assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 @pytest.mark.parametrize("partial", [True, False])

@@ -177,7 +177,7 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
 
 @pytest.mark.quick(
     "body_mass", "body_inertia", "body_ipos", "qpos0", "dof_armature", "actuator_gear", "geom_size", "geom_gap",
-    "cam_pos", "tendon_armature",
+    "cam_pos", "tendon_armature", "wind", "tendon_frictionloss", "body_gravcomp", "geom_quat", "jnt_pos",
 )  # fmt: skip
 @pytest.mark.parametrize("name", VARYING_FIELDS)
 def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, device: wp.Device) -> None:

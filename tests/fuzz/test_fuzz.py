@@ -8,23 +8,16 @@ import shutil
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import command_attacks
+import file_attacks
+import keyword_attacks
 import pytest
 from guarded import Outcome, attacks, replay
 from minimal_cases import COMMANDS, FILES, KEYWORDS
 
-KINDS = {
-    "file_attacks.py": (
-        "config.json", "kept config.json", "metrics.csv", "policy.pt", "best.pt", "checkpoint.pt", "previous.pt",
-        "episode.npz", "kept model", "kept table", "model.xml", "table.npy",
-    ),
-    "keyword_attacks.py": (
-        "EnvOptions", "PhysicsOptions", "MPPIConfig", "NPGConfig", "make", "MPPI", "CEM", "NPG", "evaluate", "train",
-        "control", "control_async", "Rollout", "OpenLoop", "load", "load_value", "GaussianPolicy", "ValueFunction",
-    ),
-    "command_attacks.py": (
-        "tasks", "new", "check", "train", "train --resume good", "train --from good", "eval", "export", "plan", "view",
-        "bench",
-    ),
+KINDS: dict[str, Iterable[str]] = {
+    "file_attacks.py": file_attacks.KINDS, "keyword_attacks.py": keyword_attacks.CALLS,
+    "command_attacks.py": command_attacks.SMALL,
 }  # fmt: skip
 """Kinds of random cases, by attack program."""
 COUNTS = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}

@@ -1,10 +1,8 @@
 """Test rehearsals, which list the kernels that a function would launch."""
 
-import inspect
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 import warp as wp
@@ -103,37 +101,6 @@ def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.arra
         thread.join(10)
     assert order == [("first", 1), ("second", 1)]
     assert originals() == before
-
-
-# if Warp lacks one of these names, update graphs/rehearsal.py and graphs/compile_ahead.py
-
-
-def test_warp_has_the_functions_that_a_rehearsal_replaces() -> None:
-    for owner, names in REPLACED.items():
-        for name in names:
-            assert callable(getattr(owner, name, None)), f"{owner.__name__}.{name}"
-    wanted = {
-        "launch": ["kernel", "dim", "inputs", "outputs", "block_dim"],
-        "capture_while": ["condition", "while_body", "stream", "kwargs"],
-        "capture_if": ["condition", "on_true", "on_false", "stream", "kwargs"],
-    }
-    for name, arguments in wanted.items():
-        found = list(inspect.signature(getattr(wp, name)).parameters)
-        assert [argument for argument in found if argument in arguments] == arguments, name
-
-
-def test_warp_has_the_internals_that_compiling_ahead_reads(arrays: tuple[wp.array, wp.array, wp.array]) -> None:
-    launch(*arrays)
-    kernel, device = fill_rows64, wp.get_device("cpu")
-    assert kernel.is_generic is False
-    module = kernel.module
-    assert (device.context, 1) in module.execs
-    assert {"device", "modules", "block_dim", "max_workers"} <= set(inspect.signature(wp.force_load).parameters)
-    module.get_module_hash(1)
-    name = module.get_module_identifier(1)
-    assert isinstance(name, str) and isinstance(wp.config.kernel_cache_dir, str)
-    output = module._get_compile_output_name(device, block_dim=1)
-    assert Path(wp.config.kernel_cache_dir, name, output).exists()
 
 
 @pytest.mark.long
