@@ -123,49 +123,6 @@ def test_success_steps_must_be_consecutive_within_an_episode(engine: str) -> Non
     assert "success_steps" not in plain.state_space.parts
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_state_contains_the_count_of_success_steps_and_a_reset_clears_it(engine: str) -> None:
-    goals = np.array([0.0, 99.0, 99.0])
-    env = lw.make(Held, engine=engine, nworld=3, horizon=0, autoreset=False, success_distance=goals)
-    for _ in range(2):
-        env.step()
-    state = env.get_state()
-    assert not env.success.any()
-    for _ in range(4):
-        env.step()
-        assert env.success.tolist() == [False, True, True]
-    full = env.get_state()
-    env.reset(torch.tensor([False, False, True]))
-    assert env.success.tolist() == [False, True, False]
-    env.set_state(state)
-    assert not env.success.any()
-    env.step()
-    assert env.success.tolist() == [False, True, True]
-    env.set_state(full)
-    assert env.success.tolist() == [False, True, True]
-    env.set_params(success_distance=0.0)  # set_state restores a success only if the state satisfies the goal
-    env.set_state(full)
-    assert not env.success.any()
-
-
-def test_rollouts_and_plans_do_not_depend_on_success_steps() -> None:
-    held, plain = held_and_plain("mujoco", nworld=4, autoreset=False)
-    actions = torch.rand(5, 4, 2, generator=torch.Generator().manual_seed(0))
-    rewards, plans = [], []
-    for env in (held, plain):
-        env.step()
-        rollouts = lw.OpenLoop(env.replicate(), 5)
-        rollouts.state.copy_(env.get_state()[0])
-        rollouts.actions.copy_(actions)
-        rollouts.run()
-        rewards.append(rollouts.reward.clone())
-        planner = lw.MPPI(env.task.task, horizon=4, samples=8, seed=3)
-        plans.append([planner(env.get_state()[0]).clone() for _ in range(2)])
-    assert torch.equal(*rewards)
-    for one, other in zip(*plans, strict=True):
-        assert torch.equal(one, other) and one.any()
-
-
 def test_random_numbers_depend_on_the_world_index_over_all_processes() -> None:
     whole, part = lw.make("point_mass", nworld=4), lw.make("point_mass", nworld=2, first_world=2)
     for env in (whole, part):

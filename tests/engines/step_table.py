@@ -195,7 +195,7 @@ UNKNOWN = {
 """Enum members that no model uses, each with a reason."""
 
 
-def xml(case: Case) -> str:
+def xml(case: Case, sensors: str | None = None) -> str:
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
     actuators = []
     for drive, (name, place) in itertools.product(DRIVE_GROUPS[case["drives"]], PLACES.items()):
@@ -256,7 +256,7 @@ def xml(case: Case) -> str:
       {pair}
       <actuator>{"".join(actuators)}</actuator>
       <equality>{equality}</equality>
-      <sensor>{SENSORS[case["sensors"]].format(drive=DRIVE_GROUPS[case["drives"]][0])}</sensor>
+      <sensor>{(sensors or SENSORS[case["sensors"]]).format(drive=DRIVE_GROUPS[case["drives"]][0])}</sensor>
     </mujoco>"""
 
 

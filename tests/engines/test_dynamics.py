@@ -140,46 +140,8 @@ def test_worlds_with_their_own_models_step_like_plain_mujoco(engine: type[Engine
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_model_change_in_one_world_does_not_affect_other_worlds(engine: type[Engine]) -> None:
-    changed, untouched = make(engine, *DRAWN), make(engine, *DRAWN)
-    for made in (changed, untouched):
-        draw(made, 1)
-    run(changed, 2), run(untouched, 2)
-    draw(changed, 2, 1)
-    got, expected = run(changed), run(untouched)
-    np.testing.assert_array_equal(got[[0, 2]], expected[[0, 2]])
-    assert (got[1] != expected[1]).any()
-
-
 def test_nominal_per_world_fields_give_the_steps_of_the_shared_model() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
-
-
-def test_mass_that_is_not_positive_causes_a_fault_in_its_world() -> None:
-    for engine in (MujocoEngine, WarpEngine):
-        made = make(engine, "body_mass", "body_inertia")
-        for name in ("body_mass", "body_inertia"):
-            made.arrays[name].numpy()[1] *= -1
-        made.apply_model(worlds(N, 1))
-        run(made, 3)
-        made.find_faults(worlds())
-        np.testing.assert_array_equal(made.fault.numpy() != 0, [False, True, False])
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_restored_state_restores_its_model_fields(engine: type[Engine]) -> None:
-    made, other = make(engine, *DRAWN), make(engine, *DRAWN)
-    draw(made, 1)
-    draw(other, 2)
-    run(made, 3), run(other, 2)
-    assert made.state_size > made.integration_size + sum(field.size for field in made.snapshots)
-    state = state_of(made)
-    other.set_state(state, worlds())
-    for name in made.dynamics:
-        np.testing.assert_array_equal(other.arrays[name].numpy(), made.arrays[name].numpy())
-    np.testing.assert_array_equal(state_of(other).numpy(), state.numpy())
-    np.testing.assert_array_equal(run(other), run(made))
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -280,25 +242,6 @@ def test_apply_model_and_settle_give_the_same_results_in_graphs() -> None:
             for call in calls:
                 call()
     np.testing.assert_array_equal(shown(captured), shown(direct))
-
-
-@pytest.mark.parametrize("name", ["xfrc_applied", "qfrc_applied", "mocap_pos"])
-@pytest.mark.parametrize("engine", ENGINES)
-def test_inputs_take_effect_in_the_next_step(engine: type[Engine], name: str) -> None:
-    made = make(engine, written=(name,), fields=("xpos",))
-    assert made.fields[name].written
-    index = MODEL.body("box").id if name == "xfrc_applied" else 0
-    made.arrays[name].numpy()[1, index] += np.float32(0.5)
-    run(made, 4)
-    data = mujoco.MjData(MODEL)
-    getattr(data, name)[index] += 0.5
-    data.ctrl[:] = (0.5, -0.3, 0.2)
-    for _ in range(8):
-        mujoco.mj_step(MODEL, data)
-    mujoco.mj_forward(MODEL, data)
-    np.testing.assert_allclose(made.arrays["qvel"].numpy()[1], data.qvel, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(made.arrays["xpos"].numpy()[1], data.xpos, rtol=1e-5, atol=1e-5)
-    assert (made.arrays["xpos"].numpy()[1] != made.arrays["xpos"].numpy()[0]).any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)

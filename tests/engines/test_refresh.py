@@ -1,9 +1,11 @@
+import re
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import pytest
+import step_table as table
 import warp as wp
 
 from lyceum_warp.engines.base import Engine
@@ -11,69 +13,14 @@ from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
 
-CHEAP = """
-<velocimeter site="tip"/> <gyro site="tip"/> <magnetometer site="tip"/> <clock/>
-<framepos objtype="site" objname="tip"/> <framequat objtype="body" objname="torso"/>
-<framexaxis objtype="geom" objname="leg"/> <frameyaxis objtype="camera" objname="eye"/>
-<framezaxis objtype="xbody" objname="torso" reftype="site" refname="tip"/>
-<framelinvel objtype="camera" objname="eye" reftype="body" refname="torso"/>
-<frameangvel objtype="site" objname="tip"/>
-<jointpos joint="knee"/> <jointvel joint="knee"/> <ballquat joint="hip"/> <ballangvel joint="hip"/>
-<tendonpos tendon="band"/> <actuatorpos actuator="pull"/>
-<subtreecom body="torso"/> <subtreelinvel body="torso"/> <subtreeangmom body="torso"/>
-<camprojection site="tip" camera="eye"/> <insidesite site="zone" objtype="body" objname="torso"/>
-<rangefinder site="tip"/> <e_potential/>
-"""
-SENSORS = {
-    "cheap": CHEAP,
-    "velocities of tendons": CHEAP + '<tendonvel tendon="cord"/> <actuatorvel actuator="pull"/> <e_kinetic/>',
-    "limits": CHEAP
-    + """<jointlimitpos joint="knee"/> <jointlimitvel joint="knee"/> <tendonlimitpos tendon="cord"/>
-    <tendonlimitvel tendon="cord"/> <distance geom1="leg" geom2="floor" cutoff="1"/>
-    <fromto geom1="leg" geom2="floor" cutoff="1"/>""",
-    "mixed": CHEAP
-    + """<accelerometer site="tip"/> <touch site="tip"/> <force site="tip"/> <actuatorfrc actuator="pull"/>
-    <framelinacc objtype="site" objname="tip"/> <jointlimitfrc joint="knee"/>""",
-    "histories": """<jointpos joint="knee" nsample="4" delay="0.005"/> <gyro site="tip" nsample="4" interval="0.006"/>
-    <framepos objtype="site" objname="tip"/> <accelerometer site="tip" nsample="4" delay="0.004"/>""",
-}
+SENSORS = {name: table.SENSORS[name] for name in ("position", "velocity", "limits", "histories")}
+SENSORS["limits"] = re.sub(r"<\w+frc [^>]*>", "", SENSORS["limits"])  # forces belong to the acceleration stage
+SENSORS["mixed"] = table.SENSORS["velocity"] + table.SENSORS["acceleration"]
 FIELDS = "site_xpos xpos xquat subtree_com cam_xpos cvel sensordata"
 
 
-def model_of(sensors: str, equality: str = "") -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(f"""
-    <mujoco>
-      <option timestep="0.002"/>
-      <worldbody>
-        <geom name="floor" type="plane" size="5 5 1"/>
-        <site name="zone" type="box" size="1 1 .5" pos="0 0 .5"/>
-        <body name="torso" pos="0 0 0.7">
-          <freejoint/>
-          <geom name="trunk" type="box" size=".15 .1 .05"/>
-          <camera name="eye" pos="-1 0 1" xyaxes="0 -1 0 1 0 1" resolution="64 48"/>
-          <site name="hook" pos=".1 0 0"/>
-          <body pos=".15 0 0">
-            <joint name="hip" type="ball" damping=".5"/>
-            <geom type="capsule" fromto="0 0 0 0 0 -.25" size=".04"/>
-            <body pos="0 0 -.25">
-              <joint name="knee" axis="0 1 0" range="-40 5" limited="true" damping=".1"/>
-              <geom name="leg" type="capsule" fromto="0 0 0 .05 0 -.2" size=".03"/>
-              <site name="tip" pos=".05 0 -.2" size=".05"/>
-            </body>
-          </body>
-        </body>
-      </worldbody>
-      <tendon>
-        <spatial name="band" stiffness="5"><site site="hook"/><site site="tip"/></spatial>
-        <fixed name="cord" range="-.5 .05" limited="true"><joint joint="knee" coef="1"/></fixed>
-      </tendon>
-      <actuator>
-        <general name="pull" tendon="band" gainprm="5" dyntype="filter" dynprm=".05"/>
-        <motor name="bend" joint="knee" gear="3"/>
-      </actuator>
-      <equality>{equality}</equality>
-      <sensor>{sensors}</sensor>
-    </mujoco>""")
+def model_of(sensors: str, equality: str = "none") -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(table.xml(table.PLAIN | {"equality": equality}, SENSORS[sensors]))
 
 
 def everyone(engine: Engine) -> wp.array:
@@ -153,19 +100,16 @@ def kind(request: pytest.FixtureRequest) -> type[Engine]:
     return engine
 
 
-def make(kind: type[Engine], sensors: str, equality: str = "") -> Engine:
-    model = model_of(SENSORS[sensors], equality)
+def make(kind: type[Engine], sensors: str, equality: str = "none") -> Engine:
+    model = model_of(sensors, equality)
     fields = [describe(model, name) for name in ("qpos", "qvel", *FIELDS.split())]
-    sizes = {} if kind is MujocoEngine else {"nconmax": 8, "njmax": 48}
+    sizes = {} if kind is MujocoEngine else {"nconmax": 64, "njmax": 256}
     engine = kind(model, 4, wp.get_device("cpu"), fields, **sizes)
     begin(engine, everyone(engine), 0)
     return engine
 
 
-@pytest.mark.quick(
-    "mujoco-cheap", "mujoco-velocities of tendons", "mujoco-limits", "mujoco-mixed", "mujoco-histories",
-    "warp-mixed", "warp-histories",
-)  # fmt: skip
+@pytest.mark.quick(*(f"mujoco-{name}" for name in SENSORS), "warp-mixed", "warp-histories")
 @pytest.mark.parametrize("sensors", SENSORS)
 def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) -> None:
     engine = make(kind, sensors)
@@ -185,7 +129,7 @@ def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) 
         begin(engine, everyone(engine), steps)
 
 
-@pytest.mark.parametrize("sensors", ["cheap", "velocities of tendons", "mixed", "histories"])
+@pytest.mark.parametrize("sensors", ["position", "velocity", "mixed", "histories"])
 def test_refresh_on_warp_computes_no_collisions_and_no_constraints(
     sensors: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -256,7 +200,7 @@ def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> 
 
 @pytest.mark.quick("mujoco", "warp")
 def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
-    engine = make(kind, "mixed", '<joint joint1="knee" polycoef="-.3 0 0 0 0"/>')
+    engine = make(kind, "mixed", "joint")
     held = shown(engine)["sensordata"]
     state = state_of(engine)
     state[1, state_columns(engine.model, "eq_active")] = 0.0
@@ -269,8 +213,8 @@ def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine
 @pytest.mark.quick("mujoco", "warp")
 def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine]) -> None:
     engine = make(kind, "limits")
-    knee = int(engine.model.joint("knee").qposadr[0])
-    column = state_columns(engine.model, "qpos").start + knee
+    elbow = int(engine.model.joint("elbow").qposadr[0])
+    column = state_columns(engine.model, "qpos").start + elbow
     sensor = next(i for i in range(engine.model.nsensor)
                   if engine.model.sensor_type[i] == mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)  # fmt: skip
     adr = int(engine.model.sensor_adr[sensor])
@@ -285,7 +229,7 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
     """Worlds that share an MjData run each stage in turn. Fields of other stages then belong to another world."""
-    model, device = model_of(SENSORS["mixed"]), wp.get_device("cpu")
+    model, device = model_of("mixed"), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
         engines = [MujocoEngine(model, nworld, device, fields, nthread=1) for nworld in (4, 1, 1, 1, 1)]
