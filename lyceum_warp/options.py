@@ -15,7 +15,15 @@ import mujoco
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.support.validate import check_flag, check_kind, described, finite_number, positive_number, whole_number
+from lyceum_warp.support.validate import (
+    check_flag,
+    check_kind,
+    check_word,
+    described,
+    finite_number,
+    positive_number,
+    whole_number,
+)
 
 ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 
@@ -48,12 +56,6 @@ def given_values(options: Any) -> dict[str, Any]:
 def _whole(options: Any, name: str, low: int) -> None:
     if (value := getattr(options, name)) is not None:
         object.__setattr__(options, name, whole_number(name, value, low=low))
-
-
-def _one_of(what: str, name: Any, known: Mapping[str, Any]) -> None:
-    if name is not None and (not isinstance(name, str) or name not in known):
-        *others, last = map(repr, known)
-        raise ValueError(f"there is no {what} {name!r}: use {', '.join(others)} or {last}")
 
 
 def _checked_limits(solver: Any) -> dict[str, int]:
@@ -113,9 +115,9 @@ class PhysicsOptions:
             object.__setattr__(self, "timestep", positive_number("timestep", self.timestep, "seconds"))
         if self.impratio is not None:
             object.__setattr__(self, "impratio", finite_number("impratio", self.impratio, low=1e-15))
-        _one_of("friction cone", self.cone, CONES)
-        _one_of("integrator", self.integrator, INTEGRATORS)
-        _one_of("Jacobian", self.jacobian, JACOBIANS)
+        for name, known in (("cone", CONES), ("integrator", INTEGRATORS), ("jacobian", JACOBIANS)):
+            if getattr(self, name) is not None:
+                check_word(name, getattr(self, name), list(known))
         for name in ("discardvisual", "deterministic"):
             if (flag := getattr(self, name)) is not None:
                 check_flag(name, flag)

@@ -124,17 +124,14 @@ class Worlds(WorldArrays):
 
     def transition_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step that advance and judge the worlds, without resets and events."""
-        return [
+        phases = [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
             Phase("judge", self._judge_step, by_world=True),
-            *self._tally_phases(),
         ]
-
-    def _tally_phases(self) -> list[Phase]:
-        """On a CPU, atomic additions need a single thread."""
-        kernel = self.task.kernels.tally_worlds if self.autoreset else None
-        return [] if kernel is None else [Phase("tally", partial(self._tally, kernel))]
+        if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
+            phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
+        return phases
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step's substeps."""

@@ -121,7 +121,7 @@ def kernels_of(
             written = [name for name, function in found.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.kernel_name}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
-            names = [field.name for field in dataclasses.fields(TaskCode) if field.name not in given]
+            names = [field.name for field in dataclasses.fields(TaskCode) if field.init and field.name not in given]
             _kernels[key] = steps.make_kernels(TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
 

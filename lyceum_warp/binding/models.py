@@ -4,8 +4,9 @@ import logging
 import sys
 import textwrap
 import warnings
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -112,16 +113,10 @@ def compile_model(
     _remove_repeated_pairs(spec)
     if "energy" in fields:
         spec.option.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
-    if physics.timestep is not None:
-        spec.option.timestep = physics.timestep
-    if physics.cone is not None:
-        spec.option.cone = CONES[physics.cone]
-    if physics.integrator is not None:
-        spec.option.integrator = INTEGRATORS[physics.integrator]
-    if physics.jacobian is not None:
-        spec.option.jacobian = JACOBIANS[physics.jacobian]
-    if physics.impratio is not None:
-        spec.option.impratio = physics.impratio
+    codes: dict[str, Mapping[str, Any]] = {"cone": CONES, "integrator": INTEGRATORS, "jacobian": JACOBIANS}
+    for name in ("timestep", "impratio", *codes):
+        if (value := getattr(physics, name)) is not None:
+            setattr(spec.option, name, codes[name][value] if name in codes else value)
     if physics.discardvisual is not None:
         spec.compiler.discardvisual = physics.discardvisual
     for name, limit in (physics.solver or {}).items():

@@ -49,15 +49,7 @@ class Findings:
     """Faults that the parts of ``judge`` find, (parts, nworld)."""
 
 
-OUTCOMES = {
-    "reward": wp.float32,
-    "eval": wp.float32,
-    "terminated": wp.bool,
-    "truncated": wp.bool,
-    "success": wp.bool,
-    "done": wp.bool,
-    "done_reason": wp.int32,
-}
+OUTCOMES = {name: field.type.dtype for name, field in Outcome.vars.items() if field.type.ndim == 1}
 """Types of the fields of Outcome with the shape (nworld,)."""
 
 
@@ -89,10 +81,16 @@ class TaskCode:
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed
+    kernels: dict[str, wp.Kernel | None] = dataclasses.field(default_factory=dict, init=False)
 
     def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
-        """Decorator: turn a function into a kernel of the task's Warp module, or into None if it is not needed."""
-        return wp.kernel(module=self.module, enable_backward=False) if needed else lambda body: None
+        """Decorator: add a function to ``kernels``, as a kernel of the task's Warp module, or as None if not needed."""
+
+        def add(body: Any) -> None:
+            made = wp.kernel(module=self.module, enable_backward=False)(body) if needed else None
+            self.kernels[body.__name__] = made
+
+        return add
 
     def kernel_for(self, function: str) -> Callable[[Any], Any]:
         """Decorator: turn a function into a kernel, or into None if the task does not define ``function``."""

@@ -1,7 +1,7 @@
 """Make the kernels of a step that call a task's functions to map actions, begin episodes and share memory."""
 
-import dataclasses
 from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -9,7 +9,7 @@ import warp as wp
 from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.kernels.random import stream, substream
 from lyceum_warp.kernels.step_types import Counters, TaskCode
-from lyceum_warp.kernels.transitions import JudgeKernels, RolloutKernels, judge_kernels, rollout_kernels
+from lyceum_warp.kernels.transitions import judge_kernels, rollout_kernels
 
 ACTION = wp.constant(int(Done.ACTION))
 MODEL = wp.constant(int(Done.MODEL))
@@ -22,20 +22,8 @@ STARTUP = wp.constant(-1)
 """Stands for the episode in the random stream of ``startup``."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ActKernels:
-    """Kernels that map actions to controls, and advance the task's memory."""
-
-    keep_before: wp.Kernel | None
-    act: wp.Kernel
-    check_model: wp.Kernel | None
-    control_worlds: wp.Kernel | None
-    substep_memory: wp.Kernel | None
-    advance_memory: wp.Kernel | None
-
-
-def act_kernels(task: TaskCode) -> ActKernels:
-    """Make the kernels of ``ActKernels``."""
+def act_kernels(task: TaskCode) -> None:
+    """Make the kernels that map actions to controls, and advance the task's memory."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view, copy_state, valid_model = task.view, task.copy_state, task.valid_model
     control, advance, substep = (task.functions[name] for name in ("control", "advance", "substep"))
@@ -123,8 +111,6 @@ def act_kernels(task: TaskCode) -> ActKernels:
         p = params[w % params.shape[0]]
         advance(view(before, w), action_in[w], view(after, w), p, counters.rng[w])
 
-    return ActKernels(keep_before, act, check_model, control_worlds, substep_memory, advance_memory)
-
 
 @wp.kernel(enable_backward=False)
 def hold_success(
@@ -147,18 +133,8 @@ def hold_success(
         success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)
 
 
-@dataclasses.dataclass(frozen=True)
-class BeginKernels:
-    """Kernels that begin episodes, randomize model fields, and run events between steps."""
-
-    restart: wp.Kernel
-    reject_worlds: wp.Kernel | None
-    start_worlds: wp.Kernel | None
-    run_events: wp.Kernel | None
-
-
-def begin_kernels(task: TaskCode) -> BeginKernels:
-    """Make the kernels of ``BeginKernels``."""
+def begin_kernels(task: TaskCode) -> None:
+    """Make the kernels that begin episodes, randomize model fields, and run events between steps."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view
     initialize, randomize, startup, reject, event = (
@@ -232,23 +208,13 @@ def begin_kernels(task: TaskCode) -> BeginKernels:
             counters.rng[w, 0] = substream(at, EVENT)
             event(view(batch, w), params[w % params.shape[0]], counters.rng[w])
 
-    return BeginKernels(restart, reject_worlds, start_worlds, run_events)
-
 
 UNIT = wp.constant(2.0**20)
 """Sums over worlds are multiples of 1 / UNIT, so that they do not depend on the order of the worlds."""
 
 
-@dataclasses.dataclass(frozen=True)
-class SharedKernels:
-    """Kernels for the memory that all worlds share."""
-
-    tally_worlds: wp.Kernel | None
-    share_memory: wp.Kernel | None
-
-
-def shared_kernels(task: TaskCode) -> SharedKernels:
-    """Make the kernels of ``SharedKernels``."""
+def shared_kernels(task: TaskCode) -> None:
+    """Make the kernels for the memory that all worlds share."""
     Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
     tally, share = task.functions["tally"], task.functions["share"]
     view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
@@ -289,12 +255,9 @@ def shared_kernels(task: TaskCode) -> SharedKernels:
             sum_inout[i] = wp.int64(0)
         share(view_shared(shared_inout[0]), view_sums(sum_row_out[0]), params[0])
 
-    return SharedKernels(tally_worlds, share_memory)
 
-
-@dataclasses.dataclass(frozen=True)
-class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKernels):
-    """The kernels of a step, and the structs of their arrays. Kernels that the task does not need are None."""
+class Kernels(SimpleNamespace):
+    """The kernels of a step by name; kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
     """The functions that make the structs: of World from a batch and a world's index, of observations from a row."""
@@ -306,6 +269,6 @@ class Kernels(ActKernels, JudgeKernels, BeginKernels, RolloutKernels, SharedKern
 
 def make_kernels(task: TaskCode) -> Kernels:
     """Make all kernels of a task."""
-    parts = (make(task) for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels, shared_kernels))
-    kernels = {name: kernel for part in parts for name, kernel in vars(part).items()}
-    return Kernels(**kernels, views=task.views, terms=task.terms, Batch=task.Batch, Observations=task.Observations)
+    for make in (act_kernels, judge_kernels, begin_kernels, rollout_kernels, shared_kernels):
+        make(task)
+    return Kernels(**task.kernels, views=task.views, terms=task.terms, Batch=task.Batch, Observations=task.Observations)

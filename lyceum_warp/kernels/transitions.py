@@ -1,7 +1,5 @@
 """Make the kernels that evaluate a task's transitions: rewards, ends of episodes, metrics, observations."""
 
-import dataclasses
-
 import warp as wp
 
 from lyceum_warp.done import Done
@@ -26,20 +24,8 @@ METRICS = wp.constant(2)
 OBSERVE_FIRST = wp.constant(3)
 
 
-@dataclasses.dataclass(frozen=True)
-class JudgeKernels:
-    """Kernels that compute rewards, ends of episodes, metrics and observations."""
-
-    check_memory: wp.Kernel | None
-    judge: wp.Kernel
-    conclude: wp.Kernel
-    observe_worlds: wp.Kernel
-    replace_observations: wp.Kernel
-    measure_worlds: wp.Kernel | None
-
-
-def judge_kernels(task: TaskCode) -> JudgeKernels:
-    """Make the kernels of ``JudgeKernels``."""
+def judge_kernels(task: TaskCode) -> None:
+    """Make the kernels that compute rewards, ends of episodes, metrics and observations."""
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
     finite_group, copy_observations = task.finite_group, task.copy_observations
@@ -274,19 +260,9 @@ def judge_kernels(task: TaskCode) -> JudgeKernels:
         s = view(batch, w)
         measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
 
-    return JudgeKernels(check_memory, judge, conclude, observe_worlds, replace_observations, measure_worlds)
 
-
-@dataclasses.dataclass(frozen=True)
-class RolloutKernels:
-    """Kernels for open-loop rollouts, which store the fields of all steps."""
-
-    judge_rows: wp.Kernel
-    advance_rows: wp.Kernel | None
-
-
-def rollout_kernels(task: TaskCode) -> RolloutKernels:
-    """Make the kernels of ``RolloutKernels``.
+def rollout_kernels(task: TaskCode) -> None:
+    """Make the kernels for open-loop rollouts, which store the fields of all steps.
 
     Row t * nworld + w is world w after t steps. The next state is nworld rows later, so ``before`` and ``after`` are
     views of the same arrays.
@@ -339,5 +315,3 @@ def rollout_kernels(task: TaskCode) -> RolloutKernels:
             copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
             counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
             advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])
-
-    return RolloutKernels(judge_rows, advance_rows)

@@ -63,7 +63,7 @@ def test_planning_attribute_of_the_task_applies_to_the_planner() -> None:
         (Planning(params={"limt": 3.0}), "'limt' in planning.params of the task 'planned' .*: did you mean limit"),
         (Planning(params={"qqq": 3.0}), "'qqq' in planning.params .*: there are limit, wrong"),
         (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon must be .* not 0"),
-        (Planning(options={"integrator": "rk5"}), "planning.options of the task 'planned': there is no integrator"),
+        (Planning(options={"integrator": "rk5"}), "planning.options of the task 'planned': integrator must be"),
         (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
     ],
 )  # fmt: skip
