@@ -60,7 +60,7 @@ class Worlds(WorldArrays):
             capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, workers=self._workers)
             self._programs[key] = Programs(
                 capture,
-                step=capture.sequence(self._phases_of_a_graph() if graphs else self.step_phases()),
+                step=capture.sequence(self.step_phases(skip=graphs and self.engine.capturable)),
                 reset=capture.sequence(self.reset_phases(randomly=False)),
                 rand_reset=capture.sequence(self.reset_phases(randomly=True)),
                 read_state=capture.sequence(self.read_phases()),
@@ -83,44 +83,38 @@ class Worlds(WorldArrays):
 
     # phases
 
-    def step_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases of a step in order."""
+    def step_phases(self, substeps: int | None = None, *, skip: bool = False) -> list[Phase]:
+        """List the phases of a step in order.
+
+        With ``skip``, the phases of restarts and events are merged into phases that a graph skips if no world needs
+        them.
+        """
+
+        def only(mask: wp.array, *parts: list[Phase]) -> list[Phase]:
+            phases = [phase for part in parts for phase in part]
+            return [self._merged(mask, phases)] if skip and phases else phases
+
+        restarting = self.restarting
+        restart, refresh = self._restart_phases(restarting, randomly=True), self._refresh_phases(restarting)
+        if not (events := self._event_phases()):
+            return [*self.transition_phases(substeps), *only(restarting, restart, refresh, self._observe_phases())]
         return [
             *self.transition_phases(substeps),
-            *self._restart_phases(self.restarting, randomly=True),
-            *self._event_phases(),
-            *self._moved_phases(),
-            *self._refresh_phases(self.restarting),
+            *only(restarting, restart),
+            *events,
+            *only(self._physics_changed, self._moved_phases()),
+            *only(restarting, refresh),
             *self._observe_phases(),
         ]
 
-    def _phases_of_a_graph(self) -> list[Phase]:
-        """List the phases of a step for a single graph, which skips a phase if no world needs it."""
-        if not self.engine.capturable:
-            return self.step_phases()
-        restart = self._restart_phases(self.restarting, randomly=True)
-        show = self._refresh_phases(self.restarting), self._observe_phases()
-        if not (events := self._event_phases()):
-            return [*self.transition_phases(), self._only_for(self.restarting, restart, *show)]
-        moved = self._moved_phases()
-        return [
-            *self.transition_phases(),
-            self._only_for(self.restarting, restart),
-            *events,
-            *([self._only_for(self._physics_changed, moved)] if moved else []),
-            *([self._only_for(self.restarting, show[0])] if show[0] else []),
-            *show[1],
-        ]
-
-    def _only_for(self, mask: wp.array, *phases: list[Phase]) -> Phase:
+    def _merged(self, mask: wp.array, phases: list[Phase]) -> Phase:
         """Merge phases into one that is skipped if the mask is empty."""
-        every = [phase for part in phases for phase in part]
 
         def run() -> None:
-            for phase in every:
+            for phase in phases:
                 phase.run()
 
-        return Phase(every[0].name, partial(self.engine.run_for, mask, run), engine=True)
+        return Phase(phases[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def transition_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step that advance and judge the worlds, without resets and events."""
@@ -164,8 +158,6 @@ class Worlds(WorldArrays):
         return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
-        if self.task.kernels.run_events is None:
-            return []
         phases, changed = [], self._physics_changed
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
             phases.append(Phase("event dynamics", partial(self.engine.apply_model, changed), engine=True))

@@ -243,11 +243,15 @@ class Engine(abc.ABC):
     def set_state(self, state: wp.array, mask: wp.array) -> None:
         """Put the masked worlds exactly into the given states, and update all fields."""
         self._set_integration(state[:, : self.integration_size], mask)
-        if self.dynamics:
-            self._read_columns(state, mask, self.dynamics.values(), self.state_size - self._dynamics_size)
-            self.apply_model(mask)
+        self._set_dynamics(state, mask)
         self.refresh_current(mask)
         self._read_columns(state, mask, self.snapshots, self.integration_size)
+
+    def _set_dynamics(self, state: wp.array, mask: wp.array) -> None:
+        if self.dynamics:
+            size = sum(field.size for field in self.dynamics.values())
+            self._read_columns(state, mask, self.dynamics.values(), self.state_size - size)
+            self.apply_model(mask)
 
     def _read_columns(self, state: wp.array, mask: wp.array, fields: Iterable[Field | ModelField], start: int) -> None:
         for field in fields:
@@ -256,10 +260,6 @@ class Engine(abc.ABC):
 
     def _saved(self) -> list[Field | ModelField]:
         return [*self.snapshots, *self.dynamics.values()]
-
-    @property
-    def _dynamics_size(self) -> int:
-        return sum(field.size for field in self.dynamics.values())
 
     @abc.abstractmethod
     def _get_integration(self, state: wp.array, mask: wp.array) -> None: ...

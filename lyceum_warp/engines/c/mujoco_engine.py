@@ -224,11 +224,9 @@ class MujocoEngine(Engine):
         self.batch.state[:] = native.batch.state
         self.batch.warning += native.batch.warning
         self._copy(self._state_fields)
-        if self.dynamics:
-            self._read_columns(state, self._everyone, self.dynamics.values(), self.state_size - self._dynamics_size)
-            self.apply_model(self._everyone)
-            for name in self.dynamics.keys() & buffers.keys():
-                np.copyto(buffers[name].numpy(), self.arrays[name].numpy())
+        self._set_dynamics(state, self._everyone)
+        for name in self.dynamics.keys() & buffers.keys():
+            np.copyto(buffers[name].numpy(), self.arrays[name].numpy())
 
     def rollout_bytes_per_world(self, steps: int, nstep: int, fields: Iterable[Field]) -> int:
         fields = list(fields)
