@@ -44,3 +44,10 @@ def check_normal(samples: np.ndarray) -> None:
     assert np.abs(quantiles - ranks).max() < 2.6 / np.sqrt(n)
     assert np.abs(samples.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(2.0 * n)
     assert np.abs(np.corrcoef(samples.T) - np.eye(k)).max() < 5.5 / np.sqrt(n)
+
+
+def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the Kolmogorov-Smirnov distance between two samples of each column, (columns,)."""
+    order = np.argsort(np.concatenate([a, b]), axis=0)
+    ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
+    return np.abs(ranks).max(axis=0)

@@ -67,11 +67,13 @@ class Graphs:
 
         def close() -> None:
             if together:
-                calls.append(self._captured(*together))
+                workers = self._workers if together[0].by_world else None
+                calls.append(graph := _Graph(self.device, [phase.run for phase in together], workers))
+                self._graphs.add(graph)
                 together.clear()
 
         for phase in phases:
-            if self._is_captured(phase):
+            if self.enabled and (self.capture_engine or not phase.engine):
                 if together and self._workers is not None and together[0].by_world != phase.by_world:
                     close()
                 together.append(phase)
@@ -85,15 +87,6 @@ class Graphs:
         """Discard all graphs because arrays were replaced; the next calls capture new graphs."""
         for graph in self._graphs:
             graph.forget()
-
-    def _is_captured(self, phase: Phase) -> bool:
-        return self.enabled and (self.capture_engine or not phase.engine)
-
-    def _captured(self, *phases: Phase) -> Callable[[], object]:
-        functions = [phase.run for phase in phases]
-        graph = _Graph(self.device, functions, self._workers if phases[0].by_world else None)
-        self._graphs.add(graph)
-        return graph
 
 
 SECONDS_A_THREAD = 5e-4

@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from checks import ks_distance
 from gymnasium.envs.mujoco import mujoco_env
 from gymnasium.envs.registration import load_env_creator
 
@@ -401,12 +402,6 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     pairs = np.array(list(itertools.combinations(range(a.shape[1]), 2)))[:200].T
     lengths = [np.hypot(x[:, pairs[0]], x[:, pairs[1]]) for x in (a, b)]
     assert (ks_distance(*lengths) < 2.8 * math.sqrt(2.0 / n)).all()
-
-
-def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    order = np.argsort(np.concatenate([a, b]), axis=0)
-    ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
-    return np.abs(ranks).max(axis=0)
 
 
 IGNORED = {("humanoid_standup", "uph_cost_weight")}

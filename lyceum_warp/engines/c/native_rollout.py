@@ -1,10 +1,11 @@
 """Roll out the whole horizon of every world in one native call."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import mujoco
 import numpy as np
+import warp as wp
 from mujoco.batch import Batch
 
 from lyceum_warp.engines.c.batch_faults import call_batch
@@ -47,8 +48,6 @@ class NativeRollout:
         model, nworld = batch.model, batch.nsim
         self.control = np.zeros((nworld, steps * nstep, model.nu))
         self.by_step = self.control.reshape(nworld, steps, nstep, model.nu)
-        self._given: Any = None
-        self._views: Any = None
         self.fields = [field for field in fields if field.size]
         self.stage = max((field.refresh for field in self.fields), default=Stage.NONE)
         self.start: dict[str, slice] = {}
@@ -78,26 +77,21 @@ class NativeRollout:
                     self.final[field.name] = bound
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
-    def run(self, *given: Any) -> None:
+    def run(self, initial: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
         """Roll out the worlds with the arguments of ``Engine.rollout``. Warnings stay in the batch."""
-        if self._given is None or any(a is not b for a, b in zip(given, self._given, strict=True)):
-            self._given, (start, held, arrays) = given, given
-            # making views of Warp arrays takes longer than filling them
-            self._views = start.numpy(), held.numpy(), {name: buffer.numpy() for name, buffer in arrays.items()}
-        state, controls, buffers = self._views
-        batch = self.batch
+        batch, state = self.batch, initial.numpy()
         batch.state[:] = state[:, : batch.nstate]
         batch.warning[:] = 0
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
-        np.copyto(self.by_step, controls.transpose(1, 0, 2)[:, :, None])
+        np.copyto(self.by_step, controls.numpy().transpose(1, 0, 2)[:, :, None])
         # after a warning, a world stops and repeats its last row
         call_batch(batch, batch.rollout, nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
             call_batch(batch, batch.forward, stage=self.stage)
         with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
             for field in self.fields:
-                self._copy(field, state, buffers[field.name])
+                self._copy(field, state, buffers[field.name].numpy())
 
     def _copy(self, field: Field, state: np.ndarray, target: np.ndarray) -> None:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name

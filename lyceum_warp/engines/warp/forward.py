@@ -149,7 +149,8 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
         if needed is None:
             return None
         wanted |= needed
-        sensors = [mjw.sensor_pos, mjw.sensor_vel][: int(_last_stage(model))]
+        last = max((int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION), default=0)
+        sensors = [mjw.sensor_pos, mjw.sensor_vel][:last]
     for part in reversed(_NEEDS):
         if part in wanted:
             wanted.update(_NEEDS[part])
@@ -174,11 +175,6 @@ def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
         if camera in (model.sensor_objtype[i], model.sensor_reftype[i]):
             wanted.add(mjw.camlight)
     return wanted
-
-
-def _last_stage(model: mujoco.MjModel) -> Stage:
-    stages = [int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION]
-    return Stage(max(stages, default=0))
 
 
 def _touching(model: mujoco.MjModel) -> bool:

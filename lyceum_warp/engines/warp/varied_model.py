@@ -114,10 +114,6 @@ class ModelRows:
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
         self.whole = whole
-        self.model = whole
-        names = list(names)
-        if not names and not own:
-            return
         self.model = copy.copy(whole)
         self.model.opt = copy.copy(whole.opt)
         self._pairs: dict[str, tuple[wp.array, wp.array]] = {}
@@ -132,9 +128,8 @@ class ModelRows:
 
     def take(self, turns: Turns) -> None:
         """Copy the rows of the group's worlds into the group's model."""
-        if self.model is not self.whole:
-            for source, group in self._pairs.values():
-                turns.take(source, group)
+        for source, group in self._pairs.values():
+            turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
         """Copy the group's rows of the given fields back."""
