@@ -121,6 +121,8 @@ class PhysicsOptions:
         for name in ("discardvisual", "deterministic"):
             if (flag := getattr(self, name)) is not None:
                 check_flag(name, flag)
+        if self.base is None:  # False only overrides a set of options; earlier releases also stored it in runs
+            object.__setattr__(self, "deterministic", self.deterministic or None)
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
 

@@ -78,8 +78,9 @@ def test_keyword_arguments_override_the_options_of_named_physics() -> None:
     for given in ({"physics": "fast", "cone": "elliptic"}, {"physics": PhysicsOptions(base="fast", cone="elliptic")}):
         assert lw.make(Fast, **given).options.physics == dataclasses.replace(FAST, cone="elliptic")
     named = {"fast": PhysicsOptions(deterministic=True)}
-    for given, wanted in ((None, True), (False, False)):
+    for given, wanted in ((None, True), (False, None)):
         assert PhysicsOptions(base="fast", deterministic=given).resolved(named).deterministic is wanted
+    assert EnvOptions().changed({"physics": "fast", "deterministic": False}).physics.deterministic is False
     with pytest.raises(ValueError, match="^the task has no physics 'quick': it has 'exact', 'fast'$"):
         lw.make(Fast, physics="quick")
     with pytest.raises(ValueError, match="base must be .* as 'exact', not int 3"):

@@ -264,7 +264,7 @@ def test_flags_with_default_values_override_the_settings_of_the_source_run(
     config = Run.open(out).config
     assert config["npg"] == npg | {"gamma": 0.995, "whiten": True}
     assert (config["seed"], config["keep_every"], config["options"]) == (0, 0, {"horizon": 32})
-    assert config["physics"] == {"deterministic": False}
+    assert config["physics"] == {}
     capsys.readouterr()
     assert cli.main([*command, "--out", str(tmp_path / "no"), "--hidden", "64", "64"]) == 2
     refused(capsys, "have hidden (8,), not (64, 64)", "omit --hidden")
