@@ -100,16 +100,16 @@ class TraceRollouts:
         self._nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
         fields = tuple(dict.fromkeys((*env.options.fields, point.field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
-        self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, horizon=0, fields=fields, **threads)
+        self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, fields=fields, **threads)
         self._parts = env.state_space.parts
         self._states = self.env.get_state()
         self._positions = self.env.field(point.field)
+        worlds = self.env.worlds
+        self._transition = worlds.programs.graphs.sequence(worlds.transition_phases())
         for _ in range(3):  # capture CUDA graphs here, because the thread must not
             self.env.set_state(self._states, check=False)
-            self.env.step()
+            self._step(self.env.action)
             self.env.get_state(out=self._states)
-        self.env.reset()
-        self.env.get_state(out=self._states)
 
     @torch.no_grad()
     def __call__(self, view: PlanView) -> Traces:
@@ -122,12 +122,18 @@ class TraceRollouts:
         env.set_state(self._states, check=False)
         path = [self._positions[:, self.point.index].clone()]
         for action in actions:
-            env.step(action)
+            self._step(action)
             path.append(self._positions[:, self.point.index].clone())
         paths = torch.stack(path, dim=1)[[*range(count), MOST_SAMPLES]].cpu().numpy()
         final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy()
         ended = pose(final, env.state_space.parts, env.task.model.nmocap)
         return Traces(paths, view.best, ended, time.perf_counter())
+
+    def _step(self, action: torch.Tensor) -> None:
+        """Make a step without events, as planners do."""
+        self.env.action.copy_(action)
+        for call in self._transition:
+            call()
 
     def _put(self, state: torch.Tensor) -> None:
         parts = self.env.state_space.parts
@@ -138,7 +144,6 @@ class TraceRollouts:
             nominal: dict[str, wp.array] = self.env.engine.nominal
             for name, row in nominal.items():
                 self._states[:, parts[name]] = torch_view(flat(row))[0].double()
-        self._states[:, parts["done_reason"]] = 0.0
 
 
 class TraceThread:

@@ -5,7 +5,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.session.drivers import WorldControl
+from lyceum_warp.viewer.session.drivers import PlanView, WorldControl
 from lyceum_warp.viewer.session.traces import TracePoint, TraceRollouts, trace_point
 
 ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a" axis="0 1 0"/><geom size=".1"/>
@@ -66,3 +66,12 @@ def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
     np.testing.assert_allclose(traces.final.qpos, qpos, atol=1e-6)
     assert control.look() is None  # unchanged
+
+
+def test_traces_do_not_contain_the_pushes_of_events() -> None:
+    paths = []
+    for pushes in ([0.015 * step for step in range(1, 5)], [1e6]):
+        plant = lw.make("humanoid_stand", autoreset=False, push_times=pushes, push_impulse=[10.0, 10.0])
+        view = PlanView(plant.get_state()[0], torch.zeros(4, plant.action_space.size), torch.zeros(4, 0, 17), None)
+        paths.append(TraceRollouts(object(), plant)(view).paths)
+    np.testing.assert_array_equal(*paths)
