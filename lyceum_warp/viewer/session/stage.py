@@ -252,12 +252,11 @@ class Stage:
         thread, current = self._threads.get(str(self.controller)), self.control
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
-        if thread.error is not None:
-            self.frames.say(f"the paths of samples cannot be drawn: {thread.error}")
-            thread.error = None
-        if (view := current.look()) is not None:
-            thread.give(view)
-        seen = thread.newest()
+        try:
+            seen = thread.follow(current.look())
+        except Exception as error:
+            self.frames.say(f"the paths of samples cannot be drawn: {error}")
+            return None
         return seen if seen is not None and (self.paused or time.perf_counter() - seen.made < _OLD) else None
 
     def _status(self, **rest: Any) -> Status:

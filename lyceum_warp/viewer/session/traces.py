@@ -5,8 +5,9 @@ planner's.
 """
 
 import dataclasses
-import threading
+import math
 import time
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import mujoco
@@ -147,56 +148,43 @@ class TraceRollouts:
 
 
 class TraceThread:
-    """A thread that rolls out the newest plan, and sleeps between rollouts."""
+    """Rolls out plans in a thread that uses a limited share of a core."""
 
     def __init__(self, rollouts: TraceRollouts) -> None:
-        self.error: BaseException | None = None
         self._rollouts = rollouts
-        self._view: PlanView | None = None
+        self._pool = ThreadPoolExecutor(1, "lyceum_warp traces")
+        self._running: Future[Traces] | None = None
+        self._waiting: PlanView | None = None
         self._newest: Traces | None = None
-        self._wake, self._working, self._ending = threading.Event(), threading.Lock(), False
-        self._thread = threading.Thread(target=self._run, name="lyceum_warp traces", daemon=True)
-        self._thread.start()
+        self._next = 0.0
 
-    def give(self, view: PlanView) -> None:
-        """Roll out the given plan next, unless a newer plan comes first."""
-        self._view = view
-        self._wake.set()
+    def follow(self, view: PlanView | None) -> Traces | None:
+        """Roll out a new plan when the thread is free, and return the last traces.
 
-    def newest(self) -> Traces | None:
-        """The last traces."""
+        Raises:
+            Exception: A rollout failed. There are no further rollouts.
+        """
+        self._waiting = self._waiting if view is None else view
+        if self._running is not None and self._running.done():
+            running, self._running = self._running, None
+            self._newest = running.result()
+        if self._waiting is not None and self._running is None and time.perf_counter() >= self._next:
+            self._running, self._waiting = self._pool.submit(self._roll_out, self._waiting), None
         return self._newest
 
     def forget(self) -> None:
         """Wait for a rollout in progress, and drop the traces."""
-        self._view = None
-        with self._working:
-            self._newest = None
+        if self._running is not None:
+            wait([self._running])
+        self._running = self._waiting = self._newest = None
 
     def close(self) -> None:
         """End the thread after a rollout in progress."""
-        self._ending = True
-        self._wake.set()
-        self._thread.join()
+        self._pool.shutdown()
 
-    def _run(self) -> None:
-        try:
-            while True:
-                self._wake.wait()
-                self._wake.clear()
-                if self._ending:
-                    return
-                view, self._view = self._view, None
-                if view is None:
-                    continue
-                begun = time.thread_time()  # CPU time, because wall time would include other programs
-                with self._working:
-                    self._newest = self._rollouts(view)
-                self._rest((time.thread_time() - begun) / SHARE)
-        except BaseException as error:
-            self.error = error
-
-    def _rest(self, seconds: float) -> None:
-        end = time.perf_counter() + seconds
-        while not self._ending and (left := end - time.perf_counter()) > 0:
-            time.sleep(min(left, 0.1))
+    def _roll_out(self, view: PlanView) -> Traces:
+        self._next = math.inf
+        begun = time.thread_time()  # CPU time, because wall time would include other programs
+        traces = self._rollouts(view)
+        self._next = time.perf_counter() + (time.thread_time() - begun) / SHARE
+        return traces
