@@ -22,7 +22,7 @@ from PIL import Image
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.runs.configuration import ALGORITHMS
-from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values, find_camera
+from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
 
@@ -243,7 +243,7 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
     """Draw states at the gallery's frame rate."""
     model = copy.copy(env.model)  # the painter sets each world's model fields
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
-    painter = Painter(mujoco, model, size, camera_values(find_camera(model, show.camera)))
+    painter = Painter(mujoco, model, size, camera_values(model, show.camera))
     chosen = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
     drawn = [painter.draw(shot) for shot in shots(env, states[chosen])]
     return [Image.fromarray(picture).resize(SIZE, Image.Resampling.LANCZOS) for picture in drawn]

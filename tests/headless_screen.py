@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 
-from lyceum_warp.viewer.protocol import Frame, Opened, Pose, Reply, Scene, Status
+from lyceum_warp.viewer.protocol import Frame, Opened, Reply, Scene, Status
 from lyceum_warp.viewer.session.frames import model_bytes
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.studio import imgui, implot
@@ -39,8 +39,11 @@ def scene_of(model: mujoco.MjModel, **changes: Any) -> Scene:
     return Scene(**values | changes)
 
 
-def pose_of(data: mujoco.MjData) -> Pose:
-    return Pose(data.qpos.copy(), data.mocap_pos.copy(), data.mocap_quat.copy())
+def state_of(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
+    state = np.empty(mujoco.mj_stateSize(model, kind))
+    mujoco.mj_getState(model, data, state, kind)
+    return state
 
 
 def status_of(**changes: Any) -> Status:
@@ -52,10 +55,7 @@ def status_of(**changes: Any) -> Status:
 
 
 def frame_of(model: mujoco.MjModel, data: mujoco.MjData, status: Status | None = None, **changes: Any) -> Frame:
-    kind = mujoco.mjtState.mjSTATE_INTEGRATION
-    state = np.empty(mujoco.mj_stateSize(model, kind))
-    mujoco.mj_getState(model, data, state, kind)
-    values: dict[str, Any] = dict(pose=pose_of(data), state=state, model_fields={}, status=status or status_of())
+    values: dict[str, Any] = dict(state=state_of(model, data), model_fields={}, status=status or status_of())
     return Frame(**values | changes)
 
 
@@ -76,7 +76,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 class Bench:
     """A panel without a window. It stores the messages that the panel sends."""
 
-    def __init__(self, model: mujoco.MjModel, scene: Scene, **options: Any) -> None:
+    def __init__(self, model: mujoco.MjModel, scene: Scene) -> None:
         self.model, self.data = model, mujoco.MjData(model)
         mujoco.mj_forward(model, self.data)
         context, plots = imgui.CreateContext(), implot.CreateContext()
@@ -90,9 +90,7 @@ class Bench:
         self.sent: list[Reply] = []
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
-        self.panel = Panel(
-            scene, model, self.sent.append, self.take, self, Opened("http://here"), **options
-        )  # fmt: skip
+        self.panel = Panel(scene, model, self.sent.append, self.take, self, Opened("http://here"), lambda file: None)
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()
         self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])

@@ -45,22 +45,11 @@ class Scene:
 
 
 @dataclasses.dataclass(frozen=True)
-class Pose:
-    """Positions of all bodies of one world."""
-
-    qpos: np.ndarray
-    """(nq,) float64."""
-    mocap_pos: np.ndarray
-    """(nmocap, 3) float64."""
-    mocap_quat: np.ndarray
-    """(nmocap, 4) float64."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Ghost:
-    """An additional pose to draw, for example of another world."""
+    """An additional state to draw, for example of another world."""
 
-    pose: Pose
+    state: np.ndarray
+    """As in ``Frame``."""
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
@@ -132,7 +121,6 @@ class Status:
 class Frame:
     """The displayed world at one moment."""
 
-    pose: Pose
     state: np.ndarray
     """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import textwrap
 from collections.abc import Iterable
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -99,12 +99,11 @@ def camera_names(model: mujoco.MjModel) -> list[str]:
     return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
 
 
-def camera_values(camera: mujoco.MjvCamera) -> tuple[float, ...]:
-    """Return a camera's type, index, tracked body, lookat (3), distance, azimuth, elevation and orthographic."""
-    return (
-        int(camera.type), camera.fixedcamid, camera.trackbodyid, *map(float, camera.lookat), camera.distance,
-        camera.azimuth, camera.elevation, int(camera.orthographic),
-    )  # fmt: skip
+def camera_values(model: mujoco.MjModel, camera: CameraChoice = None) -> dict[str, Any]:
+    """Return the attributes of the chosen camera's ``MjvCamera``, which can be pickled."""
+    view = find_camera(model, camera)
+    names = ("type", "fixedcamid", "trackbodyid", "distance", "azimuth", "elevation", "orthographic")
+    return {"lookat": view.lookat.tolist()} | {name: getattr(view, name) for name in names}
 
 
 def tracking_camera(model: mujoco.MjModel) -> int | None:

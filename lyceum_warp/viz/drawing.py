@@ -19,7 +19,6 @@ import numpy as np
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import EXTRA, NoVideoError
-from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds until a subprocess that does not end is killed
@@ -39,20 +38,27 @@ def libraries() -> list[str]:
 
 
 class DrawingProcess:
-    """A context manager for a subprocess that renders poses with the first graphics library that works."""
+    """A context manager for a subprocess that renders states with the first graphics library that works.
 
-    product = "the drawing"
+    Args:
+        model: The model.
+        camera: The attributes of the ``mujoco.MjvCamera``.
+        size: The width and the height in pixels, both even.
+        fps: The frames per second of a video. None draws pictures.
+        background: Whether the subprocess has a low priority.
+    """
+
+    product = "the picture"
 
     def __init__(
-        self, model: mujoco.MjModel, *, camera: CameraChoice, size: tuple[int, int], fps: float | None,
+        self, model: mujoco.MjModel, *, camera: dict[str, Any], size: tuple[int, int], fps: float | None = None,
         background: bool = False,
     ) -> None:  # fmt: skip
         self._model = model
         if len(size) != 2 or any(not isinstance(n, int | np.integer) or n < 2 or n % 2 for n in size):
             raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
         self.size = int(size[0]), int(size[1])
-        camera_numbers = camera_values(find_camera(model, camera))
-        self._job = {"size": self.size, "fps": fps, "camera": camera_numbers, "background": background}
+        self._job = {"size": self.size, "fps": fps, "camera": camera, "background": background}
         self._ends = contextlib.ExitStack()
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
@@ -83,7 +89,7 @@ class DrawingProcess:
         self._stop()
 
     def draw(self, shot: Shot) -> None:
-        """Draw a pose."""
+        """Draw a shot."""
         if not self._send(shot) or self._answer() != "frame":
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
 
@@ -168,40 +174,45 @@ class DrawingProcess:
 
 
 class Drawing(DrawingProcess):
-    """A subprocess that draws poses into a video file; see ``write_video``."""
-
-    product = "the video"
+    """A subprocess that draws shots into a video (mp4) or, without ``fps``, one shot into a picture (png)."""
 
     def __init__(
-        self, model: mujoco.MjModel, out: str | Path, *, camera: CameraChoice, size: tuple[int, int], fps: float,
-        background: bool = False,
+        self, model: mujoco.MjModel, out: str | Path, *, camera: dict[str, Any], size: tuple[int, int],
+        fps: float | None, background: bool = False,
     ) -> None:  # fmt: skip
         self.out = Path(out)
-        fps = positive_number("fps", fps, "frames per second")
+        if fps is not None:
+            self.product = "the video"
+            fps = positive_number("fps", fps, "frames per second")
         super().__init__(model, camera=camera, size=size, fps=fps, background=background)
-        if self.out.suffix.lower() != ".mp4" or self.out.is_dir():
+        if fps is not None and (self.out.suffix.lower() != ".mp4" or self.out.is_dir()):
             raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
         check_video()
         self._frames = 0
 
     def draw(self, shot: Shot) -> None:
-        """Draw a pose, and add it to the video."""
+        """Draw a shot, and add it to the video."""
         super().draw(shot)
         self._frames += 1
 
     def finish(self) -> Path:
-        """Complete the video, and move it to its path."""
+        """Complete the video or the picture, and move it to its path."""
         if not self._frames:
-            raise NoVideoError(f"the video {self.out} has no pose: nothing is written")
+            raise NoVideoError(f"{self.product} {self.out} has no frame: nothing is written")
         self._send(None)
         code, reason = self._ended()
         if code:
-            raise NoVideoError(f"the video could not be written ({reason})")
+            raise NoVideoError(f"{self.product} could not be written ({reason})")
         if self._abandoned:
-            raise NoVideoError(f"the video {self.out} was cancelled")
+            raise NoVideoError(f"{self.product} {self.out} was cancelled")
         self.out.parent.mkdir(parents=True, exist_ok=True)
         with replaced(self.out) as temporary:
-            shutil.copyfile(Path(self._folder, VIDEO), temporary)
+            if self._job["fps"] is None:
+                import imageio.v2 as imageio
+
+                imageio.imwrite(temporary, self.picture(), format="png")
+            else:
+                shutil.copyfile(Path(self._folder, VIDEO), temporary)
         return self.out
 
 

@@ -8,8 +8,9 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,7 +18,8 @@ import torch
 
 from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
-from lyceum_warp.viz.cameras import CameraChoice, camera_values, find_camera
+from lyceum_warp.viz.cameras import CameraChoice, camera_values
+from lyceum_warp.viz.video import check_states
 
 _GROUPS = 3  # MuJoCo shows the first three groups of geoms by default
 _AROUND, _ALONG = 24, 12  # segments of a circle and of a half circle
@@ -39,47 +41,34 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     Raises:
         ValueError: The states do not have the environment's shape, or the model has no such camera.
     """
-    if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
-        raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
+    check_states(env, states)
     stride = max(1, round(1 / (_RATE * env.timestep)))
-    none, parts, rows = slice(0), env.state_space.parts, states[::stride].double().cpu().numpy()
-    poses = [
-        (row[parts["qpos"]], *(row[parts.get(name, none)] for name in ("mocap_pos", "mocap_quat"))) for row in rows
-    ]
-    view = camera_values(find_camera(env.model, camera))
-    return write_poses(env.model, poses, out, dt=stride * env.timestep, title=env.task.name, camera=view)
+    rows = states[::stride, : env.engine.integration_size].double().cpu().numpy()
+    view = camera_values(env.model, camera)
+    return write_states(env.model, rows, out, dt=stride * env.timestep, title=env.task.name, camera=view)
 
 
-def write_poses(
-    model: mujoco.MjModel,
-    poses: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    out: str | Path,
-    *,
-    dt: float,
-    title: str,
-    camera: Sequence[float],
-) -> Path:
-    """Write poses of a model as a page; see ``write_page``."""
+def write_states(
+    model: mujoco.MjModel, states: Iterable[np.ndarray], out: str | Path, *, dt: float, title: str,
+    camera: dict[str, Any],
+) -> Path:  # fmt: skip
+    """Write integration states (``mjSTATE_INTEGRATION``) of a model as a page; see ``write_page``."""
     data, frames = mujoco.MjData(model), []
-    for qpos, place, turn in poses:
-        data.qpos[:] = qpos
-        if model.nmocap:
-            data.mocap_pos[:], data.mocap_quat[:] = np.reshape(place, (-1, 3)), np.reshape(turn, (-1, 4))
+    for state in states:
+        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
         mujoco.mj_kinematics(model, data)
         frames.append(np.concatenate([data.xpos, data.xquat], axis=1))
     vertices, indices, ranges = _triangles(model)
-    _, fixed, tracked = (int(value) for value in camera[:3])
-    if fixed >= 0:  # a camera of the model has no point to look at, so look at the whole model
-        tracked, view = int(model.cam_bodyid[fixed]), model.stat.extent * 1.5
-        camera = (0, -1, tracked, *model.stat.center, view, 120.0, -20.0)
+    tracked = camera["trackbodyid"]
+    if (fixed := camera["fixedcamid"]) >= 0:  # a camera of the model has no point to look at
+        tracked = int(model.cam_bodyid[fixed])
+        whole = {"lookat": model.stat.center.tolist(), "distance": 1.5 * model.stat.extent}
+        camera = whole | {"azimuth": 120.0, "elevation": -20.0}
     moving = np.flatnonzero(model.body_dofnum)
     content = {
         "dt": dt, "ranges": ranges, "fovy": float(model.vis.global_.fovy), "reach": 30 * float(model.stat.extent),
         "followed": tracked if tracked > 0 else int(moving[0]) if len(moving) else 0,
-        "camera": dict(
-            lookat=list(map(float, camera[3:6])), distance=float(camera[6]), azimuth=float(camera[7]),
-            elevation=float(camera[8]),
-        ),
+        "camera": {name: camera[name] for name in ("lookat", "distance", "azimuth", "elevation")},
         "poses": _packed(np.array(frames, dtype=np.float32)), "vertices": _packed(vertices),
         "indices": _packed(indices),
     }  # fmt: skip

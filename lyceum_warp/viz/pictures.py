@@ -3,7 +3,7 @@
 import numpy as np
 
 from lyceum_warp.env import Env
-from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.drawing import DrawingProcess
 from lyceum_warp.viz.video import shots
 
@@ -17,10 +17,8 @@ class WorldPictures(DrawingProcess):
         size: The width and the height in pixels, both even.
     """
 
-    product = "the picture"
-
     def __init__(self, env: Env, *, camera: CameraChoice = None, size: tuple[int, int] = (480, 480)) -> None:
-        super().__init__(env.model, camera=camera, size=size, fps=None)
+        super().__init__(env.model, camera=camera_values(env.model, camera), size=size)
         self.env = env
 
     def __call__(self) -> list[np.ndarray]:

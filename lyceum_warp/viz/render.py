@@ -1,4 +1,4 @@
-"""Draw poses into a video, or as single pictures: ``python render.py folder``.
+"""Draw states into a video, or as single pictures: ``python render.py folder``.
 
 ``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
 ``size``, ``fps``, ``camera`` and ``background``, a ``Shot`` for each picture, and None. EOF without None means that the
@@ -31,20 +31,20 @@ VIDEO, PICTURE = "video.mp4", "picture.raw"
 class Shot(TypedDict):
     """What to draw in one or several successive frames."""
 
-    pose: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """The arrays qpos, mocap_pos and mocap_quat."""
+    state: np.ndarray
+    """The integration state (``mjSTATE_INTEGRATION``)."""
     model_fields: dict[str, np.ndarray]
-    ghosts: list[tuple[tuple[np.ndarray, np.ndarray, np.ndarray], tuple[float, ...] | None, tuple[float, float]]]
-    """Poses of the model, each with a colour (None for the model's colours) and a shift in x and y."""
+    ghosts: list[tuple[np.ndarray, tuple[float, ...] | None, tuple[float, float]]]
+    """Further states, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
     """Points, (points, 3), colour and width in pixels."""
     frames: int
 
 
 class Painter:
-    """Draws poses of a model."""
+    """Draws states of a model."""
 
-    def __init__(self, mujoco: Any, model: Any, size: tuple[int, int], camera: tuple[float, ...]) -> None:
+    def __init__(self, mujoco: Any, model: Any, size: tuple[int, int], camera: dict[str, Any]) -> None:
         self.mujoco, self.model = mujoco, model
         width, height = size
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
@@ -54,18 +54,19 @@ class Painter:
         self.renderer = mujoco.Renderer(model, height, width)
         self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
         self.view, self.option, self.perturb = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvPerturb()
-        set_camera(self.view, camera)
+        for name, value in camera.items():
+            setattr(self.view, name, value)
         self._nominal: dict[str, np.ndarray] = {}
         self._fields: dict[str, np.ndarray] = {}
 
     def draw(self, shot: Shot) -> np.ndarray:
         """Draw one frame, (height, width, 3) uint8."""
         self._set_fields(shot["model_fields"])
-        self._place(self.data, shot["pose"])
+        self._place(self.data, shot["state"])
         self.renderer.update_scene(self.data, self.view, self.option)
         scene = self.renderer.scene
-        for pose, colour, shift in shot["ghosts"]:
-            self._place(self.ghost, pose)
+        for state, colour, shift in shot["ghosts"]:
+            self._place(self.ghost, state)
             first = scene.ngeom
             moving = int(self.mujoco.mjtCatBit.mjCAT_DYNAMIC)
             self.mujoco.mjv_addGeoms(self.model, self.ghost, self.option, self.perturb, moving, scene)
@@ -78,10 +79,8 @@ class Painter:
         image: np.ndarray = self.renderer.render()
         return image
 
-    def _place(self, data: Any, pose: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-        data.qpos[:] = pose[0]
-        if self.model.nmocap:
-            data.mocap_pos[:], data.mocap_quat[:] = pose[1], pose[2]
+    def _place(self, data: Any, state: np.ndarray) -> None:
+        self.mujoco.mj_setState(self.model, data, state, self.mujoco.mjtState.mjSTATE_INTEGRATION)
         self.mujoco.mj_forward(self.model, data)
 
     def _set_fields(self, given: dict[str, np.ndarray]) -> None:
@@ -105,14 +104,6 @@ class Painter:
             scene.ngeom += 1
 
 
-def set_camera(view: Any, values: tuple[float, ...]) -> None:
-    """Set the values of a camera, as returned by ``cameras.camera_values``."""
-    view.type, view.fixedcamid, view.trackbodyid = (int(value) for value in values[:3])
-    view.lookat[:] = values[3:6]
-    view.distance, view.azimuth, view.elevation = values[6:9]
-    view.orthographic = int(values[9])
-
-
 def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
     """Set fields of a model by name, and recompute derived constants, such as the poses of cameras."""
     for name, row in rows.items():
@@ -130,7 +121,7 @@ def _owner(model: Any, name: str) -> Any:
 
 
 def main(folder: str) -> int:
-    """Draw a frame for each pose on stdin."""
+    """Draw the shots on stdin."""
     source = sys.stdin.buffer
     try:
         import mujoco

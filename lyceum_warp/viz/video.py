@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import mujoco
 import torch
@@ -15,7 +15,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import NoVideoError
-from lyceum_warp.viz.cameras import CameraChoice
+from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.drawing import Drawing, check_video
 from lyceum_warp.viz.render import Shot
 
@@ -25,7 +25,6 @@ Progress: TypeAlias = Callable[[int, int], object]
 """A progress callback, called with two numbers: units done so far, and units in total."""
 
 _MAX_RATE = 60  # maximum frames per second, the rate of most screens
-_POSES = ("qpos", "mocap_pos", "mocap_quat")
 _KILLED = 5.0  # maximum seconds until the thread ends after its subprocess was killed
 
 
@@ -61,13 +60,12 @@ def write_video(
             the file's name does not end in ``.mp4``.
         NoVideoError: This machine cannot render, or a package for videos is missing.
     """
-    if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
-        raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
+    check_states(env, states)
     rate = positive_number("speed", speed, "simulated seconds per second") / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
     rows = states[::stride].cpu()
     with (
-        Drawing(env.model, out, camera=camera, size=size, fps=rate / stride) as drawing,
+        Drawing(env.model, out, camera=camera_values(env.model, camera), size=size, fps=rate / stride) as drawing,
         LongWork("drawing the video", "frames") if progress is None else contextlib.nullcontext(progress) as report,
     ):
         for i, shot in enumerate(shots(env, rows)):
@@ -76,39 +74,38 @@ def write_video(
         return drawing.finish()
 
 
+def check_states(env: Env, states: torch.Tensor) -> None:
+    """Check the shape of states of one world."""
+    if states.ndim != 2 or states.shape[1] != env.state_space.size or not len(states):
+        raise ValueError(f"states must have the shape (steps, {env.state_space.size}), not {tuple(states.shape)}")
+
+
 def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
     """Yield the content of a frame for each state."""
     parts = env.state_space.parts
-    poses = [states[:, parts.get(name, slice(0))].numpy() for name in _POSES]
-    fields = {field.name: states[:, parts[field.name]].numpy() for field in env.task.dynamics}
-    for i in range(len(states)):
-        yield Shot(
-            pose=(poses[0][i], poses[1][i].reshape(-1, 3), poses[2][i].reshape(-1, 4)),
-            model_fields={name: values[i] for name, values in fields.items()},
-            ghosts=[],
-            lines=[],
-            frames=1,
-        )
+    for state in states.numpy():
+        fields = {field.name: state[parts[field.name]] for field in env.task.dynamics}
+        yield Shot(state=state[: env.engine.integration_size], model_fields=fields, ghosts=[], lines=[], frames=1)
 
 
 class Recorder:
-    """Makes a video of shots that arrive one by one, for example from the viewer.
+    """Makes a video of shots that arrive one by one, or a picture of one shot, for example for the viewer.
 
     Shots wait in a queue until a subprocess of low priority draws them. If the queue is full, further shots are
     dropped, and the last shot in the queue is displayed longer. The file is written when the video is complete.
 
     Args:
         model: The model.
-        out: The file, whose name ends in ``.mp4``.
-        camera: The camera, as in ``write_video``.
+        out: The file: an mp4, or a png if ``fps`` is None.
+        camera: The attributes of the ``mujoco.MjvCamera``.
         size: The width and the height in pixels, both even.
-        fps: The frames per second of the video.
+        fps: The frames per second of the video, or None for a picture.
         most_waiting: The maximum number of shots in the queue.
     """
 
     def __init__(
-        self, model: mujoco.MjModel, out: Path, *, camera: CameraChoice = None, size: tuple[int, int] = (640, 480),
-        fps: float, most_waiting: int,
+        self, model: mujoco.MjModel, out: Path, *, camera: dict[str, Any], size: tuple[int, int] = (640, 480),
+        fps: float | None, most_waiting: int,
     ) -> None:  # fmt: skip
         self.out = out
         self.added = 0
@@ -131,8 +128,7 @@ class Recorder:
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
-        """Add a shot."""
-        self._check()
+        """Add a shot, unless the video has failed."""
         with self._changed:
             self.added += shot["frames"]
             if len(self._shots) < self._most:
@@ -156,7 +152,8 @@ class Recorder:
         """Finish the video, wait until the file is complete, and return its path."""
         self.end()
         self._done.wait()
-        self._check()
+        if self._error is not None:
+            raise self._error
         return self.out
 
     def cancel(self) -> None:
@@ -168,20 +165,17 @@ class Recorder:
             self._drawing.abandon()
             self._done.wait(_KILLED)
 
-    def _check(self) -> None:
-        if self._error is not None:
-            raise self._error
-
     def _draw(self) -> None:
+        product = self._drawing.product
         try:
             with self._drawing as drawing:
                 while (shot := self._next()) is not None:
                     drawing.draw(shot)
                 drawing.finish()
         except (NoVideoError, OSError) as error:
-            self._error = NoVideoError(f"the video {self.out} was cancelled") if self._cancelled else error
+            self._error = NoVideoError(f"{product} {self.out} was cancelled") if self._cancelled else error
         except Exception as error:  # a thread has no caller that could catch the error
-            self._error = NoVideoError(f"the video could not be written ({' '.join(str(error).split())})")
+            self._error = NoVideoError(f"{product} could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()
 

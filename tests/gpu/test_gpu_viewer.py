@@ -47,7 +47,8 @@ def test_viewer_shows_the_chosen_world_after_one_frame() -> None:
     assert frame.status.world == int(session.stage.live.returns.argmax())
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     np.testing.assert_array_equal(frame.state, state[frame.status.world, : len(frame.state)].cpu().numpy())
-    np.testing.assert_array_equal(frame.ghosts[0].pose.qpos, state[(frame.status.world + 1) % 4096, qpos].cpu().numpy())
+    other = state[(frame.status.world + 1) % 4096, qpos].cpu().numpy()
+    np.testing.assert_array_equal(frame.ghosts[0].state[qpos], other)
     assert len(frame.ghosts) == 4
     session.stage.advance(60)
     messages = session.stage.frame().messages + session.stage.frame().messages
@@ -78,7 +79,7 @@ def test_a_planner_controls_a_copy_of_a_world_on_a_gpu() -> None:
     session.obey(SetMode("controller", "mppi"))
     assert session.stage.live.env.obs.device.type == "cpu"
     qpos = env.state_space.parts["qpos"]
-    np.testing.assert_allclose(session.stage.frame().pose.qpos, before[100, qpos].cpu().numpy(), atol=1e-6)
+    np.testing.assert_allclose(session.stage.frame().state[qpos], before[100, qpos].cpu().numpy(), atol=1e-6)
     session.stage.advance(3)
     session.obey(SetMode("controller", "policy"))
     after = env.get_state()

@@ -9,9 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import SharedEnv
+from headless_screen import state_of
 
-from lyceum_warp.viz.cameras import camera_values, find_camera
-from lyceum_warp.viz.page import write_page, write_poses
+from lyceum_warp.viz.cameras import camera_values
+from lyceum_warp.viz.page import write_page, write_states
 
 SHAPES = """
 <mujoco>
@@ -61,8 +62,8 @@ def test_surfaces_have_the_sizes_of_their_geoms(tmp_path: Path) -> None:
     for kind, size in sizes.items():
         geom = f'<geom type="{kind}" size="{" ".join(map(str, size))}" rgba="1 0 0 1"/>'
         model = mujoco.MjModel.from_xml_string(SHAPES.format(geom))
-        camera, pose = camera_values(find_camera(model, None)), (model.qpos0, np.empty(0), np.empty(0))
-        data = content(write_poses(model, [pose], tmp_path / "page.html", dt=1.0, title="</title>", camera=camera))
+        camera, state = camera_values(model), state_of(model, mujoco.MjData(model))
+        data = content(write_states(model, [state], tmp_path / "page.html", dt=1.0, title="</title>", camera=camera))
         assert "</title></title>" not in (tmp_path / "page.html").read_text()
         world, (first, count) = data["ranges"]
         assert world[0] == 0 and first == world[1] == 6 + 36 + 12 and count > 0  # the hidden sphere is not counted

@@ -137,11 +137,7 @@ class Session:
         frame = stage.frame()
         self._window.show(frame)
         self._last_frame, stage.changed = now, False
-        try:
-            videos.add(frame)
-        except (NoVideoError, OSError) as error:
-            videos.give_up()
-            stage.frames.say(str(error))
+        videos.add(frame)
 
     # real time
 

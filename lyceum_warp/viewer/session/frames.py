@@ -4,7 +4,6 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +11,7 @@ import numpy as np
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Frame, Ghost, SetGhosts, Status
 from lyceum_warp.viewer.session.driving import Driving
-from lyceum_warp.viewer.session.live import Live, Rows, pose
+from lyceum_warp.viewer.session.live import Live, Rows
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
 
@@ -82,7 +81,7 @@ class FrameMaker:
             main.request(shown)
             waiting = main.take()
             others = others if waiting is None else waiting.states[1:]
-        ghosts = [] if traces is None else [Ghost(traces.final, (*_PLAN, _OPACITY))]
+        ghosts = [] if traces is None else [Ghost(self._physics(traces.final), (*_PLAN, _OPACITY))]
         ghosts += self._beside(others) if grid else self._coloured(others)
         ghosts += self._burst(rows.back, _PAST)
         step, past = int(state[parts["step"]][0]), live.past
@@ -92,7 +91,7 @@ class FrameMaker:
             seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
+            self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
             self._driving.arrows(state),
             np.concatenate(points), self._take_messages(),
@@ -118,7 +117,7 @@ class FrameMaker:
         )  # fmt: skip
         points, self._points = self._points, []
         return Frame(
-            self._pose(state), self._physics(state), self._model_fields(state), complete, tuple(ghosts),
+            self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             arrows=self._driving.arrows(state),
             samples=np.array(points, dtype=float).reshape(-1, 2 + self._curves), messages=self._take_messages(),
         )  # fmt: skip
@@ -137,12 +136,12 @@ class FrameMaker:
         self._seen_fault = max(self._seen_fault, rows.fault[0])
 
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        return [Ghost(self._pose(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
+        return [Ghost(self._physics(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
         cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
-        step = self._grid_step
-        return [Ghost(self._pose(row), None, (step * x, step * y)) for row, (x, y) in zip(states, cells, strict=False)]
+        step, paired = self._grid_step, zip(states, cells, strict=False)
+        return [Ghost(self._physics(row), None, (step * x, step * y)) for row, (x, y) in paired]
 
     @functools.cached_property
     def _grid_step(self) -> float:
@@ -156,13 +155,10 @@ class FrameMaker:
 
     def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
         """Make ghosts along a trajectory. The first states are the most opaque."""
-        return [Ghost(self._pose(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
-
-    def _pose(self, state: np.ndarray) -> Any:
-        return pose(state, self._env.state_space.parts, self._env.task.model.nmocap)
+        return [Ghost(self._physics(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
 
     def _physics(self, state: np.ndarray) -> np.ndarray:
-        return state[: mujoco.mj_stateSize(self._env.task.model, mujoco.mjtState.mjSTATE_INTEGRATION)].copy()
+        return state[: self._env.engine.integration_size]
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
         found = {}

@@ -4,14 +4,13 @@ On a GPU, steps do not wait for the device, and frames are copied to the host as
 """
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import Pose
 
 HISTORY_BYTES = 240 * 2**20
 """Memory for the history of all worlds, in bytes."""
@@ -340,13 +339,3 @@ def _to_host(part: torch.Tensor) -> torch.Tensor:
         return part.clone()
     host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)
     return host.copy_(part, non_blocking=True)
-
-
-def pose(state: np.ndarray, parts: Mapping[str, slice], nmocap: int) -> Pose:
-    """Extract the pose from a state."""
-    none = slice(0, 0)
-    position, quaternion = (
-        state[parts.get(name, none)].reshape(-1, size)[:nmocap].copy()
-        for name, size in (("mocap_pos", 3), ("mocap_quat", 4))
-    )
-    return Pose(state[parts["qpos"]].copy(), position, quaternion)

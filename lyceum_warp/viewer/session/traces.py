@@ -17,9 +17,7 @@ import warp as wp
 
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import flat, torch_view
-from lyceum_warp.viewer.protocol import Pose
 from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
-from lyceum_warp.viewer.session.live import pose
 
 SHARE = 0.15
 """The share of a core that the thread may use."""
@@ -85,7 +83,8 @@ class Traces:
     paths: np.ndarray
     """(samples + 1, points, 3), in metres; the plan comes last."""
     best: int | None
-    final: Pose
+    final: np.ndarray
+    """The state at the end of the plan."""
     made: float
     """Time of the rollout, from ``time.perf_counter``."""
 
@@ -126,9 +125,8 @@ class TraceRollouts:
             self._step(action)
             path.append(self._positions[:, self.point.index].clone())
         paths = torch.stack(path, dim=1)[[*range(count), MOST_SAMPLES]].cpu().numpy()
-        final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy()
-        ended = pose(final, env.state_space.parts, env.task.model.nmocap)
-        return Traces(paths, view.best, ended, time.perf_counter())
+        final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy().copy()
+        return Traces(paths, view.best, final, time.perf_counter())
 
     def _step(self, action: torch.Tensor) -> None:
         """Make a step without events, as planners do."""

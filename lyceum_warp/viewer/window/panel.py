@@ -29,16 +29,14 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         newest: Callable[[], Frame | None],
         screen: studio.Screen,
         opened: Opened,
-        offer: Callable[[str], object] = lambda file: None,
-        limit: int = studio.MAX_GEOMS,
+        offer: Callable[[str], object],
     ) -> None:
         self.actions = Actions(scene, send)
         self.mouse = Mouse(send)
         self.values = ModelValues(model)
         self.windows = Windows(self.actions)
-        self._send, self._newest, self._screen, self._opened, self._limit = send, newest, screen, opened, limit
-        self._offer = offer
-        self._geoms = ExtraGeoms(model, limit)
+        self._send, self._newest, self._screen, self._opened, self._offer = send, newest, screen, opened, offer
+        self._geoms = ExtraGeoms(model, studio.MAX_GEOMS)
         self._swapped = -SWAP_TIME
         self._model_due = False
 
@@ -90,10 +88,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
-        groups = np.array(self.viewer.vis_options.geomgroup)
-        self.viewer.extra_geoms[:] = self._geoms.draw(
-            frame.pose, frame.ghosts, frame.traces, frame.best, frame.arrows, groups
-        )
+        self.viewer.extra_geoms[:] = self._geoms.draw(frame, np.array(self.viewer.vis_options.geomgroup))
 
     def _show_model(self, frame: Frame) -> None:
         changed, visible = self.values.set(frame.model_fields)
@@ -103,5 +98,5 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self.values.copy_to(self.viewer.model)
         if self._model_due and time.monotonic() > self._swapped + SWAP_TIME:
             self._swapped, self._model_due = time.monotonic(), False
-            self._geoms = ExtraGeoms(self.values.model, self._limit)
+            self._geoms = ExtraGeoms(self.values.model, studio.MAX_GEOMS)
             self._screen.show_model(self.values.model)

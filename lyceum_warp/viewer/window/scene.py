@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Arrow, Ghost, Pose
+from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Arrow, Frame
 from lyceum_warp.viewer.window.studio import ux
 
 LINE_WIDTH = 3.0  # pixels
@@ -39,33 +39,29 @@ class ExtraGeoms:
         # room for two more worlds: the displayed one, and the ghost that exceeds the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
-    def draw(
-        self,
-        pose: Pose,
-        ghosts: Sequence[Ghost] = (),
-        traces: np.ndarray | None = None,
-        best: int | None = None,
-        arrows: Sequence[Arrow] = (),
-        groups: np.ndarray | None = None,
-    ) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame. They are valid until the next frame."""
-        if groups is not None:
-            self._options.geomgroup = groups
-        paths = [] if traces is None else list(traces)
-        first = [] if best is None else [paths.pop(best)]
+    def draw(self, frame: Frame, groups: np.ndarray) -> list[mujoco.MjvGeom]:
+        """Make the geoms of a frame. They are valid until the next frame.
+
+        Args:
+            frame: The frame.
+            groups: Whether each group of geoms is visible, (6,).
+        """
+        self._options.geomgroup = groups
+        paths = [] if frame.traces is None else list(frame.traces)
+        first = [] if frame.best is None else [paths.pop(frame.best)]
         lines = _lines(first, BEST_COLOUR, min(self.limit, MAX_LINES))
-        lines += _arrows(arrows)
-        bodies = self._ghosts(pose, ghosts, self.limit - len(lines))
+        lines += _arrows(frame.arrows)
+        bodies = self._ghosts(frame, self.limit - len(lines))
         left = min(self.limit - len(bodies), MAX_LINES) - len(lines)
         return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
 
-    def _ghosts(self, pose: Pose, ghosts: Sequence[Ghost], limit: int) -> list[mujoco.MjvGeom]:
+    def _ghosts(self, frame: Frame, limit: int) -> list[mujoco.MjvGeom]:
         data, scene, geoms = self._data, self._scene, []
-        self._place(pose)
+        self._place(frame.state)
         positions, axes = data.geom_xpos.copy(), data.geom_xmat.copy()
         scene.ngeom = 0
-        for ghost in ghosts:
-            self._place(ghost.pose)
+        for ghost in frame.ghosts:
+            self._place(ghost.state)
             begin = scene.ngeom
             mujoco.mjv_addGeoms(self.model, data, self._options, self._perturb, mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
             if scene.ngeom > limit:
@@ -86,12 +82,9 @@ class ExtraGeoms:
                 geoms.append(geom)
         return geoms
 
-    def _place(self, pose: Pose) -> None:
-        data = self._data
-        data.qpos[:] = pose.qpos
-        if self.model.nmocap:
-            data.mocap_pos[:], data.mocap_quat[:] = pose.mocap_pos, pose.mocap_quat
-        mujoco.mj_kinematics(self.model, data)
+    def _place(self, state: np.ndarray) -> None:
+        mujoco.mj_setState(self.model, self._data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_kinematics(self.model, self._data)
 
 
 def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
@@ -195,5 +188,5 @@ class ViewCameras:
 
     def view(self) -> dict[str, Any]:
         """The attributes of the camera."""
-        names = ("type", "trackbodyid", "fixedcamid", "lookat", "distance", "azimuth", "elevation")
-        return {name: copy.copy(getattr(self.viewer.camera, name)) for name in names}
+        camera, names = self.viewer.camera, ("type", "trackbodyid", "fixedcamid", "distance", "azimuth", "elevation")
+        return {"lookat": camera.lookat.tolist()} | {name: getattr(camera, name) for name in names}

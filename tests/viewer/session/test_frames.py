@@ -19,10 +19,10 @@ def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: Shared
     ghosts = session.stage.frame().ghosts
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     for ghost, world in zip(ghosts, (3, 0), strict=False):
-        np.testing.assert_array_equal(ghost.pose.qpos, state[world, qpos].numpy())
+        np.testing.assert_array_equal(ghost.state[qpos], state[world, qpos].numpy())
     past = ghosts[2:]
     assert len(past) == 5 and past[0].colour[3] > past[1].colour[3] and past[0].colour[0] > past[0].colour[2]
-    np.testing.assert_array_equal(past[-1].pose.qpos, session.stage.live.past.states[0, 2, qpos].numpy())
+    np.testing.assert_array_equal(past[-1].state[qpos], session.stage.live.past.states[0, 2, qpos].numpy())
     session.obey(protocol.SetGhosts(worlds=3, grid=True))
     shifts = {ghost.shift for ghost in session.stage.frame().ghosts}
     assert len(shifts) == 3 and (0.0, 0.0) not in shifts and all(g.colour is None for g in session.stage.frame().ghosts)

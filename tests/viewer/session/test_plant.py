@@ -47,7 +47,7 @@ def test_planner_controls_a_copy_of_the_world_in_view(shared_env: SharedEnv) -> 
     moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
     session.obey(protocol.SetGhosts(worlds=1))
-    np.testing.assert_array_equal(session.stage.frame().ghosts[0].pose.qpos, before[2, qpos].numpy())
+    np.testing.assert_array_equal(session.stage.frame().ghosts[0].state[qpos], before[2, qpos].numpy())
     session.obey(protocol.SetWorld(2))
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])

@@ -64,7 +64,7 @@ def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
             plant.step(action[None])
             np.testing.assert_allclose(point, site, atol=1e-6)
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
-    np.testing.assert_allclose(traces.final.qpos, qpos, atol=1e-6)
+    np.testing.assert_allclose(traces.final[plant.state_space.parts["qpos"]], qpos, atol=1e-6)
     assert control.look() is None  # unchanged
 
 

@@ -5,7 +5,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import SharedEnv
 from memory_window import MemoryWindow
@@ -19,7 +18,7 @@ from lyceum_warp.viewer.session.videos import VideoTaker
 from lyceum_warp.viz import drawing
 from lyceum_warp.viz.video import NoVideoError, check_video
 
-CAMERA = dict(type=1, trackbodyid=1, fixedcamid=-1, lookat=np.array([0.0, 0, 1]), distance=4.0, azimuth=90.0,
+CAMERA = dict(type=1, trackbodyid=1, fixedcamid=-1, lookat=[0.0, 0.0, 1.0], distance=4.0, azimuth=90.0,
               elevation=-20.0)  # fmt: skip
 
 

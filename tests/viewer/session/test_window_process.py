@@ -123,7 +123,7 @@ def test_points_and_messages_of_skipped_frames_are_merged_up_to_a_limit() -> Non
         merged = latest(merged, frame)
     assert merged is not None and merged.samples is not None
     np.testing.assert_array_equal(merged.samples, [[0.0, 1, 2], [0.1, 3, 4]])
-    assert merged.messages == ("one", "two", "three") and merged.pose is last.pose
+    assert merged.messages == ("one", "two", "three") and merged.state is last.state
     for i in range(30):
         merged = latest(merged, frame_of(MODEL, DATA, samples=np.full((1000, 3), i), messages=("m",) * 10))
     assert merged.samples is not None and len(merged.samples) == 20_000 and len(merged.messages) == 200

@@ -1,7 +1,7 @@
 import mujoco
 import numpy as np
 import pytest
-from headless_screen import Bench, frame_of, pose_of, robot, scene_of, status_of
+from headless_screen import Bench, frame_of, robot, scene_of, state_of, status_of
 
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Ghost, Opened, SetVideo
@@ -55,18 +55,11 @@ def test_panel_draws_only_finite_states(bench: Bench) -> None:
     np.testing.assert_allclose(bench.viewer.data.body("ball").xpos, [1, 2, 3])
 
 
-def ghost_beside(data: mujoco.MjData) -> Ghost:
-    pose = pose_of(data)
-    pose.qpos[0] += 1.0
-    return Ghost(pose, (1, 0, 0, 0.3))
-
-
-@pytest.mark.parametrize(("limit", "drawn"), [(100, 10), (3, 1)])
-def test_transparent_copies_and_traces_are_drawn_up_to_a_limit(limit: int, drawn: int) -> None:
-    model = robot()
-    bench = Bench(model, scene_of(model), limit=limit)
-    bench.draw(frame_of(model, bench.data, ghosts=(ghost_beside(bench.data),) * 2, traces=np.zeros((2, 5, 3))))
-    assert len(bench.viewer.extra_geoms) == drawn
+def test_panel_draws_ghosts_and_traces(bench: Bench) -> None:
+    state = state_of(bench.model, bench.data)
+    state[1] += 1.0  # qpos[0]
+    bench.draw(frame_of(bench.model, bench.data, ghosts=(Ghost(state, None),), traces=np.zeros((2, 5, 3))))
+    assert len(bench.viewer.extra_geoms) == 9
 
 
 # keys

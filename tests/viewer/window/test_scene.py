@@ -1,52 +1,51 @@
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
-from headless_screen import robot
+from headless_screen import frame_of, robot, state_of
 
-from lyceum_warp.viewer.protocol import Ghost, Pose
+from lyceum_warp.viewer.protocol import Frame, Ghost
 from lyceum_warp.viewer.window.scene import ExtraGeoms, ModelValues
 
 MODEL = robot()
-MOCAP = np.array([[1.0, 0, 1]]), np.array([[1.0, 0, 0, 0]])
+SHOWN, HIDDEN = np.ones(6, np.uint8), np.zeros(6, np.uint8)
 
 
-def pose(x: float) -> Pose:
-    qpos = MODEL.qpos0.copy()
-    qpos[0] = x
-    return Pose(qpos, *MOCAP)
+def frame(**changes: Any) -> Frame:
+    return frame_of(MODEL, mujoco.MjData(MODEL), **changes)
 
 
-def ghost(x: float, opacity: float = 0.3) -> Ghost:
-    return Ghost(pose(x), (0.2, 0.4, 0.6, opacity))
+def ghost(x: float) -> Ghost:
+    data = mujoco.MjData(MODEL)
+    data.qpos[0] = x
+    return Ghost(state_of(MODEL, data), (0.2, 0.4, 0.6, 0.3))
 
 
-def test_transparent_copy_draws_the_moving_geoms_in_its_own_colour() -> None:
-    geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)])
+def test_ghost_draws_the_moving_geoms_of_visible_groups_in_its_colour() -> None:
+    geoms = ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(2.0),)), SHOWN)
     assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
     np.testing.assert_allclose(geoms[0].rgba, [0.2, 0.4, 0.6, 0.3])
     assert geoms[0].transparent
+    assert ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(2.0),)), HIDDEN) == []
 
 
-def test_hidden_geom_groups_have_no_transparent_copies() -> None:
-    groups = np.zeros(6, np.uint8)
-    assert ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(2.0)], groups=groups) == []
-
-
-def test_copies_that_coincide_with_the_world_in_view_are_omitted() -> None:
-    geoms = ExtraGeoms(MODEL, 100).draw(pose(0), [ghost(0.0), ghost(0.5)])
+def test_ghosts_that_coincide_with_the_displayed_world_are_omitted() -> None:
+    geoms = ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(0.0), ghost(0.5))), SHOWN)
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 
 
-@pytest.mark.parametrize(("limit", "number"), [(1024, 10), (100, 10), (10, 10), (1024, 100), (3, 7), (1, 7)])
-@pytest.mark.parametrize("best", [None, 2])
+@pytest.mark.parametrize(("limit", "number", "best"), [(1024, 10, 2), (100, 10, None), (10, 10, 2), (1024, 100, None),
+                                                       (3, 7, 2), (1, 7, 2)])  # fmt: skip
 def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, best: int | None) -> None:
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
-    geoms = scene.draw(pose(0), traces=traces, best=best)
+    geoms = scene.draw(frame(traces=traces, best=best), SHOWN)
     assert len(geoms) <= min(limit, 160)
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
-    assert len(scene.draw(pose(0), [ghost(i) for i in range(20)], traces, best)) <= limit
+    ghosts = tuple(ghost(i) for i in range(20))
+    assert len(scene.draw(frame(ghosts=ghosts, traces=traces, best=best), SHOWN)) <= limit
 
 
 # model values
