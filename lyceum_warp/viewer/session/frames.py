@@ -48,9 +48,7 @@ class FrameMaker:
         unknown = [math.nan] * (self._curves - 2)
         self._points.append([step * self._env.timestep, 0.0, *values, *unknown])
 
-    def of_worlds(
-        self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status], *, paused: bool
-    ) -> Frame:
+    def of_worlds(self, live: Live, main: Live, traces: Traces | None, status: Callable[..., Status]) -> Frame:
         """Make a frame of the displayed world, with other worlds as ghosts.
 
         Args:
@@ -58,29 +56,14 @@ class FrameMaker:
             main: All worlds.
             traces: The paths of a planner's samples.
             status: A function that completes a ``Status``, given some of its fields.
-            paused: Whether to show the present state. Otherwise the frame may show the state at the previous frame.
         """
         shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
-        wanted = shown if live is main else [], self.ghosts.burst
-        rows, points = live.take(), []
-        if rows is not None and rows.worlds[0] == live.world:
-            points.append(rows.points)
-        else:
-            rows = None
-        if rows is None or paused or not live.asynchronous:
-            live.request(*wanted)
-            rows = live.take()
-            assert rows is not None
-            points.append(rows.points)
-        if live.asynchronous and not paused:  # start to copy the states for the next frame
-            live.request(*wanted)
+        rows = live.rows(shown if live is main else (), self.ghosts.burst)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
         others, grid = rows.states[1:], self.ghosts.grid
         if live is not main and shown:  # the other worlds do not move
-            main.request(shown)
-            waiting = main.take()
-            others = others if waiting is None else waiting.states[1:]
+            others = main.rows(shown).states[1:]
         ghosts = [] if traces is None else [Ghost(self._physics(traces.final), (*_PLAN, _OPACITY))]
         ghosts += self._beside(others) if grid else self._coloured(others)
         ghosts += self._burst(rows.back, _PAST)
@@ -93,8 +76,7 @@ class FrameMaker:
         return Frame(
             self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
-            self._driving.arrows(state),
-            np.concatenate(points), self._take_messages(),
+            self._driving.arrows(state), rows.points, self._take_messages(),
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:

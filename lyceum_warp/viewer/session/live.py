@@ -1,6 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-On a GPU, steps do not wait for the device, and frames are copied to the host asynchronously.
+On a GPU, only frames wait for the device.
 """
 
 import dataclasses
@@ -50,6 +50,8 @@ class Past:
 
     def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
         """Store the present state."""
+        if not self.length:
+            return
         index = self.now % self.length
         self.states[index].copy_(state)
         self.returns[index].copy_(returns)
@@ -65,10 +67,8 @@ class Past:
 class Rows:
     """The data of a frame, copied to the host."""
 
-    worlds: tuple[int, ...]
-    """The indices of the worlds. The displayed world comes first."""
     states: np.ndarray
-    """(worlds, state_space.size) float64."""
+    """States of the displayed world and of other worlds, (worlds, state_space.size) float64."""
     back: np.ndarray
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
@@ -89,18 +89,14 @@ class Live:
         self.world = 0
         self.pushed: int | None = None
         device, n = env.obs.device, env.nworld
-        self.asynchronous = device.type != "cpu"
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
-        self._clock = 0  # steps since the session began, except undone ones
         self._ends = torch.zeros(n, 5, dtype=torch.float64, device=device)
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
-        self._curves = torch.zeros(_CURVE_ROWS, 3 + len(env.metrics), dtype=torch.float64, device=device)
-        self._times: list[float] = []
+        self._curves = torch.zeros(_CURVE_ROWS, 4 + len(env.metrics), dtype=torch.float64, device=device)
+        self._points = 0  # since the last frame
         self._state = env.get_state()
-        self._reading: tuple[tuple[int, ...], list[float], list[torch.Tensor]] | None = None  # worlds, times, rows
-        self._event = torch.cuda.Event() if device.type == "cuda" else None
         # values before the current step
         self._length, self._over = env.episode_step.clone(), env.done.clone()
         self._number = torch.arange(n, device=device)
@@ -153,14 +149,12 @@ class Live:
 
     def _keep(self, state: torch.Tensor) -> None:
         past = self.past
-        if past.length:
-            past.put(state, self.returns, self.pushed)
-            past.now += 1
-            past.newest = past.now
+        past.put(state, self.returns, self.pushed)
+        past.now += 1
+        past.newest = past.now
 
     def _after_step(self) -> None:
         env = self.env
-        self._clock += 1
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
         if not env.autoreset:  # ``done`` then stays set after the episode, and the return must not grow
@@ -168,16 +162,12 @@ class Live:
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)
         # reading the mask would wait for the GPU
-        if self.asynchronous or ended.any():
+        if ended.is_cuda or ended.any():
             self._note_ends(ended)
-        values = [
-            ended[self.world].to(env.reward.dtype),
-            env.reward[self.world],
-            env.eval[self.world],
-            *(metric[self.world] for metric in env.metrics.values()),
-        ]
-        self._curves[len(self._times) % _CURVE_ROWS].copy_(torch.stack(values))
-        self._times.append(self._clock * env.timestep)
+        point, values = self._curves[self._points % _CURVE_ROWS], (env.reward, env.eval, *env.metrics.values())
+        point[0].fill_(self.past.now * env.timestep)
+        point[1:].copy_(torch.stack([ended[self.world].to(env.reward.dtype), *(each[self.world] for each in values)]))
+        self._points += 1
 
     def _note_ends(self, ended: torch.Tensor) -> None:
         env, reason = self.env, self.env.done_reason
@@ -213,13 +203,12 @@ class Live:
     def _move(self, steps: int) -> None:
         past = self.past
         past.now += steps
-        self._clock += steps
         index = past.now % past.length
         self.env.set_state(past.states[index], check=False)
         self.returns.copy_(past.returns[index])
         self.pushed = past.pushed[index]
         if steps < 0:
-            self._times.clear()
+            self._points = 0
 
     # user requests
 
@@ -296,46 +285,16 @@ class Live:
             return (self.world + (1 if choice == "next" else -1)) % self.env.nworld
         return int(self.returns.argmax() if choice == "best" else self.returns.argmin())
 
-    # rows of frames
+    # frames
 
-    def request(self, worlds: Sequence[int] = (), burst: int = 0) -> None:
-        """Start to copy the data of a frame to the host, unless a copy is already in progress."""
-        if self._reading is not None:
-            return
-        past, device = self.past, self.env.obs.device
-        shown = (self.world, *worlds)
-        states = self.env.get_state(out=self._state)[_index(shown, device)]
+    def rows(self, worlds: Sequence[int] = (), burst: int = 0) -> Rows:
+        """Copy the data of a frame to the host, with the states of other worlds and up to ``burst`` earlier states."""
+        past, shown = self.past, [self.world, *worlds]
+        states = self.env.get_state(out=self._state)[shown]
         count = min(burst, past.behind)
-        steps = [past.behind * i // count for i in range(1, count + 1)]
-        earlier = _index([(past.now - k) % past.length for k in steps], device)
-        parts = [
-            states, past.states[earlier, self.world], self.returns[self.world : self.world + 1],
-            self._ends[self.world], self._fault, self._curves,
-        ]  # fmt: skip
-        self._reading, self._times = (shown, self._times, [_to_host(part) for part in parts]), []
-        if self._event is not None:
-            self._event.record()
-
-    def take(self) -> Rows | None:
-        """Wait for the data of the last request."""
-        if self._reading is None:
-            return None
-        (worlds, times, parts), self._reading = self._reading, None
-        if self._event is not None:
-            self._event.synchronize()
-        states, back, returned, end, fault, curves = (part.numpy() for part in parts)
-        numbers = np.arange(len(times))[-len(curves) :]
-        points = np.column_stack([np.array(times, dtype=float)[numbers], curves[numbers % len(curves)]])
-        return Rows(worlds, states, back, float(returned[0]), tuple(end.tolist()), tuple(fault.tolist()), points)
-
-
-def _index(numbers: Sequence[int], device: torch.device) -> torch.Tensor:
-    index = torch.tensor(numbers, dtype=torch.long)
-    return index if device.type == "cpu" else index.pin_memory().to(device, non_blocking=True)
-
-
-def _to_host(part: torch.Tensor) -> torch.Tensor:
-    if part.device.type == "cpu":
-        return part.clone()
-    host = torch.empty(part.shape, dtype=part.dtype, pin_memory=True)
-    return host.copy_(part, non_blocking=True)
+        earlier = [(past.now - past.behind * i // count) % past.length for i in range(1, count + 1)]
+        parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves
+        states, back, end, fault, curves = (part.cpu().numpy() for part in parts)
+        kept, self._points = np.arange(max(0, self._points - _CURVE_ROWS), self._points) % _CURVE_ROWS, 0
+        returned = self.returns[self.world].item()
+        return Rows(states, back, returned, tuple(end.tolist()), tuple(fault.tolist()), curves[kept])

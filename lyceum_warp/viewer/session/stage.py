@@ -240,7 +240,7 @@ class Stage:
     def _frame(self) -> Frame:
         if self.mode == "playback":
             return self.frames.of_playback(self.playback, self._status)
-        frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status, paused=self.paused)
+        frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status)
         wanted, command, live = self.driving.wanted, frame.status.command, self.live
         if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
             self.driving.apply(live)  # a reset or a change of world has replaced the user's command
