@@ -306,7 +306,7 @@ class Failed:
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """Reports that the window is ready for another frame."""
+    """Reports that the window draws the last frame, and is ready for another one."""
 
 
 Reply: TypeAlias = Opened | Failed | Taken | Command

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections import deque
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -17,8 +16,6 @@ from typing import Any
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
 
-FRAME_TIME = 1 / 60
-"""Minimum time between two frames, in seconds."""
 OPENING_TIME = 60.0
 """Maximum time until the window is open, in seconds."""
 CLOSING_TIME = 5.0
@@ -49,10 +46,8 @@ class Window:
 
     def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._pending: Frame | None = None
-        self._lock = threading.Lock()
-        self._wake = threading.Event()
-        self._taken = threading.Semaphore(0)
-        self._next = 0.0
+        self._taken = True
+        self._changed = threading.Condition()  # its lock also guards both
         self._ended = False
         self._commands: deque[Command] = deque()
         self._threads: list[threading.Thread] = []
@@ -97,17 +92,14 @@ class Window:
 
         A frame that has not been sent yet is skipped. Its curve points and messages move to the new frame.
         """
-        with self._lock:
+        with self._changed:
             self._pending = protocol.latest(self._pending, frame)
-        self._wake.set()
+            self._changed.notify()
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window can draw another frame now.
-
-        The window draws about 60 frames per second while a page is open, and about 4 while none is.
-        """
-        return self._pending is None and time.monotonic() >= self._next and not self._ended
+        """Whether the window has drawn the last frame."""
+        return self._taken and self._pending is None and not self._ended
 
     def commands(self) -> list[Command]:
         """Return the commands since the last call, in order."""
@@ -140,9 +132,9 @@ class Window:
         self.close()
 
     def _end(self) -> None:
-        self._ended = True
-        self._wake.set()
-        self._taken.release()
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
 
     def _last_words(self) -> str:
         code = self._process.returncode
@@ -156,22 +148,15 @@ class Window:
 
     def _send(self) -> None:
         while True:
-            self._wake.wait()
-            if self._ended:
-                return
-            with self._lock:
-                frame, self._pending = self._pending, None
-                self._wake.clear()
-                self._next = float("inf")
-            if frame is None:
-                continue
+            with self._changed:
+                self._changed.wait_for(lambda: self._ended or (self._taken and self._pending is not None))
+                if self._ended:
+                    return
+                frame, self._pending, self._taken = self._pending, None, False
             try:
                 self._connection.send(frame)
             except (OSError, ValueError):
                 return  # the receiving thread reports the reason
-            self._taken.acquire()
-            self._next = time.monotonic()
-            time.sleep(FRAME_TIME)
 
     def _receive(self) -> None:
         closed = False
@@ -179,7 +164,9 @@ class Window:
             while not self._ended:
                 reply: protocol.Reply = self._connection.recv()
                 if isinstance(reply, protocol.Taken):
-                    self._taken.release()
+                    with self._changed:
+                        self._taken = True
+                        self._changed.notify()
                 elif isinstance(reply, Failed):
                     self.error = reply.reason
                 elif not isinstance(reply, Opened):

@@ -12,14 +12,12 @@ from multiprocessing.connection import Connection
 
 import mujoco
 
-from lyceum_warp.viewer.protocol import Close, Failed, Frame, Opened, Opening, Reply, Taken, latest
+from lyceum_warp.viewer.protocol import Close, Failed, Frame, Opened, Opening, Reply, Taken
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.proxy import Proxy
 from lyceum_warp.viewer.window.sockets import private_socket
 
-IDLE_TIME = 0.25
-"""Seconds between two frames while no page is open."""
 NICE = 5
 """A low priority, because the session's planner may need every core."""
 END_TIME = 3.0
@@ -29,44 +27,36 @@ END_TIME = 3.0
 class WindowEnd:
     """The window's end of the connection to the session.
 
-    One thread receives frames, and the drawing thread takes the latest one.
+    One thread receives frames, and the drawing thread takes them. The session sends a frame after the last one was
+    taken.
     """
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
-        self._lock = threading.Lock()
+        self._sending = threading.Lock()
         self._frame: Frame | None = None
-        self._looked = 0.0
         self._parent = os.getppid()
 
     def send(self, reply: Reply) -> None:
         """Send a message to the session, unless the session has ended."""
-        with self._lock, contextlib.suppress(OSError):
+        with self._sending, contextlib.suppress(OSError):
             self._connection.send(reply)
 
     def take(self) -> Frame | None:
         """Return the latest frame, or None if it was already returned."""
-        self._looked = time.monotonic()
-        with self._lock:
-            frame, self._frame = self._frame, None
+        frame, self._frame = self._frame, None
+        if frame is not None:
+            self.send(Taken())
         return frame
 
     def receive(self) -> None:
         """Receive frames until the session ends."""
-        while True:
-            try:
-                if not self._connection.poll(1.0):
-                    if os.getppid() != self._parent:  # a forked child of the session may hold the connection open
-                        return
-                    continue
-                frame = self._connection.recv()
-            except (EOFError, OSError):
-                return
-            with self._lock:
-                self._frame = latest(self._frame, frame)
-            if time.monotonic() - self._looked > IDLE_TIME:
-                time.sleep(IDLE_TIME)
-            self.send(Taken())
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                if self._connection.poll(1.0):
+                    self._frame = self._connection.recv()
+                elif os.getppid() != self._parent:  # a forked child of the session may hold the connection open
+                    return
 
 
 def main(descriptor: int) -> None:
