@@ -294,7 +294,7 @@ class Live:
         count = min(burst, past.behind)
         earlier = [(past.now - past.behind * i // count) % past.length for i in range(1, count + 1)]
         parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves
-        states, back, end, fault, curves = (part.cpu().numpy() for part in parts)
+        rows, back, end, fault, curves = (part.cpu().numpy() for part in parts)
         kept, self._points = np.arange(max(0, self._points - _CURVE_ROWS), self._points) % _CURVE_ROWS, 0
         returned = self.returns[self.world].item()
-        return Rows(states, back, returned, tuple(end.tolist()), tuple(fault.tolist()), curves[kept])
+        return Rows(rows, back, returned, tuple(end.tolist()), tuple(fault.tolist()), curves[kept])
