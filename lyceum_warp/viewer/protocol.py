@@ -124,7 +124,7 @@ class Frame:
     state: np.ndarray
     """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]
-    """The model fields whose values differ from the model's."""
+    """The values of the model fields that may differ between worlds, flat, by name."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None

@@ -143,14 +143,8 @@ class FrameMaker:
         return state[: self._env.engine.integration_size]
 
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        found = {}
-        for field in self._env.task.dynamics:
-            owner = self._env.task.model if hasattr(self._env.task.model, field.name) else self._env.task.model.opt
-            own = np.asarray(getattr(owner, field.name), dtype=float)
-            value = state[self._env.state_space.parts[field.name]].reshape(own.shape)
-            if not np.array_equal(value, own) and not np.array_equal(value, own.astype(np.float32)):
-                found[field.name] = value.copy()
-        return found
+        parts = self._env.state_space.parts
+        return {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
 
     def _take_messages(self) -> tuple[str, ...]:
         messages, self.messages = self.messages, []

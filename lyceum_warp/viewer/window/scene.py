@@ -125,19 +125,14 @@ class ModelValues:
     """Holds a copy of the model with the values of one world."""
 
     def __init__(self, nominal: mujoco.MjModel) -> None:
-        self._nominal = nominal
-        self._values: dict[str, np.ndarray] = {}
+        self._values: Mapping[str, np.ndarray] = {}
         self.model = copy.deepcopy(nominal)
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """Set a world's values. Return whether any value has changed, and whether the change is visible."""
-        changed = [
-            name for name in {*values, *self._values}
-            if name not in values or name not in self._values or not np.array_equal(values[name], self._values[name])
-        ]  # fmt: skip
+        changed = [name for name, value in values.items() if not _equal(value, field(self.model, name))]
         if changed:
-            self._values = dict(values)
-            self.model = copy.deepcopy(self._nominal)
+            self._values = values
             self.copy_to(self.model)
         return bool(changed), any(name.startswith(VISIBLE) for name in changed)
 
@@ -146,6 +141,11 @@ class ModelValues:
         for name, values in self._values.items():
             field(model, name)[...] = values.reshape(field(model, name).shape)
         mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def _equal(first: np.ndarray, second: np.ndarray) -> bool:
+    """Compare in single precision, because MuJoCo Warp rounds the model's values."""
+    return np.array_equal(first.astype(np.float32), second.ravel().astype(np.float32))
 
 
 def field(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -118,8 +118,7 @@ def test_user_can_choose_a_fixed_camera_of_the_model(bench: Bench) -> None:
 
 def test_world_with_other_geom_sizes_gets_a_separate_model(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyceum_warp.viewer.window.panel.SWAP_TIME", 0.0)
-    sizes = np.array(bench.model.geom_size)
-    sizes[1, 0] = 0.3
-    bench.draw(frame_of(bench.model, bench.data, model_fields={"geom_size": sizes}))
-    bench.draw(frame_of(bench.model, bench.data))
-    assert [model.geom("ball").size[0] for model in bench.models] == pytest.approx([0.3, 0.1])
+    for factor in (3.0, 1.0):
+        sizes = factor * np.array(bench.model.geom_size).ravel()
+        bench.draw(frame_of(bench.model, bench.data, model_fields={"geom_size": sizes}))
+        assert bench.models.pop().geom("ball").size[0] == pytest.approx(0.1 * factor)
