@@ -224,22 +224,18 @@ class Live:
         if self.pushed == self.world:
             self.pushed = None
 
-    def set_row(self, state: torch.Tensor, *, new_episode: bool = False, world: int | None = None) -> None:
-        """Set the state of one world, by default the displayed world.
+    def set_row(self, state: torch.Tensor, *, new_episode: bool = False) -> None:
+        """Set the state of the displayed world.
 
         Args:
             state: (state_space.size,) float64, on any device.
             new_episode: Whether the world's return starts from 0.
-            world: The index of the world.
         """
-        world = self.world if world is None else world
-        mask = self._number == world
-        self.past.drop_ahead()
         states = self.env.get_state()
-        states[world].copy_(state)
-        self.env.set_state(states, mask, check=False)
+        states[self.world].copy_(state)
+        self._restore(states, self.world)
         if new_episode:
-            self.returns.masked_fill_(mask, 0.0)
+            self.returns[self.world] = 0.0
 
     def push(self, forces: np.ndarray) -> None:
         """Push bodies of the displayed world, until ``end_push``.
@@ -256,9 +252,9 @@ class Live:
         """Clear the force of a push."""
         if (world := self.pushed) is not None:
             self.pushed = None
-            state = self.env.get_state()[world]
-            state[self.env.state_space.parts["xfrc_applied"]] = 0.0
-            self.set_row(state, world=world)
+            states = self.env.get_state()
+            states[world, self.env.state_space.parts["xfrc_applied"]] = 0.0
+            self._restore(states, world)
 
     def row(self) -> torch.Tensor:
         """Return the state of the displayed world, (state_space.size,) float64, on the world's device."""
@@ -266,11 +262,15 @@ class Live:
 
     def write(self, **parts: np.ndarray) -> None:
         """Change parts of the displayed world's state by their names in ``env.state_space``."""
-        state = self.row()
+        states = self.env.get_state()
         for name, value in parts.items():
-            where = self.env.state_space.parts[name]
-            state[where] = torch.as_tensor(np.ascontiguousarray(value).ravel(), dtype=torch.float64).to(state.device)
-        self.set_row(state)
+            flat = torch.as_tensor(np.ascontiguousarray(value).ravel(), dtype=torch.float64)
+            states[self.world, self.env.state_space.parts[name]] = flat.to(states.device)
+        self._restore(states, self.world)
+
+    def _restore(self, states: torch.Tensor, world: int) -> None:
+        self.past.drop_ahead()
+        self.env.set_state(states, self._number == world, check=False)
 
     # worlds to show
 
