@@ -55,14 +55,6 @@ def episode(env: lw.Env, policy: Callable[[torch.Tensor], torch.Tensor], **words
     return found.states
 
 
-def test_all_states_of_a_policy_episode_are_returned(env: lw.Env) -> None:
-    states = episode(env, still, seed=4)
-    assert states.shape == (21, env.state_space.size)
-    assert torch.equal(states[0, env.state_space.parts["step"]], torch.zeros(1, dtype=torch.float64))
-    assert states[-1, env.state_space.parts["time"]].item() == pytest.approx(20 * env.timestep)
-    assert torch.equal(states, episode(env, still, seed=4))
-
-
 def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) -> None:
     steps: list[tuple[int, int]] = []
     frames: list[tuple[int, int]] = []

@@ -101,18 +101,6 @@ def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
 # frames
 
 
-def test_show_does_not_wait_for_a_window_that_hangs(shared_window: Window) -> None:
-    os.kill(process_of(shared_window), signal.SIGSTOP)
-    try:
-        frame = frame_of(MODEL, DATA, samples=np.ones((1, 3)), messages=("end",))
-        began = time.monotonic()
-        for _ in range(2000):
-            shared_window.show(frame)
-        assert time.monotonic() - began < 20
-    finally:
-        os.kill(process_of(shared_window), signal.SIGCONT)
-
-
 def test_points_and_messages_of_skipped_frames_are_merged_up_to_a_limit() -> None:
     merged = None
     for frame in (
@@ -147,8 +135,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
     assert capfd.readouterr() == ("", "")  # studio prints nothing
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_sending_frames_to_a_process_that_ends_raises_an_error(number: signal.Signals) -> None:
+def test_frames_for_a_process_that_hangs_do_not_block_and_its_end_is_reported() -> None:
     """The sending thread notices first that the process has ended."""
     with Window(scene_of(MODEL)) as window:
         os.kill(process_of(window), signal.SIGSTOP)
@@ -156,10 +143,10 @@ def test_sending_frames_to_a_process_that_ends_raises_an_error(number: signal.Si
         for _ in range(5):  # fills the pipe
             window.show(frame)
             time.sleep(0.02)
-        os.kill(process_of(window), number)
+        os.kill(process_of(window), signal.SIGSEGV)
         os.kill(process_of(window), signal.SIGCONT)
         assert wait_until(lambda: not window.is_open())
-        assert window.error == f"its process was ended by {number.name}"
+        assert window.error == "its process was ended by SIGSEGV"
 
 
 def test_killed_window_ends_the_view_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -428,15 +428,25 @@ def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytes
 # addresses and ports
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_remote_viewer_prints_an_address_and_an_ssh_command(host: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    for connection, shown in (("198.51.100.7 50000 203.0.113.9 22", "203.0.113.9"), ("", socket.gethostname())):
-        monkeypatch.setenv("SSH_CONNECTION", connection)
+@pytest.mark.parametrize("ssh, shown, target", [
+    ("198.51.100.7 50000 203.0.113.9 2222", "203.0.113.9", "-p 2222 ada@203.0.113.9"),
+    ("", socket.gethostname(), f"ada@{socket.gethostname()}"),
+])  # fmt: skip
+def test_viewer_prints_an_address_and_an_ssh_command(
+    ssh: str, shown: str, target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("getpass.getuser", lambda: "ada")
+    monkeypatch.setenv("SSH_CONNECTION", ssh)
+    for host, address in (("127.0.0.1", "127.0.0.1"), ("0.0.0.0", shown), ("::", shown)):
         with Proxy(host=host) as proxy:
-            assert proxy.address.startswith(f"http://{shown}:{proxy.port}/?token=")
-            assert not proxy.local and "not encrypted" in proxy.instructions[1]
-            assert proxy.ssh_line in proxy.instructions[2]
-            assert f"http://127.0.0.1:{proxy.port}/?token={token(proxy)}" in proxy.instructions[3]
+            line = f"ssh -C -N -L {proxy.port}:127.0.0.1:{proxy.port} {target}"
+            first, *others = proxy.instructions
+            assert first == f"viewer: http://{address}:{proxy.port}/?token={token(proxy)}"
+            if host == "127.0.0.1":
+                assert others == [f"from another machine: {line}"]
+            else:
+                assert "not encrypted" in others[0] and line in others[1]
+                assert f"http://127.0.0.1:{proxy.port}/?token={token(proxy)}" in others[2]
 
 
 def test_free_port_is_found_and_busy_port_raises_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -465,17 +475,6 @@ def test_close_ends_connections_and_frees_the_port(proxy: Proxy) -> None:
         proxy.close()
         with Proxy(port=proxy.port) as again:
             assert again.port == proxy.port
-
-
-def test_printed_ssh_command_forwards_the_port(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("getpass.getuser", lambda: "ada")
-    for connection, target in (
-        (None, f"ada@{socket.gethostname()}"), ("198.51.100.7 50000 203.0.113.9 2222", "-p 2222 ada@203.0.113.9"),
-    ):  # fmt: skip
-        monkeypatch.setenv("SSH_CONNECTION", connection or "")
-        with Proxy() as proxy:
-            assert proxy.ssh_line == f"ssh -C -N -L {proxy.port}:127.0.0.1:{proxy.port} {target}"
-            assert proxy.instructions == [f"viewer: {proxy.address}", f"from another machine: {proxy.ssh_line}"]
 
 
 # the private socket
