@@ -54,14 +54,11 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
         return _default_camera(model)
     if isinstance(camera, FreeCamera):
         return _free_camera(model, camera)
-    names = camera_names(model)
-    if isinstance(camera, str) and camera and camera in names:
-        return _fixed_camera(names.index(camera))
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
+    if (index := _index(names, camera)) is not None:
+        return _fixed_camera(index)
     if camera == FREE:
         return _free_camera(model, FreeCamera())
-    index = int(camera) if isinstance(camera, str) and camera.isdecimal() else camera
-    if _is_index(index) and 0 <= int(index) < len(names):
-        return _fixed_camera(int(index))
     raise ValueError(f"there is no camera {camera!r}: {_listed(names)}, or {FREE!r}, MuJoCo's default free camera")
 
 
@@ -83,20 +80,19 @@ def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
             raise ValueError(
                 f"a camera is a name, an index, or a pose of {', '.join(f'{kind}=...' for kind in kinds)}, not {word!r}"
             )
-        try:
-            numbers = [float(number) for number in value.split(",")] if name != "track" else []
-        except ValueError:
-            numbers = []
-        if name != "track" and len(numbers) != (3 if name == "lookat" else 1):
-            wanted = "X,Y,Z" if name == "lookat" else "a number"
-            raise ValueError(f"the camera's {name} must be {wanted}, not {value!r}")
-        parts[name] = value if name == "track" else tuple(numbers) if name == "lookat" else numbers[0]
+        parts[name] = value if name == "track" else _numbers(name, value)
     return FreeCamera(**parts)  # type: ignore[arg-type]
 
 
-def camera_names(model: mujoco.MjModel) -> list[str]:
-    """Return the names of the model's cameras in order. A camera without a name has the name ""."""
-    return [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_CAMERA, i) or "" for i in range(model.ncam)]
+def _numbers(name: str, value: str) -> float | tuple[float, ...]:
+    count, wanted = (3, "X,Y,Z") if name == "lookat" else (1, "a number")
+    try:
+        numbers = tuple(map(float, value.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count:
+        raise ValueError(f"the camera's {name} must be {wanted}, not {value!r}")
+    return numbers if name == "lookat" else numbers[0]
 
 
 def camera_values(model: mujoco.MjModel, camera: CameraChoice = None) -> dict[str, Any]:
@@ -106,19 +102,11 @@ def camera_values(model: mujoco.MjModel, camera: CameraChoice = None) -> dict[st
     return {"lookat": view.lookat.tolist()} | {name: getattr(view, name) for name in names}
 
 
-def tracking_camera(model: mujoco.MjModel) -> int | None:
-    """Return the index of the model's first camera that follows a body, or None."""
-    # MuJoCo's enums do not equal NumPy integers
-    tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
-    return next((i for i, mode in enumerate(model.cam_mode) if int(mode) in tracking), None)
-
-
 def _default_camera(model: mujoco.MjModel) -> mujoco.MjvCamera:
-    if (tracking := tracking_camera(model)) is not None:
-        return _fixed_camera(tracking)
-    for i, body in enumerate(model.cam_bodyid):
-        if body == 0:
-            return _fixed_camera(i)
+    tracking = (int(mujoco.mjtCamLight.mjCAMLIGHT_TRACK), int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM))
+    for cameras in (np.isin(model.cam_mode, tracking), model.cam_bodyid == 0):
+        if cameras.any():
+            return _fixed_camera(int(cameras.argmax()))
     return _free_camera(model, FreeCamera(track=1 if model.nbody > 1 else None))
 
 
@@ -150,18 +138,21 @@ def _free_camera(model: mujoco.MjModel, camera: FreeCamera) -> mujoco.MjvCamera:
 
 def _body(model: mujoco.MjModel, body: str | int) -> int:
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(model.nbody)]
-    if isinstance(body, str) and body in names:
-        return names.index(body)
-    index = int(body) if isinstance(body, str) and body.isdecimal() else body
-    if _is_index(index) and 0 <= int(index) < len(names):
-        return int(index)
+    if (index := _index(names, body)) is not None:
+        return index
     given = ", ".join(name for name in names if name)
     hint = did_you_mean(str(body), names, f"its bodies are {textwrap.shorten(given, 200)}")
     raise ValueError(f"the camera cannot track the body {body!r}, which the model does not have: {hint}")
 
 
-def _is_index(value: object) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+def _index(names: list[str], choice: object) -> int | None:
+    """Find the index of a name, or check an index."""
+    if isinstance(choice, str):
+        if choice and choice in names:
+            return names.index(choice)
+        choice = int(choice) if choice.isdecimal() else None
+    is_number = isinstance(choice, int | np.integer) and not isinstance(choice, bool)
+    return int(choice) if is_number and 0 <= choice < len(names) else None  # type: ignore[operator, call-overload]
 
 
 def _listed(names: list[str]) -> str:

@@ -34,6 +34,7 @@ class Shot(TypedDict):
     state: np.ndarray
     """The integration state (``mjSTATE_INTEGRATION``)."""
     model_fields: dict[str, np.ndarray]
+    """Values of the same model fields in every shot, by name."""
     ghosts: list[tuple[np.ndarray, tuple[float, ...] | None, tuple[float, float]]]
     """Further states, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
@@ -56,12 +57,13 @@ class Painter:
         self.view, self.option, self.perturb = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvPerturb()
         for name, value in camera.items():
             setattr(self.view, name, value)
-        self._nominal: dict[str, np.ndarray] = {}
         self._fields: dict[str, np.ndarray] = {}
 
     def draw(self, shot: Shot) -> np.ndarray:
         """Draw one frame, (height, width, 3) uint8."""
-        self._set_fields(shot["model_fields"])
+        if any(not np.array_equal(value, self._fields.get(name, ())) for name, value in shot["model_fields"].items()):
+            self._fields = shot["model_fields"]
+            change_model(self.mujoco, self.model, self._fields)
         self._place(self.data, shot["state"])
         self.renderer.update_scene(self.data, self.view, self.option)
         scene = self.renderer.scene
@@ -82,15 +84,6 @@ class Painter:
     def _place(self, data: Any, state: np.ndarray) -> None:
         self.mujoco.mj_setState(self.model, data, state, self.mujoco.mjtState.mjSTATE_INTEGRATION)
         self.mujoco.mj_forward(self.model, data)
-
-    def _set_fields(self, given: dict[str, np.ndarray]) -> None:
-        for name in given:
-            if name not in self._nominal:
-                self._nominal[name] = self._fields[name] = np.array(getattr(_owner(self.model, name), name))
-        wanted = self._nominal | given
-        if any(not np.array_equal(np.ravel(value), np.ravel(self._fields[name])) for name, value in wanted.items()):
-            change_model(self.mujoco, self.model, wanted)
-            self._fields = wanted
 
     def _add_line(self, scene: Any, points: np.ndarray, colour: tuple[float, ...], width: float) -> None:
         kind = int(self.mujoco.mjtGeom.mjGEOM_LINE)

@@ -143,11 +143,12 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
 
 def test_video_of_single_shots_shows_fields_transparent_copies_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
+    usual = {"geom_size": model.geom_size.copy()}
 
     def write() -> Path:
         mp4 = video_of(model, tmp_path / "video.mp4", fps=25)
         for each in (
-            shot(0.0), shot(0.0, model_fields=small), shot(0.0), shot(0.5),
+            shot(0.0), shot(0.0, model_fields=small), shot(0.0, model_fields=usual), shot(0.5),
             shot(0.0, ghosts=[(shot(1.5)["state"], red, (0.0, 0.0))]),
             shot(0.0, lines=[(np.array([[-1.5, 0, -1], [1.5, 0, -1]]), red, 2.0)]),
         ):  # fmt: skip

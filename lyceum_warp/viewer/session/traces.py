@@ -101,7 +101,6 @@ class TraceRollouts:
         fields = tuple(dict.fromkeys((*env.options.fields, point.field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
         self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, fields=fields, **threads)
-        self._parts = env.state_space.parts
         self._states = self.env.get_state()
         self._positions = self.env.field(point.field)
         worlds = self.env.worlds
@@ -135,14 +134,11 @@ class TraceRollouts:
             call()
 
     def _put(self, state: torch.Tensor) -> None:
-        parts = self.env.state_space.parts
-        state = state.to(self._states.device)
-        for name, part in self._parts.items():
-            self._states[:, parts[name]] = state[part]
+        self._states.copy_(state)
         if self._nominal:
             nominal: dict[str, wp.array] = self.env.engine.nominal
             for name, row in nominal.items():
-                self._states[:, parts[name]] = torch_view(flat(row))[0].double()
+                self._states[:, self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
 
 
 class TraceThread:
