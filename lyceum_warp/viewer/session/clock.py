@@ -1,6 +1,7 @@
 """Run a viewing session: step the worlds at the chosen speed, carry out the window's commands, and send it frames."""
 
 import contextlib
+import math
 import sys
 import time
 import traceback
@@ -34,8 +35,6 @@ _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
 """Seconds of delay that the worlds catch up; longer delays are ignored."""
-_IDLE = 0.5
-"""Seconds between two frames of a paused view in which nothing changes."""
 _CHECK = 0.5
 """Seconds between two calls of the watchers."""
 
@@ -63,7 +62,7 @@ class Session:
         self._window: Window | None = None
         self._closed = self._in_run = False
         self._waiting: deque[Command] = deque()
-        self._next_step = self._next_frame = self._next_check = self._last_frame = self._last_work = 0.0
+        self._next_step = self._next_frame = self._next_check = self._last_work = 0.0
 
     # the loop
 
@@ -104,12 +103,9 @@ class Session:
                 if (now := time.perf_counter()) >= until:
                     break
         self._show_when_due(now)
-        now = time.perf_counter()
-        wake = max(self._next_frame, now + POLL)
-        if not stage.paused:
-            wake = min(wake, self._next_step)
-        if wake > now:
-            time.sleep(min(wake - now, POLL))
+        due = math.inf if stage.paused else self._next_step - time.perf_counter()
+        if due > 0:
+            time.sleep(min(due, POLL))
 
     def _poll(self) -> None:
         assert self._window is not None
@@ -131,12 +127,8 @@ class Session:
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
         self._next_frame = max(self._next_frame + 1 / _FPS, now)
-        changed = stage.changed or bool(stage.frames.messages or videos.files) or videos.due
-        if stage.paused and not changed and now - self._last_frame < _IDLE:
-            return
         frame = stage.frame()
         self._window.show(frame)
-        self._last_frame, stage.changed = now, False
         videos.add(frame)
 
     # real time
@@ -180,7 +172,6 @@ class Session:
             self._waiting.appendleft(command)
             raise InterruptedByCommand
         stage = self.stage
-        stage.changed = True
         if isinstance(command, Close):
             self._closed = True
         if isinstance(command, SetMode | SetNumber) and not self._calls_have_ended():
@@ -213,7 +204,7 @@ class Session:
     def _give_up_control(self, error: ControllerError) -> None:
         stage = self.stage
         print("".join(traceback.format_exception(error.__cause__)), end="", file=sys.stderr, flush=True)
-        stage.paused = stage.changed = True
+        stage.paused = True
         if stage.mode == "controller":
             stage.select("passive", stage.controller)
         stage.frames.say(f"{error}; the viewer is paused, without a controller")

@@ -31,15 +31,10 @@ class FrameMaker:
         self.messages: list[str] = []
         self._env, self._curves, self._driving = env, curves, driving
         self._points: list[list[float]] = []
-        self._seen_end = self._seen_fault = 0.0
 
     def say(self, text: str) -> None:
         """Show a message in the next frame."""
         self.messages.append(text)
-
-    def forget_seen(self, live: Live) -> None:
-        """Report only later ends of episodes and later faults."""
-        self._seen_end = self._seen_fault = float(live.made)
 
     def add_point(self, playback: Playback) -> None:
         """Add a step of a playback to the curves."""
@@ -106,16 +101,14 @@ class FrameMaker:
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
         """Report faults and the end of an episode. ``plant_of`` is the world that a plant copies."""
-        number, bits, returned, length, success = rows.end
-        if number > self._seen_end:
+        if rows.end is not None:
+            bits, returned, length, success = rows.end
             why = "success" if success else reasons(int(bits))
             self.say(f"the episode ended after {length:.0f} steps ({why}), return {returned:.6g}")
-        if rows.fault[0] > self._seen_fault:
-            _, bits, world, count = rows.fault
+        if rows.fault is not None:
+            bits, world, count = rows.fault
             where = int(world) if plant_of is None else plant_of
             self.say(f"fault in world {where}: {reasons(int(bits))} ({count:.0f} so far)")
-        self._seen_end = max(self._seen_end, number)
-        self._seen_fault = max(self._seen_fault, rows.fault[0])
 
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
         return [Ghost(self._physics(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]

@@ -72,10 +72,10 @@ class Rows:
     back: np.ndarray
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
-    end: tuple[float, ...]
-    """The displayed world's last complete episode: its last step, bits of ``Done``, return, length, success."""
-    fault: tuple[float, ...]
-    """The last fault: its step, bits of ``Done``, the world, and the number of faults so far."""
+    end: tuple[float, ...] | None
+    """The displayed world's last episode since the previous frame: bits of ``Done``, return, length, success."""
+    fault: tuple[float, ...] | None
+    """The last fault since the previous frame: bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
     """(points, 2 + curves) float64."""
 
@@ -85,7 +85,7 @@ class Live:
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
-        self.made = 0
+        self.made = self._reported = 0  # steps, in all and until the last frame
         self.world = 0
         self.pushed: int | None = None
         device, n = env.obs.device, env.nworld
@@ -296,5 +296,6 @@ class Live:
         parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves
         rows, back, end, fault, curves = (part.cpu().numpy() for part in parts)
         kept, self._points = np.arange(max(0, self._points - _CURVE_ROWS), self._points) % _CURVE_ROWS, 0
-        returned = self.returns[self.world].item()
-        return Rows(rows, back, returned, tuple(end.tolist()), tuple(fault.tolist()), curves[kept])
+        news = [tuple(each[1:].tolist()) if each[0] > self._reported else None for each in (end, fault)]
+        self._reported = self.made
+        return Rows(rows, back, self.returns[self.world].item(), news[0], news[1], curves[kept])

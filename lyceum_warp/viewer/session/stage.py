@@ -58,7 +58,6 @@ class Stage:
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
         self.dragging = False
-        self.changed = False
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -95,7 +94,6 @@ class Stage:
 
     def advance(self, steps: int = 1) -> None:
         """Make steps at once, not in real time."""
-        self.changed = True
         for _ in range(steps):
             self.steps += 1
             if self.mode == "playback":
@@ -176,7 +174,6 @@ class Stage:
             self.live.past.drop_ahead()
             self.reset_controller()
             self.progress.clear()
-        self.frames.forget_seen(self.live)
         self._trace()
 
     def _trace(self) -> None:
@@ -215,7 +212,6 @@ class Stage:
         if before is not self.main:
             self._transfer(self.main, before)
             self.reset_controller()
-        self.frames.forget_seen(self.live)
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
         """Set the displayed world's state, and continue its episode from there, even if it had ended."""

@@ -23,17 +23,8 @@ SHARE = 0.15
 """The share of a core that the thread may use."""
 
 
-@dataclasses.dataclass(frozen=True)
-class TracePoint:
-    """The point of a robot whose path is drawn."""
-
-    field: str
-    """"site_xpos", "xpos", "xipos" or "subtree_com"."""
-    index: int
-
-
-def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
-    """Choose the point of a robot whose path is drawn.
+def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, int]:
+    """Choose the point of a robot whose path is drawn. Return its field in MjData, such as "site_xpos", and its index.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
     for an arm is the last body in the longest chain of actuated bodies: its first site, or its centre of mass.
@@ -41,18 +32,18 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
             if (index := mujoco.mj_name2id(model, kind, name)) >= 0:
-                return TracePoint(field, index)
+                return field, index
         known = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(1, model.nbody)]
         raise ValueError(
             f"the model has no site and no body {name!r} to trace: it has {', '.join(filter(None, known)) or 'none'}"
         )
     driven = _driven_bodies(model)
     if not driven.any():
-        return TracePoint("subtree_com", 0)
+        return "subtree_com", 0
     root = int(model.body_rootid[driven.argmax()])
     moving = model.body_jntnum > 0
     if not driven[(moving & (model.body_rootid == root)).argmax()]:
-        return TracePoint("subtree_com", root)
+        return "subtree_com", root
     depth = np.zeros(model.nbody, dtype=int)  # the number of moving bodies between the world and a body
     for body in range(1, model.nbody):
         parent = model.body_parentid[body]
@@ -60,7 +51,7 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> TracePoint:
         depth[body] = depth[parent] + moving[body]
     end = int(np.where(driven, depth, -1).argmax())
     sites = np.flatnonzero(model.site_bodyid == end).tolist()
-    return TracePoint("site_xpos", sites[0]) if sites else TracePoint("xipos", end)
+    return ("site_xpos", sites[0]) if sites else ("xipos", end)
 
 
 def _driven_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -95,14 +86,13 @@ class TraceRollouts:
     def __init__(self, controller: Any, plant: Env) -> None:
         own = getattr(controller, "env", None)
         env = own if isinstance(own, Env) else plant
-        point = trace_point(env.task.model, env.task.task.trace)
-        self.point = point
+        field, self._index = trace_point(env.task.model, env.task.task.trace)
         self._nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
-        fields = tuple(dict.fromkeys((*env.options.fields, point.field)))
+        fields = tuple(dict.fromkeys((*env.options.fields, field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
         self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, fields=fields, **threads)
         self._states = self.env.get_state()
-        self._positions = self.env.field(point.field)
+        self._positions = self.env.field(field)
         worlds = self.env.worlds
         self._transition = worlds.programs.graphs.sequence(worlds.transition_phases())
         for _ in range(3):  # capture CUDA graphs here, because the thread must not
@@ -119,10 +109,10 @@ class TraceRollouts:
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
         env.set_state(self._states, check=False)
-        path = [self._positions[:, self.point.index].clone()]
+        path = [self._positions[:, self._index].clone()]
         for action in actions:
             self._step(action)
-            path.append(self._positions[:, self.point.index].clone())
+            path.append(self._positions[:, self._index].clone())
         paths = torch.stack(path, dim=1)[[*range(count), MOST_SAMPLES]].cpu().numpy()
         final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy().copy()
         return Traces(paths, view.best, final, time.perf_counter())

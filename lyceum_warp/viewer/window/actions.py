@@ -5,8 +5,6 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import MOST_BURST, Command, Frame, Scene, Status
 from lyceum_warp.viewer.window.scene import ViewCameras
@@ -103,7 +101,7 @@ class Actions:
 
     def change_speed(self, by: int) -> None:
         """Double or halve the speed."""
-        now = int(np.argmin(np.abs(np.log2(SPEEDS) - np.log2(max(self.status.speed, 1e-3)))))
+        now = SPEEDS.index(self.status.speed)
         self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
 
     def set_ghosts(self, **changes: Any) -> None:

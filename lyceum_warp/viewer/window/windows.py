@@ -142,9 +142,8 @@ class Windows:
             if imgui.Button(label):
                 self._actions.do(command)
             imgui.SetItemTooltip(tip)
-        now = int(np.argmin(np.abs(np.array(SPEEDS) - status.speed)))
         imgui.PushItemWidth(90)
-        chosen = combo("speed", [speed_name(speed) for speed in SPEEDS], now)
+        chosen = combo("speed", [speed_name(speed) for speed in SPEEDS], SPEEDS.index(status.speed))
         imgui.PopItemWidth()
         if chosen is not None:
             self._actions.do(protocol.SetSpeed(SPEEDS[chosen]))

@@ -6,7 +6,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.viewer.session.drivers import PlanView, WorldControl
-from lyceum_warp.viewer.session.traces import TracePoint, TraceRollouts, trace_point
+from lyceum_warp.viewer.session.traces import TraceRollouts, trace_point
 
 ARM = """<mujoco><worldbody><body name="base"><body name="upper"><joint name="a" axis="0 1 0"/><geom size=".1"/>
 <body name="hand" pos="0 0 1"><joint name="b" axis="0 1 0"/><geom size=".1"/>{site}</body></body></body>
@@ -26,15 +26,15 @@ def test_default_trace_point_is_the_centre_of_mass_or_the_end_of_an_arm(
 ) -> None:
     model = shared_env(task).model
     index = (model.site if field == "site_xpos" else model.body)(name).id
-    assert trace_point(model) == TracePoint(field, index)
+    assert trace_point(model) == (field, index)
 
 
 def test_trace_point_may_be_a_site_a_body_or_the_choice_of_the_task() -> None:
     model = mujoco.MjModel.from_xml_string(ARM.format(site='<site name="tip" pos="0 0 1"/>'))
-    assert trace_point(model) == TracePoint("site_xpos", 0)
+    assert trace_point(model) == ("site_xpos", 0)
     bare = mujoco.MjModel.from_xml_string(ARM.format(site=""))
-    assert trace_point(bare) == TracePoint("xipos", bare.body("hand").id)
-    assert trace_point(model, "ball") == TracePoint("xpos", model.body("ball").id)
+    assert trace_point(bare) == ("xipos", bare.body("hand").id)
+    assert trace_point(model, "ball") == ("xpos", model.body("ball").id)
     with pytest.raises(ValueError, match="no site and no body 'nose' to trace: it has tip, base, upper, hand, ball"):
         trace_point(model, "nose")
 
