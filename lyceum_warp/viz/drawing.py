@@ -63,7 +63,7 @@ class DrawingProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._errors: Any = None
         self._lock = threading.Lock()  # other threads may call `abandon`
-        self._abandoned = False
+        self._abandoned = self._drawn = False
 
     def __enter__(self) -> Self:
         failures: list[str] = []
@@ -90,6 +90,7 @@ class DrawingProcess:
 
     def draw(self, shot: Shot) -> None:
         """Draw a shot."""
+        self._drawn = True
         if not self._send(shot) or self._answer() != "frame":
             raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
 
@@ -188,23 +189,15 @@ class Drawing(DrawingProcess):
         if fps is not None and (self.out.suffix.lower() != ".mp4" or self.out.is_dir()):
             raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
         check_video()
-        self._frames = 0
-
-    def draw(self, shot: Shot) -> None:
-        """Draw a shot, and add it to the video."""
-        super().draw(shot)
-        self._frames += 1
 
     def finish(self) -> Path:
         """Complete the video or the picture, and move it to its path."""
-        if not self._frames:
+        if not self._drawn:
             raise NoVideoError(f"{self.product} {self.out} has no frame: nothing is written")
         self._send(None)
         code, reason = self._ended()
         if code:
             raise NoVideoError(f"{self.product} could not be written ({reason})")
-        if self._abandoned:
-            raise NoVideoError(f"{self.product} {self.out} was cancelled")
         self.out.parent.mkdir(parents=True, exist_ok=True)
         with replaced(self.out) as temporary:
             if self._job["fps"] is None:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.planner import Planner
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.env import Env
@@ -167,13 +168,11 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
         return None
     actions = plan.detach().to("cpu", torch.float32, copy=True)
     samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
-    sampled, returns = getattr(controller, "sampled", None), getattr(controller, "returns", None)
-    if isinstance(sampled, torch.Tensor) and isinstance(returns, torch.Tensor) and sampled.shape[1] == len(returns):
+    if isinstance(controller, Planner):
         # samples are drawn independently, so the first ones represent all of them
-        shown = torch.arange(min(MOST_SAMPLES, len(returns)), device=returns.device)
-        shown[0] = returns.argmax()
-        samples = sampled.index_select(1, shown).to("cpu", torch.float32)
-        best = 0
+        shown = torch.arange(min(MOST_SAMPLES, controller.samples), device=plan.device)
+        shown[0] = controller.returns.argmax()
+        samples, best = controller.sampled.index_select(1, shown).to("cpu", torch.float32), 0
     return PlanView(state.detach().to("cpu", torch.float64, copy=True).view(-1), actions, samples, best)
 
 

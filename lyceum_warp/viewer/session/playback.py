@@ -42,37 +42,33 @@ def reasons(bits: int) -> str:
 
 def episodes_of(given: Any, env: Env) -> list[Episode]:
     """Load the episodes to play back."""
-    if isinstance(given, Mapping):
-        return [_episode(name, each, env) for name, each in given.items()]
     if isinstance(given, str | Path | Trajectory | torch.Tensor):
         given = [given]
+    if isinstance(given, Mapping):
+        return [_episode(name, each, env) for name, each in given.items()]
     if not isinstance(given, Sequence):
         raise ValueError(f"episodes must be trajectories, their files or tensors of states, not {described(given)}")
-    return [_episode(None, each, env, i) for i, each in enumerate(given)]
+    names = [Path(each).name if isinstance(each, str | Path) else f"episode {i}" for i, each in enumerate(given)]
+    return [_episode(name, each, env) for name, each in zip(names, given, strict=True)]
 
 
-def _episode(name: str | None, given: Any, env: Env, number: int = 0) -> Episode:
+def _episode(name: str, given: Any, env: Env) -> Episode:
     if isinstance(given, str | Path):
-        return _of_trajectory(name or Path(given).name, Trajectory.load(given), env)
+        given = Trajectory.load(given)
     if isinstance(given, Trajectory):
-        return _of_trajectory(name or f"episode {number}", given, env)
+        check_episode(env, given, name)
+        rewards, evals = (values.double().numpy() for values in (given.rewards, given.evals))
+        end = "success" if given.steps and given.succeeded else reasons(given.done_reason)
+        return Episode(name, given.states.numpy(), rewards, evals, end)
     size = env.state_space.size
     if not isinstance(given, torch.Tensor) or given.ndim != 2 or given.shape[1] != size or not len(given):
         raise ValueError(
             f"an episode of {env.task.name!r} must be a Trajectory, a file of a Trajectory, or states of shape (steps, "
-            f"{size}) "
-            f"as env.get_state() returns them, not {described(given)}"
+            f"{size}) as env.get_state() returns them, not {described(given)}"
         )
     unknown = np.full(len(given) - 1, np.nan)
     states = given.detach().to("cpu", torch.float64).numpy().copy()
-    return Episode(name or f"episode {number}", states, unknown, unknown)
-
-
-def _of_trajectory(name: str, trajectory: Trajectory, env: Env) -> Episode:
-    check_episode(env, trajectory, name)
-    rewards, evals = (values.double().numpy() for values in (trajectory.rewards, trajectory.evals))
-    end = "success" if trajectory.steps and trajectory.succeeded else reasons(trajectory.done_reason)
-    return Episode(name, trajectory.states.numpy(), rewards, evals, end)
+    return Episode(name, states, unknown, unknown)
 
 
 class Playback:

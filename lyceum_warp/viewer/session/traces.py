@@ -15,6 +15,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.algos.planner import Planner
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
@@ -84,10 +85,9 @@ class TraceRollouts:
     """Rolls out plans and some of their samples in a few worlds."""
 
     def __init__(self, controller: Any, plant: Env) -> None:
-        own = getattr(controller, "env", None)
-        env = own if isinstance(own, Env) else plant
+        env = controller.env if isinstance(controller, Planner) else plant
         field, self._index = trace_point(env.task.model, env.task.task.trace)
-        self._nominal = bool(getattr(getattr(controller, "config", None), "nominal_model", False))
+        self._nominal = isinstance(controller, Planner) and controller.config.nominal_model
         fields = tuple(dict.fromkeys((*env.options.fields, field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
         self.env = env.replicate_few(MOST_SAMPLES + 1, autoreset=False, fields=fields, **threads)

@@ -28,8 +28,8 @@ _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 class VideoTaker:
     """Records one video at a time. Earlier videos and pictures may still be drawn in the background."""
 
-    def __init__(self, model: mujoco.MjModel, title: str, folder: Path | None = None) -> None:
-        self._model, self._title, self._folder = model, title, folder or Path()
+    def __init__(self, model: mujoco.MjModel, title: str) -> None:
+        self._model, self._title = model, title
         self._running: Recorder | None = None
         self._drawing: list[Recorder] = []
         self._start = 0.0
@@ -65,7 +65,7 @@ class VideoTaker:
 
     def _file(self, ending: str) -> Path:
         title = re.sub(r"[^\w.-]+", "-", self._title, flags=re.ASCII)  # the title may be a task's path
-        return self._folder / f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}"
+        return Path(f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}")
 
     def add(self, frame: Frame) -> None:
         """Add a frame as often as needed for the video to reach the present time."""

@@ -11,7 +11,6 @@ import threading
 from collections import deque
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
@@ -124,12 +123,6 @@ class Window:
             thread.join(CLOSING_TIME)
         self._connection.close()
         self._log.close()
-
-    def __enter__(self) -> "Window":
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        self.close()
 
     def _end(self) -> None:
         with self._changed:

@@ -52,7 +52,9 @@ class Actions:
         if io.WantCaptureKeyboard:
             return
         for key in self._keys:
-            if key.ctrl == io.KeyCtrl and key.shift == io.KeyShift and imgui.IsKeyPressed(key.code, key.repeat):
+            *held, name = key.name.split("+")
+            code = getattr(imgui.Key, KEY_NAMES.get(name, name))
+            if [io.KeyCtrl, io.KeyShift] == ["Ctrl" in held, "Shift" in held] and imgui.IsKeyPressed(code, key.repeat):
                 key.action(self)
                 return
         if self.status.driven and any(map(imgui.IsKeyDown, _DRIVING)):
@@ -129,22 +131,6 @@ class Key:
     what: str
     action: Callable[["Actions"], None]
     repeat: bool = False
-
-    @property
-    def code(self) -> Any:
-        """The key's code in studio, without Ctrl and Shift."""
-        last = self.name.rpartition("+")[2]
-        return getattr(imgui.Key, KEY_NAMES.get(last, last))
-
-    @property
-    def ctrl(self) -> bool:
-        """Whether the action needs Ctrl."""
-        return "Ctrl+" in self.name
-
-    @property
-    def shift(self) -> bool:
-        """Whether the action needs Shift."""
-        return "Shift+" in self.name
 
 
 def key_table() -> list[Key]:

@@ -1,7 +1,9 @@
+import contextlib
 import os
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -55,9 +57,10 @@ def frame(shared_env: SharedEnv) -> Frame:
 
 
 @pytest.fixture
-def taker(shared_env: SharedEnv, tmp_path: Path) -> VideoTaker:
+def taker(shared_env: SharedEnv, tmp_path: Path) -> Iterator[VideoTaker]:
     pytest.importorskip("imageio_ffmpeg")
-    return VideoTaker(shared_env("hopper").task.model, "runs/one two", tmp_path)
+    with contextlib.chdir(tmp_path):
+        yield VideoTaker(shared_env("hopper").task.model, "runs/one two")
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,7 +95,7 @@ def test_an_interrupted_viewer_completes_its_video(
         monkeypatch.undo()
         raise Interrupted(signal.SIGINT)
     (video,), (page,) = tmp_path.glob("runs-one-two-*.mp4"), tmp_path.glob("runs-one-two-*.html")
-    assert lines == [f"page: {page}", f"video: {video}"]
+    assert lines == [f"page: {page.name}", f"video: {video.name}"]
 
 
 def test_a_second_signal_discards_the_videos(
@@ -106,4 +109,4 @@ def test_a_second_signal_discards_the_videos(
         signal.raise_signal(signal.SIGTERM)
     assert 0 < time.monotonic() - begin < 6
     (page,) = tmp_path.iterdir()
-    assert lines[0] == f"page: {page}" and "was cancelled" in lines[1]
+    assert lines[0] == f"page: {page.name}" and "was cancelled" in lines[1]

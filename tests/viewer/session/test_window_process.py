@@ -27,7 +27,7 @@ DATA = mujoco.MjData(MODEL)
 
 @pytest.fixture(scope="module")
 def shared_window() -> Iterator[Window]:
-    with Window(scene_of(MODEL)) as window:
+    with contextlib.closing(Window(scene_of(MODEL))) as window:
         yield window
 
 
@@ -123,7 +123,7 @@ def test_points_and_messages_of_skipped_frames_are_merged_up_to_a_limit() -> Non
 def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.CaptureFixture[str]) -> None:
     threads, descriptors = threading.active_count(), None
     for _ in range(2):
-        with Window(scene_of(MODEL)) as window:
+        with contextlib.closing(Window(scene_of(MODEL))) as window:
             pid = process_of(window)
             assert page(window)
         window.close()
@@ -137,7 +137,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
 
 def test_frames_for_a_process_that_hangs_do_not_block_and_its_end_is_reported() -> None:
     """The sending thread notices first that the process has ended."""
-    with Window(scene_of(MODEL)) as window:
+    with contextlib.closing(Window(scene_of(MODEL))) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))
         for _ in range(5):  # fills the pipe
