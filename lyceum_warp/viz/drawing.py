@@ -156,22 +156,19 @@ class DrawingProcess:
     def _stop(self) -> None:
         with self._lock:
             process, self._process = self._process, None
-        if process is None:
-            self._ends.close()
-        else:
+        with self._ends:
+            if process is None:
+                return
             assert process.stdin is not None and process.stdout is not None
             with contextlib.suppress(OSError):
                 process.stdin.close()  # the subprocess ends at EOF
             try:
-                process.wait(_PATIENCE)
-            except BaseException as error:
-                _kill(process)
-                process.wait()
-                if not isinstance(error, subprocess.TimeoutExpired):
-                    raise
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(_PATIENCE)
             finally:
+                _kill(process)  # no effect on a process that has ended
+                process.wait()
                 process.stdout.close()
-                self._ends.close()
 
 
 class Drawing(DrawingProcess):

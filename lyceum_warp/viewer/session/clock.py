@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.episode_collector import ControlProgress
+from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import (
     Close,
@@ -26,7 +27,7 @@ from lyceum_warp.viewer.protocol import (
 )
 from lyceum_warp.viewer.session.commands import obey
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
-from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, run_plant
+from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, WorkingClock
 from lyceum_warp.viewer.session.stage import Stage
 from lyceum_warp.viewer.session.window_process import Window
 from lyceum_warp.viz import NoVideoError
@@ -37,6 +38,8 @@ _LAG = 0.25
 """Seconds of delay that the worlds catch up; longer delays are ignored."""
 _CHECK = 0.5
 """Seconds between two calls of the watchers."""
+_PART = 10_000
+"""Maximum number of steps of one control loop, which stores all its states."""
 
 Watcher = Callable[[], Sequence[str]]
 """Returns new messages."""
@@ -141,11 +144,21 @@ class Session:
         stage, control = self.stage, self.stage.control
         assert isinstance(control, WorldControl)
         stage.begin_due_episode()
+        live = stage.live
+        live.expect_steps()
         self._in_run = True
         try:
-            run_plant(stage.live, control, speed=stage.speed, work=self._work, on_step=self._stepped)
+            control_async(
+                live.env, control.new_run(), period=live.env.timestep / stage.speed, steps=_PART, reset=False,
+                on_step=self._stepped, clock=WorkingClock(self._work, control),
+            )  # fmt: skip
+        except InterruptedByCommand:
+            pass
+        except ValueError as error:  # from invalid actions
+            raise ControllerError(control.name, error) from error
         finally:
             self._in_run = False
+            control.new_run()  # calls from this control loop now fail
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:

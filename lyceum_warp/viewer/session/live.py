@@ -256,10 +256,6 @@ class Live:
             states[world, self.env.state_space.parts["xfrc_applied"]] = 0.0
             self._restore(states, world)
 
-    def row(self) -> torch.Tensor:
-        """Return the state of the displayed world, (state_space.size,) float64, on the world's device."""
-        return self.env.get_state()[self.world]
-
     def write(self, **parts: np.ndarray) -> None:
         """Change parts of the displayed world's state by their names in ``env.state_space``."""
         states = self.env.get_state()

@@ -4,17 +4,15 @@ import threading
 import time
 from collections.abc import Callable
 
-from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.real_time import Clock, control_async
+from lyceum_warp.controllers.real_time import Clock
 from lyceum_warp.engines.placement import options_for_plant
-from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
+from lyceum_warp.viewer.session.drivers import WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 
 POLL = 0.005
 """Seconds between two polls of the window's commands."""
 
 _RESERVE = 0.0015  # seconds before a step in which no other work may start
-_PART = 10_000  # maximum steps of one control loop, which stores all its states
 _WARM_UP = 3  # the first calls may capture CUDA graphs, so no other work runs during them
 
 
@@ -35,44 +33,14 @@ def make_plant(main: Live) -> Live:
     return plant
 
 
-def run_plant(
-    live: Live,
-    control: WorldControl,
-    *,
-    speed: float,
-    work: Callable[[], None],
-    on_step: Callable[[ControlProgress], None],
-) -> None:
-    """Run the plant in real time until its episode ends.
-
-    Args:
-        live: The plant.
-        control: The plant's controller.
-        speed: Simulated seconds per second.
-        work: Called while the plant waits for its next step. It may raise ``InterruptedByCommand`` to stop the plant.
-        on_step: Called after each step.
-    """
-    live.expect_steps()
-    try:
-        control_async(
-            live.env, control.new_run(), period=live.env.timestep / speed, steps=_PART, reset=False, on_step=on_step,
-            clock=_WorkingClock(work, warm=control.calls >= _WARM_UP),
-        )  # fmt: skip
-    except InterruptedByCommand:
-        pass
-    except ValueError as error:  # from invalid actions
-        raise ControllerError(control.name, error) from error
-    finally:
-        control.new_run()  # calls from this control loop now fail
-
-
-class _WorkingClock(Clock):
+class WorkingClock(Clock):
     """A wall clock that calls ``work`` while it waits."""
 
-    def __init__(self, work: Callable[[], None], *, warm: bool) -> None:
-        self._work, self._warm = work, warm
+    def __init__(self, work: Callable[[], None], control: WorldControl) -> None:
+        self._work, self._warm = work, control.calls >= _WARM_UP
 
     def wait_until(self, moment: float) -> None:
+        """Call ``work`` until shortly before a given moment, and then wait as usual."""
         end = moment - _RESERVE
         while (now := time.perf_counter()) < end:
             self._work()
@@ -82,6 +50,7 @@ class _WorkingClock(Clock):
         super().wait_until(moment)
 
     def wait_for(self, event: threading.Event) -> None:
+        """Call ``work`` until an event is set, unless the controller is still capturing graphs."""
         if not self._warm:
             event.wait()
         while not event.wait(POLL):

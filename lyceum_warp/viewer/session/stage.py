@@ -220,7 +220,7 @@ class Stage:
         live.set_row(state, new_episode=new_episode)
 
     def _transfer(self, before: Live, after: Live) -> None:
-        self.go_on_from(before.row(), after)
+        self.go_on_from(before.env.get_state()[before.world], after)
         if before.pushed == before.world:
             after.pushed = after.world
         after.returns[after.world] = before.returns[before.world].item()

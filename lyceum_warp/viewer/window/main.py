@@ -18,11 +18,6 @@ from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.proxy import Proxy
 from lyceum_warp.viewer.window.sockets import private_socket
 
-NICE = 5
-"""A low priority, because the session's planner may need every core."""
-END_TIME = 3.0
-"""Maximum seconds until studio ends."""
-
 
 class WindowEnd:
     """The window's end of the connection to the session.
@@ -62,7 +57,7 @@ class WindowEnd:
 def main(descriptor: int) -> None:
     """Draw until the session or the user ends the window. ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
-    os.nice(NICE)
+    os.nice(5)  # the session's planner may need every core
     connection = Connection(descriptor)
     end = WindowEnd(connection)
     try:
@@ -83,9 +78,8 @@ def run(opening: Opening, end: WindowEnd) -> None:
             return end.send(Failed(str(error), refused=True))
         sock = private_socket()
         model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
-        model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] = (
-            0.0  # studio draws planes of size 0 as infinite
-        )
+        planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        model.geom_size[planes, :2] = 0.0  # studio draws planes of size 0 as infinite
         screen = studio.Screen()
         opened = Opened(proxy.address, tuple(proxy.instructions))
         panel = Panel(opening.scene, model, end.send, end.take, screen, opened, proxy.offer)
@@ -93,8 +87,8 @@ def run(opening: Opening, end: WindowEnd) -> None:
         def follow() -> None:
             end.receive()
             screen.close()
-            time.sleep(END_TIME)
-            os._exit(1)
+            time.sleep(3.0)
+            os._exit(1)  # studio did not end
 
         threading.Thread(target=follow, daemon=True).start()
         screen.show_model(model)
