@@ -21,12 +21,10 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 @pytest.mark.quick("two episodes", "async")
-@pytest.mark.parametrize("case", ["one episode", "two episodes", "async", "one step"])
+@pytest.mark.parametrize("case", ["two episodes", "async", "one step"])
 def test_episodes_are_plotted_as_png(case: str, episode: Trajectory, env: lw.Env, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     match case:
-        case "one episode":
-            episodes = [episode]
         case "two episodes":
             episodes = [episode, control(env, towards, seed=8)]
         case "async":

@@ -11,7 +11,7 @@ from toy_controllers import towards
 
 import lyceum_warp as lw
 from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command, Frame
+from lyceum_warp.viewer.protocol import Command
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viz import drawing
 
@@ -47,17 +47,6 @@ def test_view_on_a_busy_port_leaves_no_thread(shared_env: SharedEnv) -> None:
         with pytest.raises(ValueError, match="port"):
             lw.view(env, controllers={"mppi": mppi}, port=busy.getsockname()[1])
     assert [thread.name for thread in threading.enumerate() if thread not in before] == []
-
-
-def test_window_is_closed_after_an_exception(shared_env: SharedEnv) -> None:
-    class Broken(MemoryWindow):
-        def show(self, frame: Frame) -> None:
-            raise KeyboardInterrupt
-
-    window = Broken(lambda frame, number: [])
-    with pytest.raises(KeyboardInterrupt):
-        Session(shared_env("point_mass", autoreset=False), controllers={"own": towards}).run(window)
-    assert window.closed == 1
 
 
 @pytest.mark.parametrize("controllers", [{}, {"own": towards}])

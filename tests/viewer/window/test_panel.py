@@ -5,6 +5,7 @@ from headless_screen import Bench, frame_of, robot, scene_of, state_of, status_o
 
 from lyceum_warp.viewer import protocol
 from lyceum_warp.viewer.protocol import Ghost, Opened, SetVideo
+from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.actions import key_table
 from lyceum_warp.viewer.window.studio import imgui
 from lyceum_warp.viewer.window.windows import WINDOWS
@@ -41,7 +42,9 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
         samples=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == bench.draw() == []  # draw before, during and after the first frame
+    assert bench.draw() == bench.draw(frame) == []  # draw before and with the first frame
+    bench.panel.actions.cameras.choose(studio.ux.FREE_CAMERA_IDX)
+    assert bench.draw() == []
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))
     small.panel.actions.windows |= set(WINDOWS)
     assert small.draw(frame_of(small.model, small.data, status_of(controller=None, world=0))) == []
