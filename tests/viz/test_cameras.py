@@ -2,7 +2,6 @@ import mujoco
 import numpy as np
 import pytest
 
-import lyceum_warp as lw
 from lyceum_warp.viz.cameras import FreeCamera, camera_values, find_camera, parsed_camera
 
 MODEL = """
@@ -22,18 +21,18 @@ def model() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(MODEL)
 
 
-@pytest.mark.parametrize("task", ["half_cheetah", "hopper", "reach", "point_mass"])
-def test_default_camera_is_the_first_camera_of_the_model(task: str) -> None:
-    found = find_camera(lw.make(task).model)
-    assert (found.type, found.fixedcamid) == (mujoco.mjtCamera.mjCAMERA_FIXED, 0)
-
-
-def test_default_camera_of_a_model_without_cameras_follows_the_first_body() -> None:
-    text = "<mujoco><worldbody><body><freejoint/><geom size='1'/></body></worldbody></mujoco>"
+@pytest.mark.parametrize("cameras, fixed, tracked", [
+    ("<camera/><camera mode='trackcom'/>", 1, -1), ("<camera/>", -1, 1), ("", -1, 1),
+])  # fmt: skip
+def test_default_camera_tracks_or_else_is_fixed_or_else_follows_the_first_body(
+    model: mujoco.MjModel, cameras: str, fixed: int, tracked: int
+) -> None:
+    text = f"<mujoco><worldbody><body><freejoint/><geom size='1'/>{cameras}</body></worldbody></mujoco>"
     found = find_camera(mujoco.MjModel.from_xml_string(text))
-    assert (found.type, found.trackbodyid) == (mujoco.mjtCamera.mjCAMERA_TRACKING, 1)
-    empty = find_camera(mujoco.MjModel.from_xml_string("<mujoco/>"))
-    assert empty.type == mujoco.mjtCamera.mjCAMERA_FREE
+    kind = mujoco.mjtCamera.mjCAMERA_FIXED if fixed >= 0 else mujoco.mjtCamera.mjCAMERA_TRACKING
+    assert (found.type, found.fixedcamid, found.trackbodyid) == (kind, fixed, tracked)
+    assert find_camera(model).fixedcamid == 0
+    assert find_camera(mujoco.MjModel.from_xml_string("<mujoco/>")).type == mujoco.mjtCamera.mjCAMERA_FREE
 
 
 @pytest.mark.parametrize("camera, index", [("corner", 0), (1, 1), (np.int64(2), 2), ("0", 0), ("1", 2)])

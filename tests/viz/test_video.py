@@ -1,3 +1,4 @@
+import json
 import os
 import signal
 import subprocess
@@ -10,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-import video_frames
 from headless_screen import state_of
 from varied_task import Varied, ball
 
@@ -20,6 +20,28 @@ from lyceum_warp.viz.cameras import FreeCamera, camera_values
 from lyceum_warp.viz.render import Shot
 
 SMALL = (96, 64)
+
+# in a subprocess, because imageio forks, and this process may be too large for a fork
+READ = """
+import json, sys
+import imageio.v2 as imageio
+with imageio.get_reader(sys.argv[1]) as reader:
+    frames = list(reader.iter_data())
+    result = {"fps": reader.get_meta_data()["fps"], "shape": frames[0].shape, "frames": len(frames)}
+    result["brightest"] = [int(frame.max()) for frame in frames]
+    result["red"] = [int((frame[..., 0] > frame[..., 1].astype(int) + 60).sum()) for frame in frames]
+    result["columns"] = [
+        float((frame[..., 0] > frame[..., 1].astype(int) + 60).nonzero()[1].mean()) if red else None
+        for frame, red in zip(frames, result["red"])
+    ]
+    print(json.dumps(result))
+"""
+
+
+def frames_of(path: Path) -> dict[str, Any]:
+    """Return a video's rate, shape and number of frames, and each frame's brightest and red pixels."""
+    done = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True)
+    return dict(json.loads(done.stdout))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +75,7 @@ def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) 
     video.write_video(env, states, out, size=(160, 120), progress=lambda *counts: frames.append(counts))
     assert frames == [(i, len(states)) for i in range(1, len(states) + 1)]
     assert [file.name for file in out.parent.iterdir()] == ["video.mp4"]
-    result = video_frames.read(out)
+    result = frames_of(out)
     assert result["fps"] == pytest.approx(1 / env.timestep)
     assert result["frames"] == len(states) and result["shape"] == [120, 160, 3]
     assert min(result["brightest"]) > 100  # the scene has light
@@ -67,7 +89,7 @@ def test_video_shows_the_model_fields_of_its_states(tmp_path: Path) -> None:
     sizes = states[:, parts["geom_size"]][:, 0]
     assert sizes.unique().numel() == 2
     path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), speed=0.01)
-    areas = np.array(video_frames.read(path)["red"], dtype=float)  # a fixed camera shows the red ball
+    areas = np.array(frames_of(path)["red"], dtype=float)  # a fixed camera shows the red ball
     assert len(areas) == len(states) and areas.min() > 0
     ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
     assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
@@ -141,7 +163,7 @@ def test_video_of_single_shots_shows_fields_transparent_copies_and_lines(model: 
     ):  # fmt: skip
         mp4.add(each)
     assert mp4.added == 6 and not mp4.finished  # adding a shot does not wait for the render process
-    result = video_frames.read(mp4.close())
+    result = frames_of(mp4.close())
     assert (result["frames"], result["fps"], result["shape"]) == (6, 25, [64, 96, 3])
     plain, shrunk, again, _, ghost, line = result["red"]
     assert shrunk < 0.3 * plain and again == pytest.approx(plain, rel=0.05)
@@ -155,7 +177,7 @@ def test_slow_rendering_drops_shots_but_keeps_the_video_length(model: mujoco.MjM
     for i in range(10):
         mp4.add(shot(0.1 * i))
     assert mp4.added == 10 and mp4.dropped in (7, 8)  # the render process may already have taken a shot
-    result = video_frames.read(mp4.close())
+    result = frames_of(mp4.close())
     assert result["frames"] == 10
     columns = result["columns"]
     assert columns[1] > columns[0] + 0.5 and columns[-1] == pytest.approx(columns[-2], abs=0.3)
