@@ -97,13 +97,8 @@ class WorldControl:
         return self._busy.locked()
 
     def reset(self) -> None:
-        """Reset the controller now, or after the call that is in progress."""
+        """Reset the controller before its next call."""
         self._reset_due = True
-        if self._busy.acquire(blocking=False):
-            try:
-                self._reset_now()
-            finally:
-                self._busy.release()
 
     def call(self, run: int, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
         """Call the controller.
@@ -114,12 +109,14 @@ class WorldControl:
         with self._busy:  # an interrupted control loop may still be in a call
             if run != self._run:
                 raise ControllerError(self.name, RuntimeError("its control loop has ended"))
-            self._reset_now()
             if (hidden := self.hidden) is not None:
                 state = state.clone()
                 state[..., hidden] = 0.0
-            begun = time.perf_counter()
+            due, self._reset_due = self._reset_due, False
             try:
+                if due and callable(reset := getattr(self.controller, "reset", None)):
+                    reset(None)
+                begun = time.perf_counter()
                 action = self.controller(state, obs, **words)
             except Exception as error:
                 raise ControllerError(self.name, error) from error
@@ -129,14 +126,6 @@ class WorldControl:
                 self._wanted = False
                 self._seen = plan_view(self.controller, state)
         return action
-
-    def _reset_now(self) -> None:
-        due, self._reset_due = self._reset_due, False
-        if due and callable(reset := getattr(self.controller, "reset", None)):
-            try:
-                reset(None)
-            except Exception as error:
-                raise ControllerError(self.name, error) from error
 
     def look(self) -> PlanView | None:
         """Return the plan that was copied since the last call, and request a copy of the next plan."""

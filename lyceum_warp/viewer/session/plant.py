@@ -1,4 +1,4 @@
-"""Run a controller of one world in real time, in a copy of the displayed world."""
+"""Make the plant, a copy of the displayed world, and the clock of its control loop."""
 
 import threading
 import time

@@ -104,7 +104,11 @@ class TraceRollouts:
     def __call__(self, view: PlanView) -> Traces:
         """Roll out a plan."""
         env, count = self.env, view.samples.shape[1]
-        self._put(view.state)
+        self._states.copy_(view.state)
+        if self._nominal:
+            nominal: dict[str, wp.array] = env.engine.nominal
+            for name, row in nominal.items():
+                self._states[:, env.state_space.parts[name]] = torch_view(flat(row))[0].double()
         actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # worlds without a sample follow the plan
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
@@ -122,13 +126,6 @@ class TraceRollouts:
         self.env.action.copy_(action)
         for call in self._transition:
             call()
-
-    def _put(self, state: torch.Tensor) -> None:
-        self._states.copy_(state)
-        if self._nominal:
-            nominal: dict[str, wp.array] = self.env.engine.nominal
-            for name, row in nominal.items():
-                self._states[:, self.env.state_space.parts[name]] = torch_view(flat(row))[0].double()
 
 
 class TraceThread:

@@ -176,15 +176,10 @@ class ViewCameras:
         modes = (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
         tracking = np.isin(model.cam_mode, [int(mode) for mode in modes])
         if tracking.any():
-            self.track(int(model.cam_bodyid[tracking.argmax()]))
-            self.viewer.camera.elevation = -20
-
-    def track(self, body: int) -> None:
-        """Follow a body."""
-        self.choose(ux.TRACKING_CAMERA_IDX)
-        self.viewer.camera.type = int(mujoco.mjtCamera.mjCAMERA_TRACKING)
-        self.viewer.camera.trackbodyid = body
-        self.viewer.camera.fixedcamid = -1
+            self.choose(ux.TRACKING_CAMERA_IDX)
+            camera = self.viewer.camera
+            camera.type, camera.fixedcamid = int(mujoco.mjtCamera.mjCAMERA_TRACKING), -1
+            camera.trackbodyid, camera.elevation = int(model.cam_bodyid[tracking.argmax()]), -20
 
     def view(self) -> dict[str, Any]:
         """The attributes of the camera."""
