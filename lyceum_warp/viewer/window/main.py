@@ -39,8 +39,8 @@ class WindowEnd:
 
     def take(self) -> Frame | None:
         """Return the latest frame, or None if it was already returned."""
-        frame, self._frame = self._frame, None
-        if frame is not None:
+        if (frame := self._frame) is not None:
+            self._frame = None  # no other frame arrives before this one is acknowledged
             self.send(Taken())
         return frame
 
