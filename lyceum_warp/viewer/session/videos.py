@@ -82,6 +82,8 @@ class VideoTaker:
         self._running = None
         video.end()
         self._drawing.append(video)
+        if not self._states:
+            return
         page = video.out.with_suffix(".html")
         try:
             write_states(self._model, self._states, page, dt=1 / FPS, title=self._title, camera=self._camera)
