@@ -18,11 +18,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from PIL import Image
 from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
-from rail_task import Rail, RailParams, observe_rail
 
 import lyceum_warp as lw
+from lyceum_warp import Row
 from lyceum_warp.viewer.protocol import Command, Frame, Perturb, Reset, Seek, SetBackwards, SetMode, SetPaused, Status
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.window_process import Window
@@ -65,13 +66,28 @@ MODEL = """
 """
 
 
+@wp.struct
+class BlockWorld:
+    qpos: Row[float]
+
+
+@wp.struct
+class BlockParams:
+    dt: float  # a further parameter would add a line to the panel, and move what the tests click
+
+
+@wp.func
+def observe_block(s: BlockWorld, p: BlockParams, obs: Row[float]):
+    obs[0] = s.qpos[0]
+
+
 class Block(lw.Task):
     """A red block on a rail, which a browser without a GPU renders quickly."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(MODEL))
-    obs = {"x": 1, "v": 1}
+    obs = {"x": 1}
     horizon = 100_000
-    World, Params, observe = Rail, RailParams, observe_rail
+    World, Params, observe = BlockWorld, BlockParams, observe_block
 
 
 class WatchedWindow(Window):
