@@ -36,6 +36,8 @@ _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
 """Seconds of delay that the worlds catch up; longer delays are ignored."""
+_IDLE = 0.5
+"""Seconds between two frames of a paused view without commands."""
 _CHECK = 0.5
 """Seconds between two calls of the watchers."""
 _PART = 10_000
@@ -65,7 +67,7 @@ class Session:
         self._window: Window | None = None
         self._closed = self._in_run = False
         self._waiting: deque[Command] = deque()
-        self._next_step = self._next_frame = self._next_check = self._last_work = 0.0
+        self._next_step = self._next_frame = self._next_check = self._last_frame = self._last_work = 0.0
 
     # the loop
 
@@ -129,7 +131,8 @@ class Session:
         stage, videos = self.stage, self.stage.videos
         if now < self._next_frame or not (videos.due or self._window.wants_frame):
             return
-        self._next_frame = max(self._next_frame + 1 / _FPS, now)
+        self._next_frame = now + _IDLE if stage.paused and not videos.due else max(self._next_frame + 1 / _FPS, now)
+        self._last_frame = now
         frame = stage.frame()
         self._window.show(frame)
         videos.add(frame)
@@ -185,6 +188,7 @@ class Session:
             self._waiting.appendleft(command)
             raise InterruptedByCommand
         stage = self.stage
+        self._next_frame = min(self._next_frame, self._last_frame + 1 / _FPS)
         if isinstance(command, Close):
             self._closed = True
         if isinstance(command, SetMode | SetNumber) and not self._calls_have_ended():
