@@ -38,7 +38,7 @@ class ModelFile:
     """Path of the file in the models' folder."""
     source: str
     """The name of a package for pip, or "MuJoCo Menagerie"."""
-    place: Callable[[], tuple[Path, str]]
+    place: Callable[[], tuple[Path, str]] = dataclasses.field(compare=False)
     """Find a folder with the models, and the file's path in it."""
     install: str = ""
     """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""

@@ -106,6 +106,7 @@ def control_async(
     """
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     check_flag("predict", predict)
+    check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     period = positive_number("period", env.timestep if period is None else period, "seconds")
     if period > threading.TIMEOUT_MAX:
         raise ValueError(f"period must be at most {threading.TIMEOUT_MAX:g} seconds, not {period!r}")

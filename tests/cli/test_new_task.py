@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from arbitrary_models import ARM, BALL, MODEL_CHECKS, MOVING, PLUGINS, SENSING, actuated, text
+from arbitrary_models import ARM, BALL, MODEL_CHECKS, MODELS, PLUGINS, actuated, text
 from training_runs import refused
 
 import lyceum_warp as lw
@@ -76,8 +76,7 @@ def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
     assert env.reward.tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values(), *PLUGINS.values()],
-                         ids=[*MOVING, *SENSING, *PLUGINS])  # fmt: skip
+@pytest.mark.parametrize("model", [*MODELS.values(), *PLUGINS.values()], ids=[*MODELS, *PLUGINS])
 def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
@@ -89,7 +88,7 @@ def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, fold
 
 @pytest.mark.long
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("model", [*MOVING.values(), *SENSING.values()], ids=[*MOVING, *SENSING])
+@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_new_task_for_any_model_passes_check_task(model: str, engine: str, folder: Path) -> None:
     file = new("walk", model)
     check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
