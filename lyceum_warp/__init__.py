@@ -1,7 +1,6 @@
 """Batched MuJoCo worlds for robot learning: one task source, two engines, arrays shared with torch.
 
-Importing the package loads neither torch nor Warp nor MuJoCo: each public name of ``__init__.pyi`` loads its module at
-first use (PEP 562).
+Importing the package loads neither torch nor Warp nor MuJoCo. Each public name loads its module at first use (PEP 562).
 """
 
 import ast

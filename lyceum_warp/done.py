@@ -33,7 +33,7 @@ class Done(enum.IntFlag):
     OBSERVATION = 256
     """The observation was not finite."""
     MODEL = 512
-    """MuJoCo cannot simulate a value of a randomized model field, such as a negative mass."""
+    """A randomized model field has a value that MuJoCo cannot simulate, such as a negative mass."""
 
 
 FAULTS = ~(Done.TERMINATED | Done.TRUNCATED)

@@ -189,10 +189,10 @@ class Env:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
             probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            # find writes out of bounds before functions write to the environment's own arrays
+            # a write out of bounds would damage the environment's own arrays
             probe.check_bounds()
             self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # later, invalid values are faults
+            if self.task.dynamics and not _replica:  # after construction, invalid values are faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             probe.check_observations()
             if not _replica:
@@ -357,11 +357,11 @@ class Env:
         return _copied((self if state is None else self._scratch_at(state)).obs_groups[group], out)
 
     def get_eval(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Get the evaluation metric after the last step or of given states, (nworld,)."""
+        """Get the evaluation metric of the last step or of given states, (nworld,)."""
         return _copied(self.eval if state is None else self._scratch_at(state).eval, out)
 
     def get_terminated(self, state: torch.Tensor | None = None, out: torch.Tensor | None = None) -> torch.Tensor:
-        """Get whether the last step terminated the episode or whether given states are terminal, (nworld,) bool."""
+        """Get the terminations of the last step, or whether given states are terminal, (nworld,) bool."""
         return _copied(self.terminated if state is None else self._scratch_at(state).worlds.terminated_view, out)
 
     def get_reward(
@@ -424,8 +424,8 @@ class Env:
 
         Args:
             name: Attribute of MjData or MjModel, for instance "qpos", "site_xpos" or "body_mass".
-            element: A name from the model. For example, a joint for "qpos" or "qvel", a sensor for "sensordata", or a
-                body or site.
+            element: Name of an element of the model, such as a joint for "qpos", a sensor for "sensordata", a body or a
+                site.
 
         Raises:
             ValueError: The environment has no such field, or the model has no element of this name.
@@ -476,7 +476,7 @@ class Env:
     # shared memory
 
     def update_shared(self, total: Callable[[torch.Tensor], object] | None = None) -> None:
-        """Update ``shared`` with the task's ``share``, which reads sums over the transitions since the last update.
+        """Call the task's ``share`` to update ``shared`` from sums over all transitions since the last update.
 
         Observations that depend on ``shared`` are updated. Learners call this method after each rollout. It does not
         wait for the device.
@@ -552,7 +552,7 @@ class Env:
         per world are repeated or cut.
         """
         nworld = self.nworld if nworld is None else nworld
-        # the model's file may have changed
+        # use the loaded model, because its file may have changed
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
@@ -561,7 +561,7 @@ class Env:
         return made
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
-        """Replicate the environment with only a few worlds. engine="auto" becomes the C engine.
+        """Replicate the environment with only a few worlds, with the C engine if ``engine`` is "auto".
 
         On a GPU, a step of a few worlds takes nearly as long as a step of thousands.
         """
@@ -569,7 +569,6 @@ class Env:
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        # prefer names of elements to their indices
         given = {name: value for name, value in self._given_params.items() if name not in known.tables}
         values = {name: (known.values | given)[name] for name in names}
         return values | {name: known.values[name][worlds] for name in names if name in known.per_world}

@@ -104,7 +104,7 @@ _KINDS = {
     "subtree_angmom".split(),
     _Kind.mjOBJ_BODY,
 ) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""Kinds of objects by a field's name or prefix, for fields with one row per object."""
+"""Object types of the fields with one row per object, by the field's name or prefix."""
 
 _QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
 _DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
@@ -147,7 +147,7 @@ class Field:
     lagged: bool
     """Whether the field keeps the value from ``mj_step``, which is one substep older than the state."""
     snapshot: bool
-    """Whether states include the field because the integration state does not determine it."""
+    """Whether states store the field in addition to the integration state, which does not determine it."""
     written: bool = False
     """Whether the task writes the field before a step."""
 
@@ -244,7 +244,7 @@ def _sensed(model: mujoco.MjModel, name: str) -> bool:
 def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
     """Get the rows of a named element in a field of MjData or MjModel.
 
-    A joint, a sensor, an actuator and a flex may have several rows, such as a free joint in ``qpos``.
+    An element may have several rows: a free joint, for example, has seven in ``qpos``.
     """
     if name in ("mocap_pos", "mocap_quat"):
         i = int(model.body_mocapid[_find(model, _Kind.mjOBJ_BODY, element)])
@@ -287,7 +287,7 @@ def _called(kind: mujoco.mjtObj) -> str:
 def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
-        names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)]  # None beyond the last object
+        names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)]
         known = ", ".join(sorted(n for n in names if n)) or "none with names"
         raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
     return index

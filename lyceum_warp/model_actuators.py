@@ -6,7 +6,7 @@ from lyceum_warp.support.validate import positive_number
 
 
 def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
-    """Turn a position servo into an actuator that moves the servo's target at the velocity given by its control.
+    """Turn a position servo into an actuator whose control is the velocity of the servo's target.
 
     The gains do not change. The target becomes an activation of the model (``act``), which stays in the old control
     range.

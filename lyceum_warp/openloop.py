@@ -30,9 +30,9 @@ from lyceum_warp.world_arrays import memory_columns, own_parts
 class OpenLoop:
     """Rolls out an environment's worlds from one or more states under given actions.
 
-    Write ``state`` and ``actions``, call ``run``, and read the other tensors. They are updated in place. Episodes
-    continue after a termination, up to the horizon. The C engine simulates the whole horizon in one native call if the
-    results are exactly the same. Tasks with ``control`` or ``substep`` are simulated step by step.
+    Write ``state`` and ``actions``, call ``run``, and read the other tensors. ``run`` updates them in place. Episodes
+    continue after a termination, up to the horizon. The C engine simulates the whole horizon in one native call if this
+    does not change the results. Tasks with ``control`` or ``substep`` are simulated step by step.
 
     Args:
         env: Environment of the worlds. Do not use it for anything else.
@@ -41,8 +41,9 @@ class OpenLoop:
             draws the same numbers as ``env.step`` from its state.
         nominal_model: Whether to use the nominal values of model fields that differ between worlds, instead of the
             values in ``state``.
-        models: Other values for model fields that differ between worlds, by name, each (n, size) float64 on the
-            environment's device. World w uses row w % n. Every run reads ``keys`` and these values.
+        models: Values of model fields that differ between worlds, by name, instead of the values in ``state``. Each is
+            (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
+            values.
         states: Number of initial states. Each state starts nworld / states consecutive worlds.
 
     Raises:
@@ -109,7 +110,7 @@ class OpenLoop:
             for group, space in env.obs_spaces.items():
                 setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # the batches before, after and last are views of one buffer per field
+            # for each field, _before, _after and _last are views of one buffer
             self._fields: dict[str, wp.array] = {}
             self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
             if task.shared:
@@ -145,7 +146,7 @@ class OpenLoop:
             call()
 
     def sequence(self, phases: Iterable[Phase]) -> Calls:
-        """Turn phases into calls, with as few graphs as possible."""
+        """Capture phases in as few graphs as possible, and return the calls that run them."""
         return self.worlds.programs.graphs.sequence(phases)
 
     @staticmethod

@@ -43,7 +43,7 @@ SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 
 
 def _for_engine(default: Any) -> Any:
-    """Make the field of an option that goes to the engine's constructor."""
+    """Make a dataclass field for an option of the engine's constructor."""
     return dataclasses.field(default=default, metadata={"engine": True})
 
 
@@ -121,7 +121,7 @@ class PhysicsOptions:
         for name in ("discardvisual", "deterministic"):
             if (flag := getattr(self, name)) is not None:
                 check_flag(name, flag)
-        if self.base is None:  # False only overrides a set of options; earlier releases also stored it in runs
+        if self.base is None:  # without a base, False means None (as in runs of earlier releases)
             object.__setattr__(self, "deterministic", self.deterministic or None)
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
@@ -131,7 +131,7 @@ class PhysicsOptions:
         return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
-        """Replace ``base`` by the physics options of this name."""
+        """Replace ``base`` by the options that it names."""
         if self.base is None:
             return self
         known = {"exact": PhysicsOptions(), **named}
@@ -186,7 +186,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # binding the task gives a clearer error
+        # an MjModel gets a clearer error when the task is bound
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
@@ -255,7 +255,7 @@ def suggestion(word: str, others: Iterable[str] = ()) -> str:
 
 
 def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """Give a function's signature a keyword argument for each option instead of ``**words``."""
+    """Replace ``**words`` in a function's signature by a keyword argument for each option."""
     keyword = inspect.Parameter.KEYWORD_ONLY
     options = [
         inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)

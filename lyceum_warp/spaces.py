@@ -15,7 +15,7 @@ from lyceum_warp.model_fields import ModelField
 class Space:
     """A world's vector with named parts, a dtype and optional bounds.
 
-    Arrays of an environment have another axis in front, over worlds.
+    An environment's arrays have one more axis in front, for the worlds.
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
@@ -67,7 +67,7 @@ COUNTERS = ("step", "key", "episode", "done_reason")
 """Counters in a state: steps since the reset, key of the random stream, number of the episode, bits of ``Done``."""
 
 OWN_PARTS = (*COUNTERS, "metrics", "success_steps")
-"""Parts of a state from neither MuJoCo nor the task's memory."""
+"""Parts of a state that belong neither to MuJoCo nor to the task's memory."""
 
 
 def action_space(
@@ -75,7 +75,7 @@ def action_space(
 ) -> Space:
     """Make the space of actions, which are controls unless the task declares ``actions``.
 
-    Controls are bounded by ``action_range`` or by their ranges.
+    Bounds of controls are ``action_range`` or the model's control ranges.
     """
     if actions is not None:
         space = Space.of(actions)
@@ -92,7 +92,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
         name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # do not use the name of another actuator
+        while not given[i] and name in given:  # another actuator may have this name
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])

@@ -43,7 +43,7 @@ class TaskFunction:
     """Purpose and default, for the documentation."""
     default: str | None = None
     optional: str = ""
-    """Arguments that a task's function may leave out at the end."""
+    """Last arguments, which a task's function may omit."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """What the function may write into each argument. "lasting" means lasting memory and the model, and "start" means
     everything that a reset may write. The other values are "inputs" and "memory". Arguments for results, such as
@@ -198,13 +198,13 @@ def part(size: int | str = 1) -> Any:
 
 
 class Element(int):
-    """Name of an element of the model, from ``site`` and similar functions. The element's index replaces the name."""
+    """Name of a model element, as returned by ``site`` and similar functions. The element's index replaces it."""
 
     field: str
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """The integer's value is not used."""
+        """Make an element; its value as an integer is not used."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
@@ -337,8 +337,8 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
     robot. The parameter is computed again when another parameter changes, unless the user gave it a value.
 
     Args:
-        function: Function of the MjModel and of an object with parameters as attributes. The attributes are all
-            parameters with ordinary defaults, and computed parameters that Params declares earlier.
+        function: Function with two arguments: the MjModel, and an object with parameters as attributes. The attributes
+            are all parameters with ordinary defaults, and computed parameters that Params declares earlier.
     """
     return FromModel(function)
 
@@ -358,7 +358,7 @@ class Planning:
     """Options of the planner's worlds, by their names in ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Parameters of the planner's worlds, by their names in the task's ``Params``. They are ignored if MPPI has a value
-    function, which was fitted to the rewards of the unchanged task."""
+    function, because it was fitted to the unchanged task's rewards."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -394,9 +394,9 @@ class Task:
     """Base class of tasks: a model, the fields that functions read, and a few functions of one world.
 
     A subclass names its model and the parts of its observation. Its module has two Warp structs and the task's
-    functions. Both may also be attributes of the class. The struct ``World`` lists the fields that the functions read.
-    The struct ``Params`` lists the keyword arguments of ``make`` with defaults. Its fields ``dt`` and ``substep_dt``
-    are the seconds of a step and a substep. Each function is a ``wp.func``.
+    functions. All of them may also be attributes of the class. The struct ``World`` lists the fields that the functions
+    read. The struct ``Params`` lists the keyword arguments of ``make`` with defaults. Its fields ``dt`` and
+    ``substep_dt`` are the seconds of a step and a substep. Each function is a ``wp.func``.
 
     ``World`` lists fields of MjData and MjModel by MuJoCo's names, such as ``qpos``, ``site_xpos`` and ``body_mass``. A
     model field differs between worlds, and is part of the state, if ``startup``, ``initialize``, ``randomize`` or
@@ -414,8 +414,8 @@ class Task:
     Functions:
     {functions}
 
-    The argument ``s`` has one world's fields in the current state, ``s0`` before the step, and ``s1`` after the step.
-    Fields of the position and velocity stages belong to this state. Fields of the acceleration stage (forces,
+    The argument ``s`` has one world's fields in the current state. ``s0`` has them before the step, and ``s1`` after
+    the step. Fields of the position and velocity stages belong to this state. Fields of the acceleration stage (forces,
     accelerations) come from the last substep. A sensor belongs to the stage that computes its quantity. Controls are
     clipped to the model's ranges, but ``reward`` gets the unclipped action. The argument ``rng`` is the world's random
     stream, for ``lw.uniform`` and ``lw.normal``.
@@ -431,7 +431,7 @@ class Task:
     - ``startup``: model fields and lasting memory. Resets do not change them.
     - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
 
-    A reset calls ``reject`` before the substeps of ``settle``, and does not call ``substep`` during them.
+    A reset calls ``reject`` before the substeps of ``settle``. During these substeps, ``substep`` is not called.
 
     An event runs after the reward and the termination of a step, and before the next observation. It does not run in
     worlds that restart. Open-loop rollouts and planners run no events.
@@ -457,14 +457,15 @@ class Task:
     ``reward``. A term is a function in the task's module that returns a float. Its arguments are found by name. A name
     may be ``s0``, ``action``, ``s1`` (or ``s``) or ``p``, another function, a parameter, or a field of World. The
     reward is dt times the weighted sum of the terms. ``lw.make(task, upright=2.0)`` and ``set_params`` change weights.
-    Each term times its weight and dt is also a metric. ``env.task.reward_text`` is the generated source."""
+    There is also a metric for each term: the term times its weight and dt. ``env.task.reward_text`` is the generated
+    source."""
     terminations: ClassVar[tuple[str, ...]] = ()
     """Names of functions that end the episode if one of them returns True. They replace ``terminated``. Their arguments
-    are ``s``, ``p`` and others that are found by name, as in terms. Each function is also a metric: 1 if it returns
-    True after the step, and 0 otherwise."""
+    are ``s``, ``p``, and any others that a term may have. Each function is also a metric: 1 if it returns True after
+    the step, and 0 otherwise."""
     metrics: ClassVar[tuple[str, ...]] = ()
-    """Names of the metrics that ``measure`` writes. Without ``measure``, these are functions that return a float or a
-    bool and take arguments as a term does."""
+    """Names of the metrics that ``measure`` writes. Without ``measure``, each is the name of a function that returns a
+    float or a bool. Its arguments may be those of a term."""
     horizon: ClassVar[int] = 1000
     """Number of steps after which an episode is truncated, or 0 for never."""
     success_steps: ClassVar[int] = 1
@@ -484,19 +485,19 @@ class Task:
     """The range of actions. The default ``control`` scales it to the model's control ranges. With None, actions are not
     scaled, and are unbounded if the task declares ``actions``."""
     keyframe: ClassVar[str | None] = None
-    """Name of the keyframe that a reset starts from before ``initialize``; None means ``qpos0``."""
+    """Name of the keyframe that a reset loads before it calls ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If it accepts none, the reset
-    uses the last one."""
+    """Maximum number of initial states that a reset draws if ``reject`` refuses them. If ``reject`` refuses all, the
+    reset uses the last one."""
     settle: ClassVar[int] = 0
     """Number of substeps that are simulated before the first observation of an episode, so that objects come to rest.
     They use the initial state's controls and do not call ``substep``. The episode's time starts afterwards."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5". Model, observation, reward,
-    termination, reset and parameters are the same as there. Subclasses do not inherit this attribute."""
+    termination, reset and parameters are the same as in that environment. Subclasses do not inherit this attribute."""
     trace: ClassVar[str | None] = None
-    """Name of a site or body whose path the viewer draws for a planner's samples. By default, it draws the path of the
-    centre of mass of a robot with a floating base, or of the end of an arm."""
+    """Name of a site or body whose path the viewer draws for a planner's samples. By default, this is the centre of
+    mass of a robot with a floating base, or the end of an arm."""
     mirror: ClassVar[Any] = None
     """The task's mirror image, for symmetric policies: ``lw.Mirror(...)``, or a static method ``mirror(model, p)`` that
     returns an ``lw.Mirror``."""
@@ -508,7 +509,7 @@ class Task:
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 
-    # World, Params and the Warp functions when the class was defined
+    # World, Params and the Warp functions at the time of the class's definition
     scope: ClassVar[dict[str, Any]]
 
     @staticmethod

@@ -13,8 +13,8 @@ from lyceum_warp.task import from_model
 
 Shape = Callable[[np.ndarray, np.ndarray, float, np.random.Generator], np.ndarray]
 """Function ``shape(x, y, amount, rng)`` that returns the heights of a square patch. ``x`` and ``y`` are the points'
-coordinates relative to the patch's centre. Heights and coordinates are arrays (n, n) in m. The outline of a patch is
-then set to 0, so that patches meet without a step."""
+coordinates relative to the patch's centre. Heights and coordinates are arrays (n, n) in m. Heights along the patch's
+outline are then set to 0, so that patches meet without a step."""
 
 _PLATFORM = 1.0
 """Half the side of the flat square at the centre of a patch, in m."""
@@ -121,7 +121,7 @@ class Terrain:
     seed: int = 0
     """Seed of all random heights."""
     scale: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Sizes at difficulty 1, by kind, that replace those in the table."""
+    """Sizes at difficulty 1, by kind. They replace the sizes in the table."""
 
     def __post_init__(self) -> None:
         for name in [*self.kinds, *self.scale]:
@@ -176,10 +176,10 @@ class Terrain:
     def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
         """Add the ground to a model in place of the world's plane.
 
-        The plane becomes the height field, with its name, friction and material. Without a plane, the model gets a geom
-        called ``name``. The plane's position becomes a corner between patches in the middle of the field. Corners have
-        height 0, so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend,
-        does not change.
+        The height field gets the plane's name, friction and material. Without a plane, the model gets a geom called
+        ``name``. A corner between patches in the middle of the field is at the plane's position. Corners have height 0,
+        so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend, does not
+        change.
 
         Args:
             spec: The model. It is changed in place, for example in a task's ``edit_model``.
@@ -233,7 +233,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
-        ValueError: There is no such height field, or no single fixed and upright geom has it.
+        ValueError: There is no such height field, or it does not have exactly one geom, fixed and upright.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:

@@ -33,7 +33,7 @@ from lyceum_warp.viz.video import check_video
 log = logging.getLogger(__name__)
 
 Callback = Callable[[Any], Any]
-"""Function of an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
+"""Function that is called with an iteration's statistics, an object of the algorithm's ``Iteration`` class."""
 
 
 class Display:
@@ -41,7 +41,7 @@ class Display:
 
     @contextlib.contextmanager
     def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Return a context for training up to a total number of iterations."""
+        """Return a context manager that is active during training."""
         yield
 
     def __call__(self, iteration: Iteration) -> None:
@@ -76,8 +76,8 @@ def train(
     Policies are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise they are compared by
     ``return_mean``, the return of episodes under the policy before the update.
 
-    The policy and the complete state are saved at the start, at the end, and every 30 s. They are saved more often if
-    this takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and
+    The policy and the complete state are saved at the start, at the end, and every 30 s. Both are saved more often if
+    saving takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and
     produces the same numbers. After Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and
     ends. A second signal ends it at once.
 
@@ -110,7 +110,7 @@ def train(
 
     Raises:
         ValueError: The folder is not empty, an argument is out of range, the run does not fit the learner, or another
-            process has the run.
+            process has locked the run.
         ImportError: ``tensorboard`` needs the extra ``tensorboard``.
         NoVideoError: ``video_every`` needs the extra ``viz``.
         OSError: The folder cannot be written. The run can later be resumed from its last save.
@@ -177,11 +177,10 @@ def train(
 
 
 _PAIRS = 64
-"""Number of episodes in the comparison at the end of training, each under both settings."""
+"""Number of episodes in the comparison at the end of training. Each episode runs under both settings."""
 
 
 def _judge_transfer(run: Run, learner: Learner, wanted: bool | None, display: Display) -> None:
-    """Compare if it was requested or if it takes only seconds."""
     env, exact = learner.env, task_physics(learner.env)[1] == EXACT
     on_gpu = env.device.is_cuda and env.engine.name == "warp"
     if wanted is False or (wanted is None and exact and not on_gpu):
@@ -275,7 +274,7 @@ def _check_equal(run: Run, learner: Learner) -> None:
     old, new, algorithm = then.options, env.options, run.config["algorithm"]
     now["engine"] = engine_name(now["engine"], now["device"])
     own = {"engine": engine_name(old.engine, old.device), "algorithm": algorithm, "nworld": old.nworld}
-    # these options may differ, and note_changes compares the model
+    # horizon, fields and dynamics may differ
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | dict(then.params)
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))

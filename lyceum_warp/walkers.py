@@ -191,7 +191,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
 
 
 def leg_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """List the joints from the base to each foot, (feet, most joints of a leg). Rows of shorter legs end with -1.
+    """List the joints from the base to each foot, (feet, joints of the longest leg). Rows of shorter legs end with -1.
 
     Raises:
         ValueError: A foot is not connected to the base by hinges.
@@ -214,7 +214,7 @@ def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the axes of ``leg_joints``, (feet, most joints of a leg, 3)."""
+    """Get the axes of ``leg_joints``, (feet, joints of the longest leg, 3)."""
     data = _straight(model)
     return data.xaxis[leg_joints(model, p)]
 
@@ -234,9 +234,9 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Compute spheres that touch a plane if and only if the foot does.
 
-    The result, (feet, most spheres, 4), has centres relative to the foot's last joint and radii, in m. A capsule
-    becomes a sphere at each end, and a box becomes a sphere at each corner. Any other geom becomes a sphere at each
-    corner of its bounding box. Radii include the margin at which a contact starts to exert force.
+    The result, (feet, spheres, 4), has each sphere's centre relative to the foot's last joint, and its radius, in m. A
+    capsule becomes a sphere at each end, and a box becomes a sphere at each corner. Any other geom becomes a sphere at
+    each corner of its bounding box. Radii include the margin at which a contact starts to exert force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -417,8 +417,8 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
     Args:
         spec: The model.
-        feet: For each new site, a body's name and the site's position in the body, in m. A joint or geom stands for its
-            body.
+        feet: For each new site, a body's name and the site's position in the body, in m. A joint's or geom's name
+            stands for its body.
 
     Raises:
         ValueError: The model has no element of this name.

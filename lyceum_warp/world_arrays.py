@@ -64,7 +64,7 @@ class WorldArrays:
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of successes in a row, without columns if ``success_steps`` is 1."""
+        """Number of successes in a row; it has no columns if ``success_steps`` is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
@@ -181,7 +181,7 @@ class WorldArrays:
             self.mask_view.copy_(mask)
 
     def pack_state(self, ended: wp.array) -> None:
-        """Write the state of every world into ``state``, with the part ``done_reason`` from ``ended``."""
+        """Write the state of every world into ``state``. Its part ``done_reason`` is taken from ``ended``."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
         own = self.counters
@@ -204,7 +204,7 @@ class WorldArrays:
             yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
-        """Set the selected worlds' counters from ``columns``, the columns after the engine's."""
+        """Set the selected worlds' counters from ``columns``, the state's columns after those of the engine."""
         own = self.counters
         counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

@@ -117,7 +117,7 @@ class Worlds(WorldArrays):
         return Phase(phases[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
     def transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases of a step that advance and judge the worlds, without resets and events."""
+        """List the phases of a step that advance and evaluate the worlds, without resets and events."""
         phases = [
             Phase("act", self.act, by_world=True),
             *self.physics_phases(substeps),
@@ -166,7 +166,7 @@ class Worlds(WorldArrays):
         return phases
 
     def _observe_phases(self) -> list[Phase]:
-        """List the phases that observe worlds again that changed after the evaluation."""
+        """List the phases that make new observations of worlds that changed after the evaluation."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
@@ -189,7 +189,7 @@ class Worlds(WorldArrays):
         ]
 
     def rehearsal(self) -> None:
-        """Run every phase once that only launches kernels, so that ``compile_ahead`` can list the kernels."""
+        """Launch the kernels of all phases once, so that ``compile_ahead`` can list them."""
         self.seed_streams(0)
         # all substeps after the first are equal, and each would take milliseconds on the Warp engine
         step = self.step_phases(min(self.task.frame_skip, 2))
@@ -306,13 +306,13 @@ class Worlds(WorldArrays):
         self.engine.commit(self._physics_changed, state_fields)
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
-        """Mark worlds in which an event changed a field, which belongs to the task's memory if ``physics`` is False."""
+        """Mark worlds in which an event changed a physics field, or a memory field if ``physics`` is False."""
         found = [self._physics_changed, self._changed, self._outdated]
         args = [self._continuing, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:
-        """Observe worlds that changed after the evaluation, which observed all others."""
+        """Make new observations of the worlds that changed after the evaluation."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
         args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)

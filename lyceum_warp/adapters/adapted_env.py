@@ -10,7 +10,7 @@ from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make`` that are arguments of adapters, under another name."""
+"""Options of ``lw.make``, each with the adapter's argument that replaces it."""
 
 
 def environment_of(

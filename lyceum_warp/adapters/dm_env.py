@@ -18,7 +18,7 @@ except ImportError as error:
 class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
     """One world as a ``dm_env.Environment``, for code that expects the interface of dm_control's suite.
 
-    An observation is a dict with the parts of the observation group ``policy``, float32. A single number has the shape
+    An observation is a dict with one float32 array for each part of the group ``policy``. A single number has the shape
     (1,). The first step after the end of an episode ignores its action and starts a new episode. The discount is 0
     after a termination. It is 1 if a time limit or a fault ends the episode.
 
@@ -38,7 +38,7 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
         self._ended = True
 
     def reset(self) -> dm_env.TimeStep:
-        """Start a new random episode. Reward and discount of its first time step are None."""
+        """Start a new random episode. The reward and the discount of the first time step are None."""
         obs, _ = self._world.reset()
         self._ended = False
         return dm_env.restart(self._split(obs))

@@ -19,8 +19,8 @@ class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):
 
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
-        **options: ``dict_obs``, ``render_mode``, ``camera`` and ``render_size``, as in ``GymnasiumVectorEnv``, and
-            options and parameters for ``lw.make``.
+        **options: ``dict_obs``, ``render_mode``, ``camera`` and ``render_size``, as in ``GymnasiumVectorEnv``. All
+            others are options and parameters for ``lw.make``.
 
     Raises:
         FileNotFoundError: The package with the task's model is not installed.

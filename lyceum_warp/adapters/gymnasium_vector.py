@@ -32,16 +32,16 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
       ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observations and infos of ended episodes. The
       masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. If ``torch`` is False,
       ``final_obs`` and ``final_info`` exist only if an episode ended. ``final_obs`` is then an object array with None
-      for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, they are tensors over all worlds and
-      always exist. A check would wait for the device.
+      for the other worlds, as Gymnasium's wrappers expect. If ``torch`` is True, both always exist, as tensors over all
+      worlds. Asking whether an episode ended would wait for the device.
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. Until then, a world keeps stepping, and
       its termination or truncation stays True. A world with a fault is reset at once, but returns its last valid
       observation.
     - NEXT_STEP resets the world in the next step, which ignores the world's action. Every step then runs the kernels of
       a reset twice. Some wrappers, such as ``NormalizeObservation``, require this mode.
 
-    Without a seed for the constructor or the first reset, the seed is random, as in Gymnasium's own environments. One
-    seed is enough for all worlds: each world has its own random numbers.
+    If neither the constructor nor the first reset gets a seed, the seed is random, as in Gymnasium's own environments.
+    One seed is enough for all worlds: each world has its own random numbers.
 
     Args:
         task: A task, as in ``lw.make``, or an environment.
@@ -204,7 +204,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         env = self.env
         groups, infos = dict(env.obs_groups), {"eval": env.eval, "done_reason": env.done_reason}
         if not env.autoreset:
-            # a fault always resets a world, whose row is then already the first of the next episode
+            # a world with a fault has already restarted, so its final observation is in final_obs
             done = env.done[:, None]
             groups = {name: torch.where(done, env.final_obs_groups[name], obs) for name, obs in groups.items()}
         if env.task.functions["success"] is not None:
@@ -263,7 +263,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
 
 def check_array(actions: Any, shape: tuple[int, ...]) -> None:
-    """Check that actions are an array of real numbers of a shape."""
+    """Check that actions are an array of floats with the given shape."""
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind != "f":
         array = isinstance(actions, np.ndarray)
         given = f"a {actions.dtype} array of shape {actions.shape}" if array else described(actions)
@@ -271,7 +271,7 @@ def check_array(actions: Any, shape: tuple[int, ...]) -> None:
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:
-    """Make a Box for one world's vector. The bounds are infinite if the space has none."""
+    """Convert a space to a Gymnasium Box."""
     low, high = (-np.inf if space.low is None else space.low), (np.inf if space.high is None else space.high)
     return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.float32)
 

@@ -8,7 +8,7 @@ from lyceum_warp.algos.value import value_group
 from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
-"""rsl_rl's names of activations that differ from torch's."""
+"""Activations whose names in rsl_rl and torch differ."""
 
 _PPO = {
     "epochs": "num_learning_epochs", "minibatches": "num_mini_batches", "clip": "clip_param", "gamma": "gamma",
@@ -28,7 +28,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the mean policy.
 
     Args:
-        env: The environment of the networks' inputs.
+        env: The environment whose observations are the networks' inputs.
         config: Hyperparameters; by default ``PPOConfig()``.
 
     Returns:

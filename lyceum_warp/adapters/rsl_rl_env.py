@@ -24,7 +24,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     """An environment for rsl_rl's runners: ``OnPolicyRunner(RslRlVecEnv("hopper", 4096, device="cuda"), config)``.
 
     ``step`` never waits for the device. ``step`` copies the observations, because rsl_rl stores them only after the
-    next step. All other results are buffers that the next step overwrites. rsl_rl copies them before.
+    next step. All other results are buffers that the next step overwrites. rsl_rl copies them before that.
 
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
@@ -32,7 +32,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         words: Options and parameters, as for ``lw.make``.
 
     Raises:
-        ImportError: rsl_rl is missing (on importing this module).
+        ImportError: rsl_rl was not installed when this module was imported.
     """
 
     num_envs: int
@@ -63,7 +63,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     def episode_length_buf(self) -> torch.Tensor:
         """Steps since the reset, (nworld,) int32, a live view.
 
-        Assign a tensor to change the counters, and with them the times at which episodes are truncated.
+        Assign a tensor to change how many steps remain until each episode is truncated.
         """
         return self.env.episode_step
 

@@ -35,8 +35,8 @@ class StableBaselines3VecEnv(VecEnv):
         task: A task, as in ``lw.make``, or an ``Env``.
         num_envs: Number of worlds; by default one, or the number in the given environment.
         dict_obs: Whether observations are dicts of all observation groups.
-        **options: ``render_mode``, ``camera`` and ``render_size``, as in ``GymnasiumVectorEnv``, and options and
-            parameters for ``lw.make``.
+        **options: ``render_mode``, ``camera`` and ``render_size``, as in ``GymnasiumVectorEnv``. All others are options
+            and parameters for ``lw.make``.
 
     Raises:
         FileNotFoundError: The package with the task's model is not installed.
@@ -129,7 +129,7 @@ class StableBaselines3VecEnv(VecEnv):
             raise ValueError(f"{attr_name!r} is shared by all worlds: call set_attr without indices")
         if attr_name not in self.env.task.parameters.values and hasattr(self, attr_name):
             setattr(self, attr_name, value)
-        else:  # set_params suggests similar names
+        else:  # if the name is unknown, the error suggests similar names
             self.env.set_params(**{attr_name: value})
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:

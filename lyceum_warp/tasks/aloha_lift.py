@@ -96,7 +96,7 @@ class AlohaLift(lw.Task):
     keyframe, frame_skip, horizon, success_steps = "start", 8, 150, 10
     obs = {"position": 16, "velocity": 22, "target": 14, "pot": 3, "pot_axes": 9, "handles_from_grips": 6}
     metrics, action_range = ("reach", "orient", "grasp", "lift"), (-1.0, 1.0)
-    # a plan with half the substeps is 1.9 times as fast; longer substeps soften contacts, so that grasps fail
+    # planning with half the substeps is 1.9 times as fast; with longer substeps, contacts are softer and grasps fail
     physics = {"fast": lw.PhysicsOptions(frame_skip=4, timestep=0.01)}
     planning = lw.Planning(settings=dict(horizon=16, samples=128, temperature=0.5, noise=0.6, include_plan=False))
 

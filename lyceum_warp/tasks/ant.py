@@ -2,8 +2,8 @@
 
 MuJoCo's sensor stage computes the contact forces. With the model's integrator RK4, that stage runs only in the first of
 four passes of a substep. Gymnasium computes ``cfrc_ext`` again after the last pass. The model has pyramidal friction
-cones. With these, MuJoCo Warp's contact frame differs from MuJoCo's for a steep leg on the floor. Both frames are
-valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
+cones. With pyramidal cones, MuJoCo Warp's contact frame differs from MuJoCo's for a steep leg on the floor. Both frames
+are valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
 """Cartpole: keep a pole upright on a cart in the middle of its rail (dm_control's cartpole balance).
 
-The reward is dm_control's smooth reward, or that of balance_sparse with ``sparse=True``. Success: the
-pole is upright and the cart is centred, as the sparse reward requires. Episodes do not terminate. In Gymnasium's
-CartPole-v1, an episode ends if the pole tilts by 12 degrees, and there are only two actions.
+The reward is dm_control's smooth reward. With ``sparse=True``, it is the reward of balance_sparse. Success: the pole is
+upright and the cart is centred, as the sparse reward requires. Episodes do not terminate. In Gymnasium's CartPole-v1,
+an episode ends if the pole tilts by 12 degrees, and there are only two actions.
 """
 
 import warp as wp

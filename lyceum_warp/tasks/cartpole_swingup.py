@@ -1,7 +1,7 @@
 """CartpoleSwingup: swing a pole up and balance it (dm_control's cartpole swingup, with Lyceum's reward).
 
-All sigmoids of Lyceum's reward are quadratic. In dm_control's reward, they are Gaussian, except for the control's.
-Episodes do not terminate.
+All sigmoids of Lyceum's reward are quadratic. In dm_control's reward, only the control's sigmoid is quadratic, and the
+others are Gaussian. Episodes do not terminate.
 """
 
 import warp as wp

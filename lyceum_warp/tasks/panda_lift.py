@@ -92,7 +92,7 @@ class PandaLift(lw.Task):
     obs = {"position": 9, "velocity": 15, "target": 8, "cube": 3, "cube_axes": 9, "cube_from_grip": 3}
     metrics = ("reach", "orient", "grasp", "lift")
     action_range = (-1.0, 1.0)
-    # a plan with half the substeps is 1.8 times as fast; longer substeps soften contacts, so that grasps fail
+    # planning with half the substeps is 1.8 times as fast; with longer substeps, contacts are softer and grasps fail
     physics = {"fast": lw.PhysicsOptions(frame_skip=4, timestep=0.01)}
     planning = lw.Planning(settings=dict(horizon=16, samples=64, temperature=0.5, noise=0.6, include_plan=False))
 

@@ -7,7 +7,7 @@ from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
 def check_spaces(ctx: Context) -> None:
-    """A space has its buffer's shape and type, its parts cover all columns, and its bounds are in order."""
+    """A space has its buffer's shape and type, parts for all columns, and no lower bound above an upper bound."""
     env = ctx.a
     ctx.that(env.obs is env.obs_groups["policy"], "the group policy is not env.obs")
     ctx.that(env.final_obs is env.final_obs_groups["policy"], "the final group policy is not env.final_obs")

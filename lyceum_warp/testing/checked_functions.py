@@ -20,7 +20,7 @@ _SHAPES = ("shape", "strides")
 _HELPERS = {
     "bounds_at": index_checks.at, "bounds_from_end": index_checks.from_end, "bounds_element": index_checks.element,
 }  # fmt: skip
-"""Functions that the copies call, with names that a task hardly uses."""
+"""Functions that the copies call. A task is unlikely to use their names."""
 
 
 class Unchecked(Exception):  # noqa: N818
@@ -41,7 +41,7 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # functions may call each other
+        for scope, numbers in self._scopes:  # only now, all copies exist that a function may call
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
@@ -99,7 +99,7 @@ class CheckedFunctions:
         types |= {"bounds_report_type": wp.array2d(dtype=int), "bounds_result_type": returned}
         scope = source.scope | _HELPERS | types | defaults
         scope |= {"bounds_wp": wp, "bounds_module": wp.get_module(self._module)}
-        if number in self._copies:  # with an existing key, Warp adds an overload
+        if number in self._copies:  # Warp treats a function with an existing key as an overload
             scope[tree.name] = self._copies[number]
         self._scopes.append((scope, rewriter.callees))
         self._run(ast.unparse(ast.fix_missing_locations(tree)), scope, len(self._scopes))
@@ -155,7 +155,7 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function as a value, because its copy has one more argument."""
+        """Refuse a function that is used as a value, because its copy has one more argument."""
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(

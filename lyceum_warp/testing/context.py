@@ -67,7 +67,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Draw random actions, (steps, nworld, nact), from -1 to 1 without bounds."""
+        """Draw random actions, (steps, nworld, nact). Actions without bounds are between -1 and 1."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))
@@ -83,11 +83,11 @@ class Context:
         return mask.to(self.a.action.device)
 
     def faulty(self, env: Env) -> torch.Tensor:
-        """Mark the worlds with a fault in the last step, (nworld,) bool."""
+        """Return a mask of the worlds with a fault in the last step, (nworld,) bool."""
         return (env.done_reason & int(FAULTS)) != 0
 
     def calm(self, env: Env) -> torch.Tensor:
-        """Mark the worlds that no event changed after the last step, (nworld,) bool."""
+        """Return a mask of the worlds that no event changed after the last step, (nworld,) bool."""
         if env.task.functions["event"] is None:
             return torch.ones_like(env.done)
         return ~env.worlds.changed_view
@@ -116,7 +116,7 @@ class Context:
 
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
-        """Change ``horizon``, ``autoreset`` or ``graphs`` of environments within a context."""
+        """Change ``horizon``, ``autoreset`` or ``graphs`` of environments until the context exits."""
         kept: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs

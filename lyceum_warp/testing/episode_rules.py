@@ -10,7 +10,7 @@ from lyceum_warp.done import Done
 from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
-# tolerated growth of the interpreter's caches; one leaked float per step is 3,200 bytes after 100 steps
+# the interpreter's caches may grow by this much; one leaked float per step is 3,200 bytes after 100 steps
 _PYTHON_BYTES = 2_048
 
 
@@ -54,7 +54,7 @@ def check_truncation(ctx: Context) -> None:
 
 
 def check_no_autoreset(ctx: Context) -> None:
-    """Without automatic resets, ``done`` stays set, the world keeps stepping, and ``final_obs`` equals ``obs``."""
+    """Without automatic resets, a finished world keeps stepping with ``done`` set, and ``final_obs`` equals ``obs``."""
     env, horizon = ctx.a, 3
     with ctx.changed(env, horizon=horizon, autoreset=False):
         ctx.restart()

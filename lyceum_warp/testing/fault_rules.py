@@ -8,7 +8,6 @@ from lyceum_warp.testing.context import SHORT, Context
 
 
 def _check_fault(ctx: Context, part: str, value: float) -> None:
-    """Write a value into the first number of one world's action or of a part of its state, and step."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     what, reason = f"{value} in {part}", Done.ACTION if part == "action" else Done.NAN
     ctx.restart()
@@ -96,7 +95,7 @@ def check_not_finite(ctx: Context) -> None:
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     params = {name: value for name, value in a.task.params.items() if name not in ("dt", "substep_dt")}
     names = [name for name, value in params.items() if isinstance(value, float) and np.isfinite(value)]
-    with ctx.changed(a, b, graphs=False):  # parameters that differ between worlds need new graphs
+    with ctx.changed(a, b, graphs=False):  # graphs would be captured again for each of these parameters
         for name in names:
             kept = a.task.params[name]
             ctx.restart()

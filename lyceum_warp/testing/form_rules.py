@@ -69,7 +69,7 @@ def check_metrics(ctx: Context) -> None:
 def check_success_steps(ctx: Context) -> None:
     """``success`` requires ``success_steps`` successes in a row.
 
-    The current number is part of the state, and a reset clears it.
+    The number of successes so far is part of the state, and a reset clears it.
     """
     a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
     if needed == 1:

@@ -65,7 +65,7 @@ class _Run:
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # functions are the same on every engine
+        # a slow engine takes fewer steps, because functions are the same on every engine
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -83,7 +83,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run a step's functions on the state of a fault, which a read out of range (NaN) may have caused."""
+        """Run a step's functions again on the state of a fault, which a read out of range may have caused."""
         env = self.ctx.b
         env.set_state(state)
         env.action.copy_(action)
@@ -149,7 +149,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """An empty array gets memory for one element, because a checked function may access it."""
+        """Make an array, with memory for at least one element, because a checked function may access it."""
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

@@ -1,6 +1,6 @@
-"""Check that a world's inputs, such as applied forces, its own model fields and ``settle`` affect its physics.
+"""Check that inputs (such as applied forces), model fields and ``settle`` affect a world's physics.
 
-The engine must come closer to ``mj_step`` than ``mj_step`` without these inputs and fields.
+The engine's result must be closer to ``mj_step`` with these inputs and fields than to ``mj_step`` without them.
 """
 
 import copy
@@ -26,7 +26,7 @@ def predicted(
     """Step every world with ``mj_step``, and return its coordinates, (nworld, nq).
 
     Args:
-        env: The environment of the states.
+        env: The environment that the states belong to.
         before: Initial states, (nworld, state_space.size).
         after: States with the controls and inputs of the step; by default ``before``.
         nstep: Number of substeps.
@@ -142,7 +142,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # the same random values as after one reset
+    # many resets give the same random values as one reset
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

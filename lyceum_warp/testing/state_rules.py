@@ -94,7 +94,7 @@ def check_set_state_shows(ctx: Context) -> None:
 
 
 def check_purity(ctx: Context) -> None:
-    """For old states and actions, getters return the numbers of the original step at any time, without side effects."""
+    """Given earlier states and actions, getters return the results of the original step, without side effects."""
     env = ctx.a
     has_evaluate = env.task.functions["evaluate"] is not None
     with ctx.changed(env, autoreset=False, horizon=0):
@@ -152,7 +152,7 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    The columns that survive a reset are first made equal in all worlds, because others may depend on them.
+    The columns that survive a reset are first made equal in all worlds, because other columns may depend on them.
     """
     env = ctx.a
     lasting = _lasting_columns(env)

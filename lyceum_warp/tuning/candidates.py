@@ -71,7 +71,7 @@ def not_tried(env: Env) -> list[str]:
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
-    """Combine settings, or return None if the result is one of them.
+    """Combine settings, or return None if the result equals one of them.
 
     A setting is left out if an earlier one has the same group or sets the same option.
     """

@@ -13,10 +13,11 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the unchanged task's mean absolute return."""
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
-"""Smallest accepted rank correlation of returns under a planner's and the plant's physics; see bench/rank_loss.py."""
+"""Smallest accepted rank correlation between returns under the planner's physics and returns under the plant's physics;
+see bench/rank_loss.py."""
 
 LEAST_GAIN = 1.03
-"""Returns are compared only from this speed-up on, or if a setting takes less memory."""
+"""Returns are compared only if a setting reaches this speed-up or takes less memory."""
 _LEAST_SAVING = 0.95
 
 
@@ -63,7 +64,7 @@ def episodes_needed(found: Difference, half_width: float) -> int:
 
 
 def buys(speedup: float, memory: float) -> bool:
-    """Return whether a setting saves time or memory, from the speed-up's lower bound and the ratio of memory."""
+    """Decide whether a setting saves time or memory, given the speed-up's lower bound and the ratio of memory."""
     return speedup >= LEAST_GAIN or memory <= _LEAST_SAVING
 
 

@@ -19,19 +19,19 @@ _MOVING_STEPS = (30, 120)
 _FALLING_STEPS, _LYING_STEPS = 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""A plan is improved this often before the compared samples are drawn around it."""
+"""Number of times that a plan is improved before the compared samples are drawn around it."""
 
 
 class Rankings:
     """Compares a planner's physics options with the plant's options.
 
-    From each state, both planners draw the same samples around the same plan. Their rank correlation says whether
-    coarser physics is good enough, because a planner uses only the order and the differences of returns. There are
-    three kinds of states:
+    From each state, both planners draw the same samples around the same plan. The rank correlation of the samples'
+    returns shows whether coarser physics is good enough. A planner uses only the order and the differences of returns.
+    There are three kinds of states:
 
     - standing: after a random reset;
-    - moving: after 30 to 120 steps, spread evenly over the states, under a planner with the plant's physics that
-      replans every 6 steps. A robot that handles objects grasps only late in an episode;
+    - moving: after steps under a planner that uses the plant's physics and replans every 6 steps. The number of steps
+      is spread evenly from 30 to 120, because grasps happen late in an episode;
     - fallen: after random actions until the end of the episode (at most 200 steps), and 10 more steps.
     """
 
@@ -120,7 +120,7 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Compute Spearman's rank correlation of each row of two (rows, n) arrays, without rows of equal numbers."""
+    """Compute Spearman's rank correlation of each row of two (rows, n) arrays. Rows of equal numbers are left out."""
     a, b = (_ranks(values.double()) for values in (first, second))
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     spread = a.square().sum(1) * b.square().sum(1)

@@ -92,8 +92,8 @@ def tune(
         tolerance: Bound on the 95 % interval of the difference of returns, relative to the mean absolute return. It is
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
-        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, as many
-            as the width of the interval needs, for at most a minute (5 s with ``short``).
+        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, enough
+            for a narrow interval, but for at most a minute (5 s with ``short``).
         planning: Whether to find physics options for the worlds of the task's planner. The search then compares
             planning times, and the rankings of the same samples from standing, moving and fallen states. It suggests a
             setting if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). ``nworld``

@@ -21,7 +21,7 @@ DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
 """Standard deviation of a perturbation of positions and velocities, which shows how chaotic the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the difference's confidence interval, for the number of episodes."""
+"""Target half-width of the difference's confidence interval. It determines the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -32,10 +32,10 @@ class Effort:
     """Limits on the duration of measurements."""
 
     repeats: int
-    """Number of timed blocks of steps, each with the unchanged task and with the setting."""
+    """Number of timed blocks of steps. Each block runs with the unchanged task and with the setting."""
     block_seconds: float
     judging_seconds: float
-    """Time limit for the unchanged task's episodes, once for random actions and once for the policy."""
+    """Time limit for the unchanged task's episodes. It applies separately to random actions and to the policy."""
     steps: int
     """Maximum number of steps in an episode, or 0 for the task's horizon."""
     recorded_at: tuple[int, ...]
@@ -47,7 +47,7 @@ SHORT = Effort(repeats=7, block_seconds=0.1, judging_seconds=5.0, steps=100, rec
 
 
 class Trials:
-    """Compares settings with the unchanged task, by turns in one process.
+    """Compares settings with the unchanged task. Both run alternately in one process.
 
     Args:
         reference: The unchanged task, made with ``autoreset=False``.
@@ -69,7 +69,7 @@ class Trials:
     # recorded states and actions
 
     def _record(self) -> None:
-        """Record states in worlds of which half follow the policy and the others act at random."""
+        """Record states. Half of the worlds follow the policy, and the others act at random."""
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
@@ -169,7 +169,7 @@ class Trials:
         return time.perf_counter() - start
 
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Compute velocities at some steps after the k-th states, (times, nworld, nv) float64; NaN after a fault."""
+        """Record velocities after the k-th states, (times, nworld, nv) float64. They are NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
         found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):
@@ -186,7 +186,7 @@ class Trials:
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
-        """Compare returns, and count faults and steps on both sides.
+        """Compare returns, and count faults and steps with and without the setting.
 
         The spread in the first batch determines the number of batches.
         """
@@ -211,7 +211,7 @@ class Trials:
         return difference(*np.concatenate(pairs, axis=1)), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
-        """Run one episode per world, and return returns (nworld,), faults and steps.
+        """Run one episode per world, and get the episodes' returns (nworld,), the faults and the steps.
 
         Equal batches have equal initial states, random streams and random actions.
         """
@@ -235,7 +235,7 @@ class Trials:
 
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
-    """Yield uniform random actions, (nworld, nact), from -1 to 1 without bounds."""
+    """Yield uniform random actions, (nworld, nact). Actions without bounds are between -1 and 1."""
     device, low, high = env.obs.device, env.action_space.low, env.action_space.high
     assert low is not None and high is not None
     generator = torch.Generator(device).manual_seed(seed)

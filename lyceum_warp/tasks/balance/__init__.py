@@ -1,4 +1,4 @@
-"""Stand, walk and get up under pushes: a family of tasks for planners in real time."""
+"""Stand, walk and get up under pushes: a family of tasks for real-time planning."""
 
 TASKS = {
     "g1_stand": "g1_balance",
@@ -7,4 +7,4 @@ TASKS = {
     "humanoid_walk": "humanoid_balance",
     "humanoid_get_up": "humanoid_balance",
 }
-"""The modules of the tasks by name. The registry reads this dict without running the file."""
+"""The module of each task, by the task's name. The registry reads this dict without running the file."""

@@ -157,7 +157,7 @@ class Balance(lw.Task):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Put a site at each foot; a state that contained geoms would not fit a planner without visual geoms."""
+        """Put a site at each foot. Geoms in the state would break planners whose models have no visual geoms."""
         for name in ("right_foot", "left_foot"):
             geom = spec.geom(name)
             (spec.site(name) or geom.parent.add_site(name=name)).pos = geom.pos

@@ -1,6 +1,6 @@
 """G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
-Actions are offsets of the leg joints' targets. The targets lift the feet in time with a gait clock. With zero actions,
+Actions are offsets of the leg joints' targets. The targets follow a gait clock and lift the feet. With zero actions,
 the robot steps in place and falls after about a second. A planner thus only corrects the steps. The servos have the
 gains of unitree_rl_gym, which also keeps waist and arms rigid. A substep would take twice as long with the upper body's
 17 joints and the legs' dry friction.
@@ -81,12 +81,12 @@ class G1Stand(balancing.Balance):
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
         pose = model.key("knees_bent").qpos
-        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]  # all except the floating base
+        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]
         servos = [servo for servo in spec.actuators if servo.target not in LEGS]
         hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
         for element in (*spec.sensors, *spec.keys, *servos, *hands):
             spec.delete(element)
-        for body in spec.bodies:  # most meshes are drawn twice
+        for body in spec.bodies:  # most meshes have two visual geoms
             meshes = [geom.meshname for geom in body.geoms]
             for i, geom in enumerate(body.geoms):
                 if geom.meshname and geom.meshname in meshes[:i]:

@@ -36,7 +36,7 @@ def lift(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the matrix P of the effort x^T P x for balancing from a state x = (qpos, qvel) near upright, s.
+    """Return the matrix P of the effort x^T P x (in s) that balances a state x = (qpos, qvel) near upright.
 
     The effort is the smallest integral of the squared action that brings the arms to rest upright. The linearized
     dynamics are dx/dt = A x + B u, with unstable modes z_i = w_i^T x, A^T w_i = r_i w_i and b_i = w_i^T B. The effort

@@ -57,8 +57,8 @@ class BallInCupCatch(lw.Task):
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Add a sensor that counts contacts, so that ``reject`` can refuse initial states with contacts.
 
-        Also add a keyframe with the ball in the cup. The simulations that size MuJoCo Warp's buffers start from
-        keyframes, too. From the initial state alone, they find too few constraints.
+        Also add a keyframe with the ball in the cup. Simulations from all keyframes size MuJoCo Warp's buffers. Without
+        this keyframe, they find too few constraints.
         """
         suite.count_contacts(spec)
         spec.add_key(name="caught", qpos=[0.0, 0.0, 0.0, 0.333])

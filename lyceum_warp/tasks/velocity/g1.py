@@ -50,7 +50,7 @@ class G1(walking.Biped):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add force sensors to the feet, and let the feet set the friction with the ground."""
+        """Add force sensors to the feet, and ignore the friction of the ground."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
 
 

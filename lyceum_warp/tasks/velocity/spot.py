@@ -32,5 +32,5 @@ class SpotVelocity(walking.Velocity):
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Let the feet set the friction with the ground, and use the humanoids' physics options."""
+        """Ignore the friction of the ground, and use the humanoids' physics options."""
         walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))

@@ -410,7 +410,7 @@ class Velocity(lw.Task):
     metrics = ("velocity_error", "yaw_rate_error")
     terminations = ("fell_over", "too_low")
     deployment, mirror = staticmethod(walkers.deployment), staticmethod(walkers.mirror)
-    cleared = ("sensordata",)  # forces are zero before the first substep, where mjlab computes them for the first state
+    cleared = ("sensordata",)  # a reset clears the forces; mjlab computes them for the first state
 
 
 @wp.struct
