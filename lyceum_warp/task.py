@@ -136,7 +136,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments for results: each is one world's row of an array."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Kinds of memory that World declares, with one row of floats per world and kind."""
+"""Kinds of memory that World declares. Each world has one row of floats for each kind."""
 
 GROUP_PREFIX = "observe_"
 """Prefix of functions that write a group of observations: ``observe_critic`` writes the group ``critic``."""
@@ -391,11 +391,11 @@ class Training:
 @_document_functions
 @document_attributes
 class Task:
-    """Base class of tasks: a model, the fields that functions read, and a few functions of one world.
+    """Base class of tasks: a model, the fields that functions read, and functions that run in each world.
 
-    A subclass names its model and the parts of its observation. Its module has two Warp structs and the task's
-    functions. All of them may also be attributes of the class. The struct ``World`` lists the fields that the functions
-    read. The struct ``Params`` lists the keyword arguments of ``make`` with defaults. Its fields ``dt`` and
+    A subclass names its model and the parts of its observation. The module of the subclass has two Warp structs and the
+    task's functions. All of them may also be attributes of the class. The struct ``World`` lists the fields that the
+    functions read. The struct ``Params`` lists the keyword arguments of ``make`` with defaults. Its fields ``dt`` and
     ``substep_dt`` are the seconds of a step and a substep. Each function is a ``wp.func``.
 
     ``World`` lists fields of MjData and MjModel by MuJoCo's names, such as ``qpos``, ``site_xpos`` and ``body_mass``. A
@@ -414,11 +414,11 @@ class Task:
     Functions:
     {functions}
 
-    The argument ``s`` has one world's fields in the current state. ``s0`` has them before the step, and ``s1`` after
-    the step. Fields of the position and velocity stages belong to this state. Fields of the acceleration stage (forces,
-    accelerations) come from the last substep. A sensor belongs to the stage that computes its quantity. Controls are
-    clipped to the model's ranges, but ``reward`` gets the unclipped action. The argument ``rng`` is the world's random
-    stream, for ``lw.uniform`` and ``lw.normal``.
+    The argument ``s`` has one world's fields in the current state. ``s0`` has the fields before the step, and ``s1``
+    has them after the step. Fields of the position and velocity stages belong to this state. Fields of the acceleration
+    stage (forces, accelerations) come from the last substep. A sensor belongs to the stage that computes its quantity.
+    Controls are clipped to the model's ranges, but ``reward`` gets the unclipped action. The argument ``rng`` is the
+    world's random stream, for ``lw.uniform`` and ``lw.normal``.
 
     A function may write only the following fields, and only if ``World`` lists them:
 
@@ -443,7 +443,7 @@ class Task:
 
     model: ClassVar[Any]
     """The model: a file name, ``lw.package_model(...)``, an MjSpec, or a static method without arguments that returns
-    one of these. A file is relative to the task's file, or one of gymnasium's models."""
+    one of these. A file name is relative to the task's file, or names one of gymnasium's models."""
     frame_skip: ClassVar[int] = 1
     """Substeps in a step."""
     obs: ClassVar[Any]
@@ -491,7 +491,8 @@ class Task:
     reset uses the last one."""
     settle: ClassVar[int] = 0
     """Number of substeps that are simulated before the first observation of an episode, so that objects come to rest.
-    They use the initial state's controls and do not call ``substep``. The episode's time starts afterwards."""
+    They use the initial state's controls and do not call ``substep``. The episode's time starts after these
+    substeps."""
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5". Model, observation, reward,
     termination, reset and parameters are the same as in that environment. Subclasses do not inherit this attribute."""
@@ -518,7 +519,7 @@ class Task:
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return metadata for ONNX files as JSON values by name, such as gains that a robot needs.
+        """Return JSON values by name, such as a robot's gains, which ONNX files store as metadata.
 
         The argument ``model`` is the compiled model, and ``p`` has the parameters as attributes.
         """
@@ -528,7 +529,7 @@ class Task:
         super().__init_subclass__(**keywords)
         if "gymnasium" not in vars(cls):
             cls.gymnasium = None
-        # a later cell of a notebook may define another task
+        # copy them now, because a later cell of a notebook may define another task
         module = vars(sys.modules[cls.__module__])
         cls.scope = {
             name: value

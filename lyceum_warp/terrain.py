@@ -24,7 +24,7 @@ _BASE = 1.0
 
 
 def _inwards(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Compute the distance of points from a patch's outline, in m. It is constant on the flat platform."""
+    """Compute the distance of points from a patch's outline, in m. The distance is constant on the flat platform."""
     half = float(x.max())
     return np.clip(half - np.maximum(abs(x), abs(y)), 0.0, max(half - _PLATFORM, 0.0))
 
@@ -182,7 +182,7 @@ class Terrain:
         change.
 
         Args:
-            spec: The model. It is changed in place, for example in a task's ``edit_model``.
+            spec: The model, which is changed in place, for example in a task's ``edit_model``.
             name: Name of the height field.
 
         Raises:

@@ -85,8 +85,8 @@ def train(
         learner: The algorithm, such as ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
         folder: The run's folder. It must be new or empty.
         iterations: Total number of iterations, including those before resuming.
-        callback: Called with each iteration after its row was written. Training ends if it returns True. If it raises
-            an error, the run is saved and the error is raised again.
+        callback: Function that is called with each iteration, after the iteration's row was written. Training ends if
+            it returns True. If it raises an error, the run is saved and the error is raised again.
         target_return: Training ends when the return that selects the best policy reaches this number.
         minutes: Training ends after the iteration that exceeds this time limit.
         keep_every: Iterations between policies that are saved in numbered files, or 0 for none.
@@ -97,8 +97,9 @@ def train(
         camera: Camera of the videos: the name or index of a camera in the model, a ``viz.cameras.FreeCamera``, or
             "free" for MuJoCo's default camera.
         transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. The default
-            makes only comparisons that take seconds: with the C engine after training on a GPU, and with exact physics
-            after training with other physics. ``transfer=True`` adds the task's other physics and the Warp engine.
+            makes only comparisons that take seconds. After training on a GPU, it compares with the C engine. After
+            training with other physics, it compares with exact physics. ``transfer=True`` adds the task's other physics
+            and the Warp engine.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.
@@ -202,7 +203,7 @@ def _learn(
     learner: Learner, saver: Saver, iterations: int, callbacks: list[Callback], target_return: float | None,
     limit: float,
 ) -> None:  # fmt: skip
-    """Iterate until the target, the last iteration or the time limit, with all ranks together."""
+    """Iterate until the target return, the last iteration or the time limit. All ranks stop together."""
     team, run, deadline = learner.team, saver.run, time.monotonic() + limit
     ended = False
     with postponed(insist=team.size == 1) as noted:

@@ -113,7 +113,7 @@ def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
     All lists are in the order of ``joints``.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
-    # the joint's own damping adds to the servo's
+    # the joint's own damping adds to the servo's damping
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
@@ -376,7 +376,7 @@ def prepare_walker(
     foot with the ground.
 
     Args:
-        spec: The model. It is changed in place.
+        spec: The model, which is changed in place.
         feet: Names of the sites of the feet.
         timestep: Seconds in a substep, or None for the model's time step.
         iterations: Maximum iterations of the solver and of the line search, or None for the model's limits.
@@ -478,7 +478,7 @@ def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.01
     lie within the outline of the sole and touch its lowest plane. Masses do not change.
 
     Args:
-        spec: The model after ``prepare_walker``. It is changed in place.
+        spec: The model after ``prepare_walker``, which is changed in place.
         feet: Names of the sites of the feet.
         radius: Radius of the capsules, in m.
 

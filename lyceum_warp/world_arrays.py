@@ -43,7 +43,7 @@ def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
 
 
 class WorldArrays:
-    """All arrays of many worlds of one task on one engine."""
+    """All arrays of an environment's worlds."""
 
     def __init__(self, task: BoundTask, engine: Engine) -> None:
         self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld

@@ -86,8 +86,7 @@ class Worlds(WorldArrays):
     def step_phases(self, substeps: int | None = None, *, skip: bool = False) -> list[Phase]:
         """List the phases of a step in order.
 
-        With ``skip``, the phases of restarts and events are merged into phases that a graph skips if no world needs
-        them.
+        With ``skip``, the phases of restarts and events are merged, so that a graph skips them if no world needs them.
         """
 
         def only(mask: wp.array, *parts: list[Phase]) -> list[Phase]:
@@ -191,7 +190,7 @@ class Worlds(WorldArrays):
     def rehearsal(self) -> None:
         """Launch the kernels of all phases once, so that ``compile_ahead`` can list them."""
         self.seed_streams(0)
-        # all substeps after the first are equal, and each would take milliseconds on the Warp engine
+        # two substeps launch all kernels; on the Warp engine, each further substep would take milliseconds
         step = self.step_phases(min(self.task.frame_skip, 2))
         phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
         for phase in phases:
@@ -321,7 +320,7 @@ class Worlds(WorldArrays):
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
-        # a state that was set without a check may have faults, and its world keeps the last valid observation
+        # a state that was set without a check may be invalid; its world then keeps the last valid observation
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)

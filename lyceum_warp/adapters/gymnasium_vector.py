@@ -52,7 +52,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             tensors, a step never waits for the device.
         copy: Whether to copy results. Without copies, most results are live buffers, which the next step overwrites.
         dict_obs: Whether observations are dicts of all observation groups instead of the group ``policy``. By default,
-            True if the task has several groups.
+            this is True if the task has several groups.
         render_mode: "rgb_array" for pictures, or None.
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.

@@ -46,7 +46,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        # rsl_rl's check would wait for the device, and the environment already reports NaN as a fault
+        # skip rsl_rl's NaN check, which would wait for the device; NaN is a fault of the environment
         "check_for_nan": False,
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},

@@ -1,8 +1,8 @@
 """HumanoidStandup: stand up from the floor (Gymnasium's HumanoidStandup-v5).
 
 MuJoCo's sensor stage computes the contact forces, as in the task humanoid. The first observation of an episode contains
-contact forces. In Gymnasium, they are zero. The solver is Newton instead of the model's PGS. ``uph_cost_weight`` weighs
-the height. Gymnasium documents this parameter but does not use it.
+contact forces. In Gymnasium, they are zero. The solver is Newton instead of the model's PGS. ``uph_cost_weight`` is the
+weight of the height. Gymnasium documents this parameter but does not use it.
 """
 
 import warp as wp

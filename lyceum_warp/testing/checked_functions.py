@@ -36,12 +36,12 @@ class CheckedFunctions:
     def __init__(self, module: str, functions: Mapping[str, wp.Function], views: Mapping[Any, wp.Function]) -> None:
         self._module, self._views = module, views
         self.places: list[str] = []
-        """Each index in the source, such as "observe reads s.qpos[7] out of range (hopper.py, line 40)"."""
+        """A message for each index in the source: "observe reads s.qpos[7] out of range (hopper.py, line 40)"."""
         self._numbers: dict[wp.Function, int] = {}
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # only now, all copies exist that a function may call
+        for scope, numbers in self._scopes:  # a function may call copies that are made later
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:

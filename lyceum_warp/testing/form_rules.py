@@ -35,7 +35,7 @@ def check_noise(ctx: Context) -> None:
 
 
 def check_metrics(ctx: Context) -> None:
-    """``episode_metrics`` are sums of ``metrics`` over an episode without faults, and part of the state."""
+    """``episode_metrics`` are sums of ``metrics`` over an episode without faults. They are part of the state."""
     a, b, horizon = ctx.a, ctx.b, 4
     if not a.metrics:
         return
@@ -105,7 +105,7 @@ def check_success_steps(ctx: Context) -> None:
 def check_events(ctx: Context) -> None:
     """An event runs after a step's reward and termination, and changes the state and the next observation.
 
-    It does not run in worlds that restart, and changes no other world.
+    It does not run in worlds that restart, and does not affect other worlds.
     """
     a, b = ctx.a, ctx.b
     if a.task.functions["event"] is None:

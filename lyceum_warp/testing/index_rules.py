@@ -83,7 +83,7 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Run a step's functions again on the state of a fault, which a read out of range may have caused."""
+        """Repeat a step that ended with a fault, because a read out of range may have caused the fault."""
         env = self.ctx.b
         env.set_state(state)
         env.action.copy_(action)

@@ -200,7 +200,7 @@ def check_masked_reset(ctx: Context) -> None:
 
 
 def check_rand_reset(ctx: Context) -> None:
-    """``rand_reset(seed)`` is reproducible and clears actions. Other resets, worlds and seeds give other states."""
+    """``rand_reset(seed)`` is reproducible and clears actions. Other resets, worlds and seeds give different states."""
     a, b = ctx.a, ctx.b
     ctx.run(a, ctx.actions(5))
     ctx.restart()

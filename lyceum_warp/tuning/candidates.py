@@ -11,9 +11,9 @@ _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
-"""Number of degrees of freedom from which each engine uses a sparse Jacobian."""
+"""Smallest number of degrees of freedom for which each engine uses a sparse Jacobian."""
 _DENSE_LIMIT = 60
-"""Number of degrees of freedom up to which MuJoCo Warp supports a dense Jacobian."""
+"""Largest number of degrees of freedom for which MuJoCo Warp supports a dense Jacobian."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -100,7 +100,7 @@ class Rankings:
         start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
             exact, own = self._seconds(self.one, start), self._seconds(one, start)
-            if repeat:  # the first plans load kernels
+            if repeat:  # the first plans are not timed, because they load kernels
                 times.append(own)
                 ratios.append(exact / own)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}

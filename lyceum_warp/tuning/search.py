@@ -36,10 +36,10 @@ class Tuning:
     rows: list[Row]
     """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
     "same" if the interval of the returns lies within the tolerance, "different" if it lies outside, and "not shown"
-    otherwise. It is "faults" if there are more than twice as many faults as in the unchanged task. It is "no gain",
-    without a comparison of returns, if the setting is less than 3 % faster and saves no memory. It is "refused" if
-    MuJoCo or the engine refuses the setting, for the reason in the entry ``refused``. A setting of a planner may also
-    get "ranks badly"."""
+    otherwise. The verdict is "faults" if there are more than twice as many faults as in the unchanged task. The verdict
+    is "no gain", without a comparison of returns, if the setting is less than 3 % faster and saves no memory. The
+    verdict is "refused" if MuJoCo or the engine refuses the setting, for the reason in the entry ``refused``. A
+    planner's setting may also get the verdict "ranks badly"."""
     reference: Row
     """Results of a comparison of the unchanged task with itself."""
     not_tried: list[str]
@@ -54,12 +54,12 @@ class Tuning:
 
     @property
     def flags(self) -> str:
-        """Write the best setting as flags of lyceum-warp train and plan, or "" without one."""
+        """Write the best setting as flags of lyceum-warp train and plan, or "" if there is none."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
     def task_line(self) -> str:
-        """Write the best setting as a task's line for ``physics="fast"``, or "" without one."""
+        """Write the best setting as a task's line for ``physics="fast"``, or "" if there is none."""
         return task_line(self.best["physics"]) if self.best else ""
 
 
@@ -80,20 +80,20 @@ def tune(
     """Find the fastest physics options that do not change a task's returns.
 
     Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence
-    and returns. Returns are those of the same episodes under random actions and under a policy. Settings are first
-    tried alone. Then the best settings of all groups are combined. While the combination changes the returns, its least
-    useful setting is removed.
+    and returns. Returns are compared over the same episodes, under random actions and under a policy. Settings are
+    first tried alone. Then the best settings of all groups are combined. While the combination changes the returns, its
+    least useful setting is removed.
 
     Args:
         task: A task's name, file or class.
-        run: Folder of a run of the same task. Returns are then compared under its policy, too, and its parameters
-            replace the task's defaults.
+        run: Folder of a run of the same task. Returns are then also compared under the run's policy, and the run's
+            parameters replace the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Bound on the 95 % interval of the difference of returns, relative to the mean absolute return. It is
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
-        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, enough
-            for a narrow interval, but for at most a minute (5 s with ``short``).
+        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, there
+            are enough for a narrow interval, but they take at most a minute (5 s with ``short``).
         planning: Whether to find physics options for the worlds of the task's planner. The search then compares
             planning times, and the rankings of the same samples from standing, moving and fallen states. It suggests a
             setting if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). ``nworld``

@@ -61,7 +61,7 @@ def reject(s: World, p: Params) -> bool:
 class FingerSpin(lw.Task):
     model, frame_skip = suite.model("finger"), 2
     obs = {"position": 4, "velocity": 3, "touch": 2}
-    # planners hold each torque for two steps, and their reward rises with the speed even above the task's speed
+    # planners hold each torque for two steps; their reward keeps rising above the task's target speed
     planning = lw.Planning(
         settings={
             "horizon": 16, "samples": 32, "knots": 8, "spline": "zero", "noise": 2.0, "temperature": 0.02,

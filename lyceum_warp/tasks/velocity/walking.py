@@ -342,7 +342,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     draw_command(s, p, rng)
 
 
-# the command is that before the step
+# these functions read the command before the step
 
 
 @wp.func
