@@ -123,7 +123,7 @@ FUNCTIONS = {
                      writes={"s1": "memory"}),
         TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", None,
                      "Writes what one transition adds to sums over all worlds. ``ended`` is True at an episode's end. "
-                     "Only in environments with automatic resets. Default: none."),
+                     "It is called only in environments with automatic resets. Default: none."),
         TaskFunction("share", "shared: Shared, sums: Sums, p: Params", None,
                      "Updates the memory that all worlds share, from the sums since the last update. "
                      "``env.update_shared`` calls this function. Default: no change."),
