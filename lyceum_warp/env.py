@@ -292,9 +292,9 @@ class Env:
     def get_state(self, out: torch.Tensor | None = None, mask: torch.Tensor | None = None) -> torch.Tensor:
         """Get the complete state of every world, (nworld, state_space.size), float64.
 
-        A state has everything that determines the future of its world. That includes the engine's integration state,
-        model fields that differ between worlds, counters, the random stream and the task's memory.
-        ``state_space.parts`` names the columns of a state.
+        A state has everything that determines the future of its world. It includes the engine's integration state, the
+        world's own model fields, counters, the random stream and the task's memory. ``state_space.parts`` names the
+        columns of a state.
 
         Args:
             out: Tensor into which the states are written.

@@ -39,8 +39,7 @@ class OpenLoop:
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. By default, each world
             draws the same numbers as ``env.step`` from its state.
-        nominal_model: Whether to use the nominal values of model fields that differ between worlds, instead of the
-            values in ``state``.
+        nominal_model: Whether to use nominal values of model fields, instead of each world's own values in ``state``.
         models: Values, by name, of model fields that differ between worlds. They replace the values in ``state``. Each
             is (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
             values.

@@ -1,7 +1,7 @@
 """Define the options of an environment and of its physics.
 
-The arguments of ``make``, ``replicate`` and MPPI, the command line and the help texts follow from ``EnvOptions`` and
-``PhysicsOptions``. To add an option, add a field to one of these classes.
+``EnvOptions`` and ``PhysicsOptions`` determine the arguments of ``make``, ``replicate`` and MPPI, the command line and
+the help texts. To add an option, add a field to one of these classes.
 """
 
 import dataclasses

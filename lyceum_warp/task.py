@@ -470,10 +470,10 @@ class Task:
     """Number of steps after which an episode is truncated, or 0 for never."""
     success_steps: ClassVar[int] = 1
     """Number of successes in a row before ``env.success`` is True. If it is more than 1, the state has a part
-    ``success_steps`` with the current count, which a reset clears."""
+    ``success_steps`` with the count so far. A reset clears the count."""
     lagged: ClassVar[tuple[str, ...]] = ()
-    """Fields that keep the values from ``mj_step``, which are one substep older than the state, as in some Gymnasium
-    tasks."""
+    """Fields that keep the values from ``mj_step``, as in some Gymnasium tasks. These values are one substep older than
+    the state."""
     cleared: ClassVar[tuple[str, ...]] = ()
     """Fields of the last substep, such as contact forces, that a reset clears before ``initialize``. A forward pass
     computes all other fields in worlds that restart."""

@@ -90,7 +90,7 @@ def check_bad_warmstart(ctx: Context) -> None:
 
 
 def check_not_finite(ctx: Context) -> None:
-    """A reward or an observation that is not finite is a fault of its world, and changes no other world."""
+    """A reward or an observation that is not finite is a fault, and changes no other world."""
     a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
     others, actions = ~ctx.mask(bad), ctx.actions(2)
     params = {name: value for name, value in a.task.params.items() if name not in ("dt", "substep_dt")}

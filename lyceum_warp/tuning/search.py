@@ -35,11 +35,11 @@ class Tuning:
 
     rows: list[Row]
     """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
-    "same" if the interval of the returns lies within the tolerance, "different" if it lies outside, and "not shown"
-    otherwise. The verdict is "faults" if there are more than twice as many faults as in the unchanged task. The verdict
-    is "no gain", without a comparison of returns, if the setting is less than 3 % faster and saves no memory. The
-    verdict is "refused" if MuJoCo or the engine refuses the setting, for the reason in the entry ``refused``. A
-    planner's setting may also get the verdict "ranks badly"."""
+    "same" if the interval of the returns lies within the tolerance. It is "different" if the interval lies outside, and
+    "not shown" otherwise. The verdict is "faults" if there are more than twice as many faults as in the unchanged task.
+    The verdict is "no gain", without a comparison of returns, if the setting is less than 3 % faster and saves no
+    memory. The verdict is "refused" if MuJoCo or the engine refuses the setting, for the reason in the entry
+    ``refused``. A planner's setting may also get the verdict "ranks badly"."""
     reference: Row
     """Results of a comparison of the unchanged task with itself."""
     not_tried: list[str]
@@ -79,10 +79,10 @@ def tune(
 ) -> Tuning:
     """Find the fastest physics options that do not change a task's returns.
 
-    Every setting is compared with the unchanged task in the same process: steps per second, memory, faults, divergence
-    and returns. Returns are compared over the same episodes, under random actions and under a policy. Settings are
-    first tried alone. Then the best settings of all groups are combined. While the combination changes the returns, its
-    least useful setting is removed.
+    Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults,
+    divergence and returns. Returns are compared over the same episodes, under random actions and under a policy.
+    Settings are first tried alone. Then the best settings of all groups are combined. While the combination changes the
+    returns, its least useful setting is removed.
 
     Args:
         task: A task's name, file or class.

@@ -147,8 +147,8 @@ class Trials:
     def _speed(self, env: Env) -> tuple[float, float, float]:
         """Measure steps per second of all worlds, and the speed-up's median and lower bound.
 
-        As other processes may slow down blocks, the lower bound is the smaller of two numbers: the blocks' lower
-        quartile, and the speed-up between the fastest blocks.
+        The lower bound is the smaller of two numbers: the blocks' lower quartile, and the speed-up between the fastest
+        blocks. It allows for other processes that slow down blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
