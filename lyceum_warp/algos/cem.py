@@ -1,13 +1,13 @@
 """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
 CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). The
-noise has a standard deviation s_t for each element of the plan. The n best samples u_t^1, ..., u_t^n, the elites,
-determine the next plan and the next noise:
+noise has a standard deviation s_t for each element of the plan. The n best samples u_t^1, ..., u_t^n are called elites.
+They determine the next plan and the next noise:
 
     u_t = 1/n sum_k u_t^k,    s_t = max(sqrt(1/n sum_k (u_t^k - u_t)^2), min_noise)
 
-The covariance is diagonal, as in hydrax, judo and MuJoCo MPC. Smoothing changes the standard deviation of the noise by
-the factor ``spread``. Therefore s_t is divided by this factor.
+The covariance is diagonal, as in hydrax, judo and MuJoCo MPC. Smoothing multiplies the noise's standard deviation by
+``spread``. The elites' standard deviation is therefore divided by ``spread``.
 """
 
 from collections.abc import Sequence
@@ -33,7 +33,7 @@ class EliteWeights(PlanUpdate):
         self._rank = torch.zeros_like(samples.returns, dtype=torch.int32)
 
     def weigh(self, samples: PlanSamples) -> None:
-        """Weight the best samples that did not fail."""
+        """Give equal weights to the best samples that did not fail."""
         returns, weights, rank = (by_sample(rows) for rows in (samples.returns, samples.weights, self._rank))
         plants, count = samples.returns.shape
         wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)

@@ -1,7 +1,7 @@
 """Evaluate and differentiate small fully connected networks on the CPU without autograd.
 
-With a hundred units per layer, torch's modules and autograd take longer than the arithmetic itself. This module
-computes only one matrix product per layer, into preallocated buffers.
+With a hundred units per layer, torch's modules and autograd take longer than the arithmetic itself. For each layer,
+this module computes only one matrix product, into a preallocated buffer.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -32,10 +32,9 @@ _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[tor
     nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
     nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
 }
-"""For each activation: a function that applies it in place, and a function that multiplies by its derivative in
-place."""
+"""Two functions for each activation: one applies it in place, the other multiplies by its derivative in place."""
 
-_FEW = 2**18  # use NumPy, whose calls have less overhead than torch's, up to this number of multiplications
+_FEW = 2**18  # up to this number of multiplications, use NumPy, whose calls have less overhead than torch's
 
 
 class DensePasses:
@@ -115,10 +114,10 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs for u (rows, outputs), and write it into ``out``."""
+        """Compute J^T u at the last inputs, and write it into ``out``; u has the shape (rows, outputs)."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # the product with the longer rows is faster
+            # of the product and its transpose, the one with longer rows is faster
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:

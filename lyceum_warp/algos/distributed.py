@@ -36,7 +36,7 @@ class Team:
         return self.size == 1 or distributed.get_backend() == "nccl"
 
     def capture(self, function: Callable[[], object]) -> torch.cuda.CUDAGraph:
-        """Capture torch operations and communication in a CUDA graph."""
+        """Capture a function in a CUDA graph, including its communication."""
         graph = torch.cuda.CUDAGraph()
         # other threads, such as NCCL's, may call CUDA during the capture
         with capturing(), torch.cuda.graph(graph, capture_error_mode="thread_local"):
@@ -62,7 +62,9 @@ class Team:
         return nworld // self.size
 
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Convert indices into (steps, worlds of all processes) to indices into (steps, nworld).
+        """Convert indices of the samples of all processes to indices of this process's samples.
+
+        All samples have the shape (steps, worlds of all processes), and this process's samples (steps, nworld).
 
         Returns:
             The indices, and a mask of this process's samples. Samples of other processes get the index 0.
@@ -97,7 +99,7 @@ class Team:
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:
         """Broadcast tensors from rank 0, in place.
 
-        Processes on different hardware would drift apart by rounding errors.
+        Otherwise, rounding errors would make processes on different hardware drift apart.
         """
         if self.size > 1:
             tensors = list(tensors)
@@ -129,10 +131,10 @@ class Team:
 
 
 class Captured:
-    """Calls a function of torch operations and communication. On a GPU, a CUDA graph replays the function.
+    """Calls a function that runs torch operations and communicates with other processes.
 
-    The function must update tensors in place, because a graph stores addresses. The first call runs the function
-    directly.
+    On a GPU, a CUDA graph replays the function. The function must update tensors in place, because a graph stores
+    addresses. The first call runs the function directly.
     """
 
     def __init__(self, function: Callable[[], object], team: Team, device: torch.device) -> None:
@@ -152,7 +154,7 @@ class Captured:
             return
         with torch.cuda.device(self.device):
             if not self._warm:
-                # before a capture, torch requires a run on a stream that is not the default stream
+                # before a capture, torch requires one call on a stream other than the default stream
                 current, side = torch.cuda.current_stream(), torch.cuda.Stream()
                 side.wait_stream(current)
                 with torch.cuda.stream(side):

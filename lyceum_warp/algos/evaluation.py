@@ -20,7 +20,7 @@ _MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive an evaluation's seed from a training seed. Their initial states differ."""
+    """Derive a seed for evaluation from the seed of training, so that initial states differ."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -67,11 +67,11 @@ def evaluate(
 
     Args:
         env: The environment; its worlds are reset.
-        policy: A function that maps observations (nworld, nobs) to actions (nworld, nact), or a module with such a
-            method ``act``.
+        policy: A function that maps observations (nworld, nobs) to actions (nworld, nact), or a module whose method
+            ``act`` does this.
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states, which differ from those of an environment made with the same seed. Without a
-            seed, the worlds continue their random streams.
+        seed: Seed of the initial states. The same seed in ``lw.make`` gives different initial states. Without a seed,
+            the worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
@@ -150,7 +150,7 @@ class MeanPolicyEvaluation:
         self._few: Env | None = None
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
-        """Add the results of an evaluation to the statistics, or None for each result if no evaluation is due."""
+        """Evaluate the policy if due, and add the results to the statistics; otherwise, the results are None."""
         found: dict[str, Any] = dict.fromkeys(_MEAN_STATISTICS)
         if due:
             means = torch.zeros(len(found), dtype=torch.float64, device=self.env.obs.device)

@@ -1,4 +1,4 @@
-"""Check the fields of a configuration by their annotations and bounds."""
+"""Check that the fields of a configuration match their annotations and bounds."""
 
 import dataclasses
 import math
@@ -16,8 +16,8 @@ LEAST = -math.inf
 def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
     """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
-    Checked are numbers with bounds, bools, ``Literal``, the widths of hidden layers (``tuple[int, ...]``) and names of
-    groups of observations (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
+    The function checks numbers with bounds, bools, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and names
+    of observation groups (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.

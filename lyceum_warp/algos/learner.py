@@ -1,4 +1,4 @@
-"""Define the interface of learning algorithms that training, run folders and export use."""
+"""Define the interface between learning algorithms and training, run folders and export."""
 
 import abc
 import copy
@@ -15,7 +15,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
-"""Prefixes of columns in metrics.csv, for a metric's sum over an episode and for its mean over steps."""
+"""Prefixes of the metrics' columns in metrics.csv: sums over an episode, and means over all samples."""
 
 NESTED = ("metrics", "step_metrics", "numbers")
 
@@ -153,7 +153,7 @@ class Learner(abc.ABC):
 
     @property
     def best_by(self) -> str:
-        """The field of ``Iteration`` that selects the best policy and is compared with a run's target return.
+        """The field of ``Iteration`` that a run uses to select its best policy and to check its target return.
 
         "mean_return" is the return of the policy after the update, without noise. "return_mean" is the return of the
         policy before the update, with noise. The default is "mean_return", or "return_mean" if the configuration has

@@ -11,11 +11,11 @@ from lyceum_warp.algos.distributed import Captured, Team
 Samples = Mapping[str, torch.Tensor]
 
 _SURE = 6.0
-"""A process's buffer has room for this many standard deviations more than the mean number of its samples."""
+"""A process's buffer holds the mean number of its samples plus this many standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:
-    """Compute the size of each process's buffer for a mini-batch of ``batch`` samples of all processes."""
+    """Compute the size of each process's buffer; ``batch`` counts the mini-batch's samples of all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 
@@ -46,9 +46,10 @@ class Minibatches:
 
     @torch.no_grad()
     def shuffle(self, samples: Samples, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Copy samples (steps, nworld, ...) into mini-batches (mini-batches, samples, ...) at fixed addresses.
+        """Copy samples in random order into mini-batches at fixed addresses.
 
-        The generator must have the same state in every process.
+        The samples have the shape (steps, nworld, ...), and the result (mini-batches, samples, ...). The generator must
+        have the same state in every process.
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
         places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)

@@ -1,6 +1,6 @@
 """Update plans by model predictive path integral control (MPPI): weight samples by the exponential of their returns.
 
-In MPPI, a sample k of the planner (``planner.py``) with the return R_k has the weight
+MPPI weights each sample by its return. If sample k of the planner (``planner.py``) has the return R_k, its weight is
 
     w_k = exp((R_k - max R) / temperature) / sum_j exp((R_j - max R) / temperature),
 

@@ -1,4 +1,4 @@
-"""Divide a planner's arguments into settings, options and parameters; their defaults are the task's ``planning``."""
+"""Divide a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ def task_config(task: type[Task], value: object = None) -> MPPIConfig:
 
     Args:
         task: The task.
-        value: The planner's value function; its ``discount``, if it has one, replaces the task's discount.
+        value: The planner's value function. If it has a ``discount``, this replaces the task's discount.
 
     Raises:
         ValueError: The task's ``planning`` is not valid.
@@ -129,7 +129,7 @@ _OWN_OPTIONS = {
     "seed": "every sample starts from the state to plan from",
     "first_world": "no other process has samples",
 }
-"""Options that the planner sets itself, each with the reason for refusing a value."""
+"""Options that only the planner may set, each with the reason."""
 
 
 def _check_options(options: Mapping[str, Any]) -> None:

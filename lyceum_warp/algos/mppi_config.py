@@ -38,9 +38,9 @@ class MPPIConfig:
     samples: int = 64
     """Number of samples per improvement of the plan. The planner rolls out each sample in one world per model."""
     update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
-    """Method that computes the new plan: the mean of the samples with weights exp(return / temperature) ("mppi"), the
-    mean of the best samples ("cem", the cross-entropy method), the best sample ("predictive_sampling"), or a
-    ``PlanUpdate``."""
+    """How to compute the new plan. "mppi" averages all samples with the weights exp(return / temperature). "cem", the
+    cross-entropy method, averages the best samples. "predictive_sampling" takes the best sample. A ``PlanUpdate`` is a
+    custom method."""
     temperature: float = 0.1
     """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
@@ -48,14 +48,15 @@ class MPPIConfig:
     """Number of best samples to which CEM fits the plan and the noise. None means a tenth of the samples, but at least
     two."""
     noise: Numbers = 0.5
-    """Noise that is added to the plan, in units of the action: a standard deviation, a standard deviation for each
-    action, or a covariance, (nact, nact). CEM adapts the noise, starting from the standard deviations in ``noise``."""
+    """Noise that is added to the plan, in units of the action. Give a single standard deviation, a standard deviation
+    for each action, or a covariance matrix, (nact, nact). CEM adapts the noise, starting from the standard deviations
+    in ``noise``."""
     min_noise: float | Sequence[float] | None = None
     """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
     ``noise``."""
     include_plan: bool | None = None
-    """Whether the first sample is the plan itself, without noise. None means True in general, but False with a single
-    sample, and False with an update that adapts the noise, such as CEM."""
+    """Whether the first sample is the plan itself, without noise. None means False with a single sample or with an
+    update that adapts the noise, such as CEM. Otherwise, None means True."""
     smoothing: tuple[float, float, float] = (0.25, 0.8, 0.0)
     """Weights (b0, b1, b2) that smooth the noise n over time: e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2) from the third
     step on. (1, 0, 0) is white noise. The noise of knots is not smoothed."""
@@ -85,7 +86,7 @@ class MPPIConfig:
     """Number of models in which each sample is rolled out. With several models, the planner randomizes their model
     fields with the task's ``startup``, ``initialize`` and ``randomize``, and ignores the values in the state."""
     risk: Literal["mean", "worst"] = "mean"
-    """Combination of a sample's returns in several models: their mean or the smallest."""
+    """How to combine a sample's returns in several models: by their mean ("mean") or by the smallest ("worst")."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.update, PlanUpdate):
@@ -126,7 +127,7 @@ class MPPIConfig:
         """Replace None by defaults, except in ``knots`` and in settings that the update ignores.
 
         Args:
-            value: The planner's value function; its ``discount``, if it has one, is the default discount.
+            value: The planner's value function. If it has a ``discount``, this is the default discount.
 
         Raises:
             ValueError: A setting does not apply to the update.

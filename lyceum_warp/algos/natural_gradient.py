@@ -1,4 +1,4 @@
-"""Compute the vanilla policy gradient and the natural gradient, by conjugate gradient on the Fisher information."""
+"""Compute the vanilla policy gradient, and solve for the natural gradient by conjugate gradient."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -33,7 +33,7 @@ class FisherProduct:
     """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
 
     The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks. The block of theta is E[J^T
-    diag(1/sigma^2) J] with J = d mean / d theta. The block of log sigma is diagonal with the entry 2.
+    diag(1/sigma^2) J] with J = d mean / d theta. The block of log sigma is twice the identity matrix.
 
     ``count`` is the number of observations of all processes. ``weight`` is 0 for observations of other processes, and
     otherwise 1.
@@ -69,7 +69,7 @@ class FisherProduct:
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:
-            # this term is not a sum over samples, so each process adds a share
+            # this term is not a sum over samples, so each process adds 1 / size of it
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 
@@ -100,7 +100,7 @@ def conjugate_gradient(
 ) -> torch.Tensor:
     """Solve A x = target for a symmetric positive definite matrix A, starting from x = 0; ``product`` computes A x.
 
-    No branch depends on values, so the host never waits for the device.
+    No branch depends on the value of a tensor, so the host never waits for the device.
     """
     x = torch.zeros_like(target)
     residual = target.clone()

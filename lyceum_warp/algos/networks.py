@@ -46,7 +46,7 @@ def mlp(
 ) -> nn.Sequential:
     """Make a fully connected network with Glorot-uniform weights and zero biases.
 
-    ``sizes`` includes the input and the output. ``last_scale`` is a factor on the last layer's initial weights.
+    ``sizes`` includes the input and the output. ``last_scale`` multiplies the last layer's initial weights.
 
     Raises:
         ValueError: The activation is unknown.
@@ -123,7 +123,7 @@ class Normalizer(nn.Module):
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:
-        """Set ``shift`` and ``scale`` between their values before and after an update."""
+        """Interpolate ``shift`` and ``scale`` between their values before and after an update."""
         self.shift.copy_(torch.lerp(before[0], after[0], part))
         self.scale.copy_(torch.lerp(before[1].log(), after[1].log(), part).exp())
 

@@ -34,13 +34,13 @@ _SHORTER = 4
 """Maximum number of times that NPG shortens a step."""
 
 _LARGEST = 1e30
-"""Rewards are clipped to this limit, so that the sum of an episode fits into float32."""
+"""Rewards are clipped to this limit, so that their sum over an episode fits into float32."""
 
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
 
 _DRIFT = 0.2
-"""Maximum KL divergence of a normaliser's update, as a fraction of the desired KL divergence."""
+"""Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
 
 
 @document_attributes
@@ -65,14 +65,15 @@ class NPGIteration(OnPolicyIteration):
     outliers: int
     """Number of advantages that were clipped to ten standard deviations of the returns."""
     skipped_updates: int
-    """Number of non-finite updates that were skipped: 0, 1 or 2 (policy, value function)."""
+    """Number of updates that NPG skipped because they were not finite: 0, 1 or 2. Each iteration updates the policy and
+    the value function."""
     time_gradient: float
     """Seconds for advantages and the vanilla gradient."""
     time_solve: float
     """Seconds for conjugate gradient and the step."""
     time_value: float
-    """Seconds for the value function's fit. Time that overlaps with the step (on two CPU threads) counts only in
-    ``time_solve``."""
+    """Seconds for the value function's fit. On two CPU threads, the fit overlaps with the step. Only ``time_solve``
+    includes the overlapping time."""
 
 
 @document_attributes
@@ -123,7 +124,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # reading a number must not wait for a device or another process
+        # read numbers only if this waits neither for a GPU nor for another process
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -182,7 +183,7 @@ class NPG(OnPolicyLearner):
         fisher = self.fisher(obs)
 
         # 6. Fit the value function to the samples' returns; with two CPU threads, the fit runs in parallel with step 5.
-        # The fit corrects the change of the predictions by the value function's normaliser.
+        # Updating the normaliser changes the value function's predictions; the fit corrects this change.
         self.value.observe(value_obs, team)
         fit = functools.partial(self.fit, value_obs, rollout.step.flatten(), target.flatten(), self.generator)
         with beside(fit, allowed=self._reads_numbers) as fit_result:
@@ -306,7 +307,7 @@ class NPG(OnPolicyLearner):
         return old_mean
 
     def fisher(self, obs: torch.Tensor) -> FisherProduct:
-        """Make the product with the Fisher information of a random subset of the samples."""
+        """Make the ``FisherProduct`` of a random subset of the samples."""
         weight = None
         if self._fisher_count < self.count:
             subset = torch.randperm(self.count, generator=self.generator, device=obs.device)[: self._fisher_count]
@@ -383,7 +384,7 @@ class NPG(OnPolicyLearner):
 
 
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Compute the mean of returns and of prediction errors, and the sums of squared deviations, as scalar tensors."""
+    """Compute means and sums of squared deviations of returns and of prediction errors, as scalar tensors."""
     target, error = returns.double(), (returns - predicted).double()
     return {
         "target_mean": (target_mean := target.mean()),
@@ -394,7 +395,7 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str,
 
 
 def value_statistics(sums: Sequence[Mapping[str, float]], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from each process's sums over its ``samples`` samples."""
+    """Compute ``value_error`` and ``explained_variance`` from the sums of processes with ``samples`` samples each."""
     sized = [{**part, "samples": samples} for part in sums]
     n, mean, square = pooled(sized, "samples", "target_mean", "target_square")
     _, error_mean, error_square = pooled(sized, "samples", "error_mean", "error_square")

@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""NPG restarts worlds by default (``min_restarts``) if an episode lasts longer than this number of iterations. When an
-episode of hopper lasted 63 or 31 iterations, the return stayed low for a long time with some seeds, but not with 16
-iterations (bench/README.md, "NPG's learning curves")."""
+"""By default, NPG restarts worlds (``min_restarts``) if an episode lasts longer than this number of iterations. When an
+episode of hopper lasted 31 or 63 iterations, the return of some seeds stayed low for a long time. This did not happen
+when an episode lasted 16 iterations (bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
@@ -39,10 +39,10 @@ class NPGConfig:
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon; 0 turns
     restarts off. If fewer worlds started an episode in the last iteration, random worlds are restarted. This requires
-    "segments" and a time limit. Without restarts, worlds that started together reach the time limit together, and few
-    samples in between come from the start of an episode. The statistics exclude interrupted episodes, so values well
-    above 1 bias ``return_mean`` towards short episodes. The default is 0.5 if an episode lasts longer than 20
-    iterations, and 0 otherwise."""
+    "segments" and a time limit. Without restarts, worlds that started together reach the time limit together. Between
+    the time limits, few samples come from the start of an episode. The statistics exclude interrupted episodes, so
+    values well above 1 bias ``return_mean`` towards short episodes. The default is 0.5 if an episode lasts longer than
+    20 iterations, and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97

@@ -1,4 +1,4 @@
-"""Define the interface of plan updates, which weight the samples, and may fit the plan and its noise to them.
+"""Define the interface of plan updates, which turn samples into the next plan.
 
 The planner (``planner.py``) rolls out the samples and computes their weighted mean.
 """

@@ -12,8 +12,7 @@ Each call improves a plan, a sequence of actions u_t, from a given state:
 
 The formulation follows Williams et al., 2017 ("Information theoretic MPC for model-based reinforcement learning"),
 without a cost on the controls, as in Lyceum (Summers et al. 2020) and in trajopt. The smoothing comes from trajopt.
-Returns are divided by the temperature. Summers et al. give inverse temperatures; for example, their 5 corresponds to a
-temperature of 0.2.
+Returns are divided by the temperature. Summers et al. give inverse temperatures, such as 5 for a temperature of 0.2.
 
 With several plants, each plant has its own plan, and the planner rolls out the samples of all plans together. The
 samples of a single plan may leave most of a GPU, or most threads, idle.
@@ -84,10 +83,11 @@ class Planner:
     plans, and on the plan from which it starts. In each sample, the task's functions draw from a separate stream seeded
     by the planner, so a plan cannot anticipate the plant's random numbers.
 
-    ``plants=n`` plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n worlds. Plant i uses the
-    seed ``seed + i`` for its noise, so its plan equals the plan of a single-plant planner with this seed on the same
-    engine. With ``models``, all plants use the models of the first seed. With several plants, all buffers except
-    ``model_fields`` have an axis for the plants, after the axis for steps or knots if there is one.
+    With ``plants=n``, the planner plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n
+    worlds. Plant i uses the seed ``seed + i`` for its noise. On the same engine, its plan equals the plan of a
+    single-plant planner with this seed. With ``models``, all plants use the models of the first seed. With several
+    plants, all buffers except ``model_fields`` have an axis for the plants. It follows the axis for steps or knots, if
+    there is one.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
@@ -103,11 +103,11 @@ class Planner:
             per plant.
         plants: Number of plants to plan for.
         params: Parameters of the task. A parameter that has the same name as a setting must be given here.
-        words: Individual settings by their names in ``lw.MPPIConfig`` (None keeps the default; ``update`` may be a
-            custom ``lw.PlanUpdate``), options of the planner's worlds as for ``lw.make``, and parameters of the task.
-            Parameters with one value per world are ordered by plant, then by sample, then by model. With a CUDA device,
-            engine="auto" and few samples, the C engine rolls out the samples, because it is faster for few samples.
-            Plans are then on the CPU.
+        words: Settings, options of the planner's worlds, and parameters of the task, by name. Settings are the fields
+            of ``lw.MPPIConfig``; None keeps the default. The setting ``update`` may be a custom ``lw.PlanUpdate``.
+            Options are those of ``lw.make``. Parameters with one value per world are ordered by plant, then by sample,
+            then by model. With few samples, engine="auto" selects the C engine even on a CUDA device, because it is
+            faster then. Plans are then on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -343,7 +343,7 @@ class Planner:
         return action
 
     def _checked(self, state: torch.Tensor) -> torch.Tensor:
-        """Check the state to plan from, or the states of all plants, and unpack a single row."""
+        """Check the state of each plant; with one plant, return a state without the axis for plants."""
         like = self._loop.state
         if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
             state = state[0]
@@ -398,7 +398,7 @@ class Planner:
                 Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples),
                 self._fit_in_torch,
             ]  # fmt: skip
-        # phases become as few graphs as possible; functions that use torch run between the graphs
+        # combine phases into as few graphs as possible; functions that use torch run between the graphs
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
             some: Any = list(group)
@@ -435,7 +435,7 @@ class Planner:
             wp.copy(target, rows)
 
     def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
-        """Compute actions from the rows of plans or samples, unless rows and actions are the same array."""
+        """Interpolate actions from knots; without knots, do nothing."""
         if rows is not actions:
             args = [rows, self._phase, *self._spline, self._low, self._high, actions]
             wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
@@ -540,9 +540,10 @@ class Planner:
             rows.copy_(states[:, self.env.state_space.parts[name]])
 
     def state_of(self, **parts: Any) -> torch.Tensor:
-        """Make a state from some of its parts, such as measurements; all other parts equal the task's fixed reset.
+        """Make a state from some of its parts, such as measurements.
 
-        Model fields have nominal values unless given, as in ``body_mass=...``.
+        All other parts have the values of the task's fixed reset. Model fields have nominal values unless they are
+        given, for example as ``body_mass=...``.
 
         Fields that belong to the last substep, such as accelerations, affect only the first transition of a plan.
         ``time`` also sets the step counter, unless ``step`` is given.
@@ -611,8 +612,8 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The new plan is the mean of the best samples. The standard deviation of the best samples becomes the standard
-    deviation of the noise and persists between calls; ``reset`` restores the initial value. Names in other packages:
+    The new plan is the mean of the best samples. Their standard deviation becomes the standard deviation of the noise.
+    The adapted noise persists between calls, and ``reset`` restores the initial noise. Names in other packages:
 
     ============= =============== ========================
     here          hydrax          judo
@@ -634,8 +635,8 @@ class CEM(MPPI):
 class PredictiveSampling(MPPI):
     """Predictive sampling: ``lw.MPPI`` with ``update="predictive_sampling"``.
 
-    The new plan is the best sample. Howell et al. 2022, hydrax, judo and MuJoCo MPC plan with knots; to plan with
-    knots, set ``knots`` and ``spline``. All arguments of ``lw.MPPI`` except ``update`` are accepted.
+    The new plan is the best sample. Howell et al. 2022, hydrax, judo and MuJoCo MPC plan with knots. To do the same,
+    set ``knots`` and ``spline``. All arguments of ``lw.MPPI`` except ``update`` are accepted.
     """
 
     _only_update = "predictive_sampling"

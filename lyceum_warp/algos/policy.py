@@ -28,9 +28,9 @@ class GaussianPolicy(Normalized):
         nobs: Length of an observation.
         nact: Length of an action.
         hidden: Widths of the hidden layers.
-        network: A module that replaces the default network. It maps observations (..., nobs), normalised if
-            ``normalize`` is set, to mean actions (..., nact), in float32 and independently for each observation. For
-            NPG, the network must be twice differentiable.
+        network: A module that replaces the default network. It maps float32 observations (..., nobs) to float32 mean
+            actions (..., nact), independently for each observation. If ``normalize`` is set, its inputs are normalised.
+            For NPG, the network must be twice differentiable.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.

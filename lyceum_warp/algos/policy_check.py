@@ -19,7 +19,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
 
     The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
     deterministically, and independently for each observation. It must be differentiable with respect to its trainable
-    parameters, for NPG twice.
+    parameters. For NPG, it must be twice differentiable.
 
     Raises:
         ValueError: The policy violates one of these rules.

@@ -35,7 +35,7 @@ _EPS = 1e-2
 _SMALLEST_STD = 1e-6
 
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
-"""Limits of the adaptive learning rate, and the factor of a change."""
+"""Limits of the adaptive learning rate, and the factor by which the rate changes."""
 
 
 @document_attributes
@@ -233,8 +233,8 @@ class PPO(OnPolicyLearner):
         """Compute the update's inputs, each (steps, nworld, ...), with the networks from before the update.
 
         The value function's targets are its predictions plus the advantages. Advantages bootstrap from the observation
-        after each step but before the task's events, such as a push or a new command, because no action caused these
-        events. They also bootstrap at time limits, at faults and at the end of the rollout.
+        after a step. This observation precedes the task's events, such as a push or a new command, because no action
+        causes events. Advantages also bootstrap at time limits, at faults and at the end of the rollout.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
@@ -305,7 +305,7 @@ class PPO(OnPolicyLearner):
             self._losses += self._sums[-3:]
 
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
-        """Append the mirror images of samples. An image keeps the density of its original."""
+        """Append the mirror images of samples; an image has the same density as its original."""
         assert self._mirror is not None
         images = dict(samples)
         for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
@@ -334,7 +334,7 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """Compute the KL divergence from the sampling policy to the current policy, averaged over the samples."""
+        """Compute the KL divergence from the old to the current policy, averaged over the samples."""
         kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 

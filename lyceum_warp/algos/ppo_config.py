@@ -38,7 +38,7 @@ class PPOConfig:
     """Clipping range of the probability ratio around 1. With clip_value_loss, predicted values are clipped to the same
     range around the old predictions."""
     clip_value_loss: bool = True
-    """Whether the value loss is the larger of two errors: of the prediction and of the clipped prediction."""
+    """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
@@ -76,8 +76,8 @@ class PPOConfig:
     """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
-    image. "loss" adds symmetry_coef times the squared difference between the policy and its mirror image to the loss.
-    "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
+    image. "loss" adds a term to the loss: symmetry_coef times the squared difference between the policy and its mirror
+    image. "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True

@@ -13,7 +13,7 @@ from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 Rows: TypeAlias = dict[str, torch.Tensor]
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""The default capacity: this number of transitions, or of steps of every world if that is more."""
+"""The default capacity is this number of transitions, or this number of steps of every world if that is more."""
 
 _SHARE = 0.3
 
@@ -156,7 +156,7 @@ class Replay:
         """Get transitions by index; a CUDA graph can capture this method.
 
         A return has fewer than ``n_step`` rewards if the episode ends earlier or no further steps are stored. It then
-        also bootstraps from its last observation, except after a termination.
+        bootstraps from its last observation, except after a termination.
 
         Args:
             index: Indices, (batch,) int64: k * nworld + w for world w in the k-th oldest step.

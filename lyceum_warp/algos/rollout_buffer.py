@@ -22,7 +22,7 @@ _Pair: TypeAlias = tuple[Any, wp.array]
 """An array of an environment, and the buffer that stores it for each step."""
 
 _LARGE = 1e18
-"""Maximum absolute observation, whose square fits into float32."""
+"""Largest absolute observation; its square still fits into float32."""
 
 
 @document_attributes
@@ -144,7 +144,7 @@ class Rollout:
             self.store_outputs()
 
     def begin(self) -> None:
-        """Start to fill the buffer, if the caller steps the environment instead of calling ``collect``."""
+        """Prepare the buffer for a caller that steps the environment itself, without ``collect``."""
         self._index.zero_()
         self._fault.zero_()
 
@@ -168,7 +168,7 @@ class Rollout:
 
         Otherwise, worlds that start together and never terminate reach their time limits in the same rollout. The
         statistics exclude the shortened episodes. On the Warp engine, this method does nothing if the task sets
-        ``lw.Task.settle``, because all worlds wait while one world settles after a reset.
+        ``lw.Task.settle``. On this engine, all worlds wait while one world settles after a reset.
 
         Args:
             generator: Random generator with the same state in every process.
@@ -207,7 +207,8 @@ class Rollout:
     def explain_not_finite(self) -> str:
         """Describe in one sentence the first number that is infinite, NaN or too large for float32, and a remedy.
 
-        The environment treats infinite or NaN rewards and observations as faults, so only large ones occur.
+        The environment treats infinite or NaN rewards and observations as faults. Rewards and observations can
+        therefore only be too large.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):

@@ -114,7 +114,7 @@ def _sums(rollout: Rollout) -> dict[str, torch.Tensor]:
 
 
 def pooled(parts: Sequence[Mapping[str, float]], *names: str) -> tuple[float, float, float]:
-    """Compute the size of the union of several sets, its mean, and its sum of squared deviations from the mean.
+    """Compute the size, mean and sum of squared deviations of the union of several sets.
 
     Args:
         parts: Numbers of each set.

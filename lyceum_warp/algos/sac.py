@@ -4,7 +4,7 @@ SAC was proposed by Haarnoja et al., 2018 ("Soft Actor-Critic Algorithms and App
 moving target critics, and a temperature that is adapted to reach a target entropy.
 
 With many worlds and large batches, this implementation is close to FastSAC (Seo et al. 2025, "Learning Sim-to-Real
-Humanoid Locomotion in 15 Minutes"). If the critics predict quantiles, the targets drop the largest ones, as in TQC
+Humanoid Locomotion in 15 Minutes"). If the critics predict quantiles, the targets drop the largest quantiles, as in TQC
 (Kuznetsov et al. 2020, "Controlling Overestimation Bias with Truncated Mixture of Continuous Distributional Quantile
 Critics").
 """

@@ -68,8 +68,8 @@ class SACConfig:
     """Number of quantiles that each critic predicts; with 1, it predicts the mean. TQC (Kuznetsov et al., 2020) uses
     25."""
     dropped_quantiles: int = 2
-    """Number of quantiles per critic that the targets drop, the largest ones of both critics (TQC). With one quantile,
-    the targets use ``critic_bound`` instead."""
+    """Number of quantiles per critic that the targets drop, as in TQC. The targets drop the largest of both critics'
+    quantiles. With one quantile, the targets use ``critic_bound`` instead."""
     critic_bound: Literal["min", "mean"] | None = None
     """Value of an action if ``quantiles`` is 1: the minimum or the mean of the two critics' predictions. The default is
     "mean" with 256 or more worlds, and otherwise "min"."""
@@ -79,18 +79,18 @@ class SACConfig:
     """Initial temperature, the learned weight of the entropy. The default is 0.001 with 256 or more worlds, and
     otherwise 1."""
     target_entropy: float | None = None
-    """Target entropy of the policy, per element of the action scaled to [-1, 1]. SAC adapts the temperature to reach
-    it. The default is 0 with 256 or more worlds, and otherwise -1."""
+    """Target entropy of the policy for each element of an action, where actions are scaled to [-1, 1]. SAC adapts the
+    temperature to reach it. The default is 0 with 256 or more worlds, and otherwise -1."""
     action_limit: float = 1.0
-    """Bound of the absolute values of actions, if the task sets no bounds."""
+    """Largest absolute value of actions that the task does not bound."""
     hidden: tuple[int, ...] | None = None
-    """Widths of the policy's hidden layers. The default widths are 512 256 128 with 256 or more worlds, and otherwise
-    256 256."""
+    """Widths of the policy's hidden layers. With 256 or more worlds, the default is (512, 256, 128). With fewer worlds,
+    it is (256, 256)."""
     activation: Activation = "relu"
     """Activation of the policy's hidden layers."""
     value_hidden: tuple[int, ...] | None = None
-    """Widths of the critics' hidden layers. The default widths are 512 512 512 with 256 or more worlds, and otherwise
-    256 256."""
+    """Widths of the critics' hidden layers. With 256 or more worlds, the default is (512, 512, 512). With fewer worlds,
+    it is (256, 256)."""
     value_activation: Activation = "relu"
     """Activation of the critics' hidden layers."""
     value_group: str | None = None
@@ -99,8 +99,8 @@ class SACConfig:
     """Whether to apply layer normalisation to the critics' hidden layers."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
-    image. "loss" adds symmetry_coef times the squared difference between the policy and its mirror image to the loss.
-    "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
+    image. "loss" adds a term to the loss: symmetry_coef times the squared difference between the policy and its mirror
+    image. "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
     normalize: bool = True

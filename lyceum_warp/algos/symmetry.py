@@ -43,7 +43,7 @@ class PolicyMirror(nn.Module):
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
         """Average each action with the mirror image of the action for the mirrored observation.
 
-        The actions for mirrored observations are then mirror images bit for bit.
+        A mirrored observation then gives the mirrored action, bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 

@@ -59,12 +59,12 @@ def one_thread() -> Iterator[None]:
 def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callable[[], Result]]:
     """Run a function and the ``with`` block in parallel if torch has exactly two threads.
 
-    Each then uses one thread. This is faster than one after the other on two threads: mini-batches do not benefit from
-    a second thread, and large products speed up by less than a factor of two. With any other number of threads, or if
-    it is not allowed, the function runs when the ``with`` block asks for its result.
+    Each then uses one thread. This is faster than running one after the other with two threads each. Mini-batches do
+    not benefit from a second thread, and large products speed up by less than a factor of two. With any other number of
+    threads, or if ``allowed`` is False, the function runs when the ``with`` block asks for its result.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function
         return
-    with one_thread(), ThreadPoolExecutor(1) as pool:  # the pool waits even after an error
+    with one_thread(), ThreadPoolExecutor(1) as pool:  # after an error, the pool still waits for the function
         yield pool.submit(function).result

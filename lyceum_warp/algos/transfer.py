@@ -35,9 +35,9 @@ class Difference:
     second: float
     """The quantity's mean in the second simulation."""
     low: float
-    """Lower end of the confidence interval of the second mean minus the first mean."""
+    """Lower end of the confidence interval of ``second - first``."""
     high: float
-    """Upper end of the confidence interval of the second mean minus the first mean."""
+    """Upper end of the confidence interval of ``second - first``."""
     margin: float
     """The largest difference at which the two means count as equal."""
 
@@ -66,7 +66,7 @@ class Comparison:
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
-    """Differences of returns, of lengths and, if the task can terminate episodes, of terminated fractions."""
+    """Differences of returns and lengths, and of terminated fractions if the task can terminate episodes."""
 
     @property
     def verdict(self) -> str:
@@ -125,12 +125,13 @@ def transfer(
 
     The Warp engine is compared with the C engine, both with the environment's physics options. On the C engine, the
     task's exact physics is compared with its other sets of physics options, and with the environment's set. Both
-    episodes of a pair have equal initial states, randomized model fields, pushes and commands. The intervals of returns
-    and lengths use Student's t over the pairs. The interval of the terminated fraction uses Agresti and Min's method.
+    episodes of a pair have the same initial state, the same randomized model fields, and the same pushes and commands.
+    The intervals of returns and lengths use Student's t over the pairs. The interval of the terminated fraction uses
+    Agresti and Min's method.
 
     Args:
         env: An environment of the task; its worlds do not change.
-        policy: A function from observations to actions, without noise, or a module with such a method ``act``.
+        policy: A function that maps observations to actions without noise, or a module whose method ``act`` does this.
         episodes: Number of pairs of episodes, each in a separate world.
         seed: Seed of the initial states.
         margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction

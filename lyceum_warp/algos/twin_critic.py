@@ -36,7 +36,7 @@ class TwinCritic(Normalized):
     """
 
     shape: dict[str, Any]
-    """Arguments of the constructor for critics of the same structure as these."""
+    """Arguments that make critics with the same structure."""
     group: str
     """The group of observations that the critics use."""
 
@@ -88,7 +88,7 @@ class TwinCritic(Normalized):
 
 
 def quantile_loss(values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Compute the quantile Huber loss of each row (Dabney et al. 2018, equation 10), added over both critics.
+    """Compute the quantile Huber loss of each row (Dabney et al. 2018, equation 10), summed over both critics.
 
     Args:
         values: The critics' quantiles, (2, rows, n).

@@ -110,9 +110,9 @@ class ValueFunction(Normalized):
 
         The last layer compensates for the change (Pop-Art; van Hasselt et al. 2016, "Learning values across many orders
         of magnitude"). Returns are clipped to the old shift plus or minus ``BOUND`` times the old scale, and the scale
-        changes at most by the factor ``BOUND``. If more than a quarter of the returns are outliers, for example after a
-        change of the task, the quartiles determine the bounds of the returns, and the scale may change by any factor.
-        If all returns are equal, the scale does not change.
+        changes at most by the factor ``BOUND``. These limits do not apply if more than a quarter of the returns are
+        outliers, for example after a change of the task. The quartiles of the returns then determine the bounds of the
+        returns, and the scale may change by any factor. If all returns are equal, the scale does not change.
 
         Args:
             returns: Returns, of any shape.

@@ -40,10 +40,11 @@ class ValueFit:
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
     ) -> torch.Tensor:
-        """Fit the value function to returns, or restore it and return False if the result is not finite.
+        """Fit the value function to returns.
 
-        Targets are clipped to the value function's shift plus or minus ``BOUND`` times its scale. The generator must
-        have the same state in every process.
+        If the result is not finite, restore the value function and return False. Targets are clipped to the value
+        function's shift plus or minus ``BOUND`` times its scale. The generator must have the same state in every
+        process.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)
