@@ -117,7 +117,7 @@ class DensePasses:
         """Compute J^T u at the last inputs, and write it into ``out``; u has the shape (rows, outputs)."""
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
-            # of the product and its transpose, the one with longer rows is faster
+            # compute the product or its transpose, whichever has longer rows, because this is faster
             if x.shape[1] < u.shape[1]:
                 out[2 * i].copy_((x.t() @ u).t())
             else:

@@ -64,7 +64,7 @@ class Team:
     def locate(self, index: torch.Tensor, nworld: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Convert indices of the samples of all processes to indices of this process's samples.
 
-        All samples have the shape (steps, worlds of all processes), and this process's samples (steps, nworld).
+        The arrays of samples have the shapes (steps, worlds of all processes) and (steps, nworld).
 
         Returns:
             The indices, and a mask of this process's samples. Samples of other processes get the index 0.

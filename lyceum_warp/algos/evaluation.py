@@ -20,7 +20,7 @@ _MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive a seed for evaluation from the seed of training, so that initial states differ."""
+    """Derive a seed for evaluation from the seed of training, so that their initial states differ."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
@@ -42,7 +42,7 @@ class Episodes:
     terminated: torch.Tensor
     """1.0 for each episode that ended by termination, otherwise 0.0. Time limits and faults are not terminations."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
-    """The task's metrics by name, each summed over the steps of an episode."""
+    """Each metric of the task, summed over the steps of an episode."""
 
     def first(self, count: int) -> "Episodes":
         """Select the first ``count`` episodes."""

@@ -1,4 +1,4 @@
-"""Define the interface between learning algorithms and training, run folders and export."""
+"""Define the interface of learning algorithms."""
 
 import abc
 import copy
@@ -61,11 +61,11 @@ class Iteration:
     mean_success: float | None = None
     """Fraction of the evaluated episodes that ended with the goal met; None if the task does not define ``success``."""
     metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """The task's metrics by name, summed over each episode and averaged over episodes."""
+    """Each metric of the task, summed over an episode and averaged over episodes."""
     step_metrics: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """The task's metrics by name, averaged over all samples."""
+    """Each metric of the task, averaged over all samples."""
     numbers: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Additional numbers of the algorithm, by column name."""
+    """Additional numbers of the algorithm; the keys are columns of metrics.csv."""
 
     def row(self) -> dict[str, Any]:
         """Convert the statistics to a row of metrics.csv, without values that are None.

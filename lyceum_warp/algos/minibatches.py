@@ -15,7 +15,7 @@ _SURE = 6.0
 
 
 def room(batch: int, team: Team) -> int:
-    """Compute the size of each process's buffer; ``batch`` counts the mini-batch's samples of all processes."""
+    """Compute the size of each process's buffer; ``batch`` is the size of a mini-batch over all processes."""
     share = batch / team.size
     return min(batch, math.ceil(share + _SURE * math.sqrt(share)))
 

@@ -39,8 +39,8 @@ class MPPIConfig:
     """Number of samples per improvement of the plan. The planner rolls out each sample in one world per model."""
     update: Literal["mppi", "cem", "predictive_sampling"] | PlanUpdate = "mppi"
     """How to compute the new plan. "mppi" averages all samples with the weights exp(return / temperature). "cem", the
-    cross-entropy method, averages the best samples. "predictive_sampling" takes the best sample. A ``PlanUpdate`` is a
-    custom method."""
+    cross-entropy method, averages the best samples. "predictive_sampling" takes the best sample. A ``PlanUpdate``
+    object defines a custom update."""
     temperature: float = 0.1
     """Temperature of MPPI's weights, in units of reward. Low temperatures follow the best sample; high temperatures
     average all samples."""
@@ -52,8 +52,8 @@ class MPPIConfig:
     for each action, or a covariance matrix, (nact, nact). CEM adapts the noise, starting from the standard deviations
     in ``noise``."""
     min_noise: float | Sequence[float] | None = None
-    """Lower limit of CEM's adapted standard deviations, one number or one for each action. None means a tenth of
-    ``noise``."""
+    """Lower limit of CEM's adapted standard deviations: a single number, or a number for each action. None means a
+    tenth of ``noise``."""
     include_plan: bool | None = None
     """Whether the first sample is the plan itself, without noise. None means False with a single sample or with an
     update that adapts the noise, such as CEM. Otherwise, None means True."""
@@ -67,7 +67,7 @@ class MPPIConfig:
     """Interpolation of actions between knots: piecewise constant ("zero"), piecewise linear ("linear"), or cubic
     Hermite ("cubic")."""
     between: Literal["hold", "linear"] = "hold"
-    """Action between two actions of the plan: the earlier action ("hold"), or their linear interpolation ("linear").
+    """Action to apply between two steps of the plan. "hold" repeats the earlier step's action; "linear" interpolates.
     The setting ``between`` applies if the planner's time step is a multiple of the plant's time step."""
     discount: float | None = None
     """Discount factor of rewards and of the terminal value. None means the value function's discount, or 1 without a
@@ -76,10 +76,10 @@ class MPPIConfig:
     """Number of improvements of the plan per call of the planner."""
     fill: str | Numbers = "zero"
     """Action that fills the end of a shifted plan: "zero" (the action nearest to zero), "repeat" (the last action), or
-    a given action (one number, or one per element of the action)."""
+    a given action (a single number, or a number for each element of the action)."""
     termination: Literal["stop", "ignore"] = "stop"
-    """Whether a sample's return stops at the end of its episode ("stop") or continues to the horizon ("ignore", as in
-    Lyceum and trajopt)."""
+    """How to treat a sample whose episode ends before the horizon. "stop" counts no rewards after the end. "ignore"
+    counts all rewards up to the horizon, as in Lyceum and trajopt."""
     nominal_model: bool = False
     """Whether samples use the nominal values of per-world model fields instead of the values in the given state."""
     models: int = 1

@@ -166,7 +166,7 @@ def moved(module: Module, env: Env) -> Module:
 
 
 def trainable(module: Module) -> Module:
-    """Return the module, and unfreeze it if all its parameters are frozen, as in a module from ``lw.load``."""
+    """Return the module; if all its parameters are frozen, as after ``lw.load``, unfreeze them."""
     if isinstance(module, nn.Module) and not any(parameter.requires_grad for parameter in module.parameters()):
         module.requires_grad_(True)
     return module

@@ -193,7 +193,7 @@ class NPG(OnPolicyLearner):
             timer.mark()
             fitted = fit_result()
 
-        # one copy to the host
+        # copy all numbers to the host at once
         update = {
             "kl": kl, "step_norm": step.norm(), "step_fraction": fraction, "gradient_norm": gradient.norm(),
             "std_mean": self.policy.log_std.detach().exp().mean(),
@@ -395,7 +395,10 @@ def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str,
 
 
 def value_statistics(sums: Sequence[Mapping[str, float]], samples: int) -> dict[str, float]:
-    """Compute ``value_error`` and ``explained_variance`` from the sums of processes with ``samples`` samples each."""
+    """Compute ``value_error`` and ``explained_variance`` from the sums of all processes.
+
+    ``samples`` is the number of samples of each process.
+    """
     sized = [{**part, "samples": samples} for part in sums]
     n, mean, square = pooled(sized, "samples", "target_mean", "target_square")
     _, error_mean, error_square = pooled(sized, "samples", "error_mean", "error_square")

@@ -57,7 +57,8 @@ class NPGConfig:
     damping: float = 1e-4
     """Damping, added to the diagonal of the Fisher information (as in mjrl, unlike Lyceum)."""
     fisher_fraction: float = 1.0
-    """Fraction of the samples used for the Fisher information, drawn at random in each iteration."""
+    """Fraction of the samples from which NPG computes the Fisher information. NPG draws these samples at random in each
+    iteration."""
     kl_limit: float = 1.5
     """Maximum KL divergence of a step, as a multiple of delta / 2. NPG shortens steps that exceed this limit."""
     hidden: tuple[int, ...] = (64, 64)

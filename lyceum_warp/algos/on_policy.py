@@ -1,4 +1,4 @@
-"""Define the base class of NPG and PPO: networks, rollouts, advantages, evaluation and checkpoints."""
+"""Define the base class of NPG and PPO, with their networks, rollouts, advantages, evaluation and checkpoints."""
 
 import dataclasses
 from typing import Any, ClassVar

@@ -84,10 +84,10 @@ class Planner:
     by the planner, so a plan cannot anticipate the plant's random numbers.
 
     With ``plants=n``, the planner plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n
-    worlds. Plant i uses the seed ``seed + i`` for its noise. On the same engine, its plan equals the plan of a
-    single-plant planner with this seed. With ``models``, all plants use the models of the first seed. With several
-    plants, all buffers except ``model_fields`` have an axis for the plants. It follows the axis for steps or knots, if
-    there is one.
+    worlds. Plant i uses the seed ``seed + i`` for its noise. On the same engine, the plan of plant i equals the plan of
+    a single-plant planner with this seed. With ``models``, all plants use the models of the first seed. With several
+    plants, all buffers except ``model_fields`` have an axis for the plants. This axis follows the axis for steps or
+    knots, if there is one.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
@@ -106,8 +106,8 @@ class Planner:
         words: Settings, options of the planner's worlds, and parameters of the task, by name. Settings are the fields
             of ``lw.MPPIConfig``; None keeps the default. The setting ``update`` may be a custom ``lw.PlanUpdate``.
             Options are those of ``lw.make``. Parameters with one value per world are ordered by plant, then by sample,
-            then by model. With few samples, engine="auto" selects the C engine even on a CUDA device, because it is
-            faster then. Plans are then on the CPU.
+            then by model. With few samples, engine="auto" selects the C engine even if there is a CUDA device. The C
+            engine is faster for few samples, and its plans are on the CPU.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -135,8 +135,8 @@ class Planner:
     sampled: torch.Tensor
     """The last improvement's actions, (horizon, samples, nact)."""
     model_fields: dict[str, torch.Tensor]
-    """The values of model fields in each model, (models, size) float64; empty with one model. Each call reads the
-    values."""
+    """The values of model fields in each model, (models, size) float64; empty with one model. The planner reads these
+    values in each call."""
     model_returns: torch.Tensor
     """The samples' returns in each model, (samples, models); minus infinity for failed samples."""
     returns: torch.Tensor
@@ -387,7 +387,7 @@ class Planner:
         )  # fmt: skip
 
     def _program(self, *, first: bool) -> Calls:
-        """List the calls that make one improvement; the first improvement also shifts the plan in time."""
+        """List the calls of one improvement; the first improvement also shifts the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -465,7 +465,6 @@ class Planner:
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
-        """Compute the weights by an update that uses torch, and compute the statistics of the improvement."""
         arrays = self._arrays
         if (returned := self._update.weigh(arrays)) is not None:
             raise ValueError(
@@ -612,8 +611,9 @@ class MPPI(Planner):  # noqa: D101
 class CEM(MPPI):
     """The cross-entropy method: ``lw.CEM(task, ...)`` is ``lw.MPPI(task, update="cem", ...)``.
 
-    The new plan is the mean of the best samples. Their standard deviation becomes the standard deviation of the noise.
-    The adapted noise persists between calls, and ``reset`` restores the initial noise. Names in other packages:
+    The new plan is the mean of the best samples. The standard deviation of the best samples becomes the standard
+    deviation of the noise. The adapted noise persists between calls, and ``reset`` restores the initial noise. Names in
+    other packages:
 
     ============= =============== ========================
     here          hydrax          judo

@@ -19,7 +19,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
 
     The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
     deterministically, and independently for each observation. It must be differentiable with respect to its trainable
-    parameters. For NPG, it must be twice differentiable.
+    parameters. For NPG, the policy must be twice differentiable.
 
     Raises:
         ValueError: The policy violates one of these rules.
@@ -40,7 +40,7 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
 
 
 def check_sizes(policy: Any, env: Env, name: str = "the policy") -> None:
-    """Check that a policy fits an environment's observations and actions; errors call the policy ``name``.
+    """Check that a policy fits an environment's observations and actions; error messages call it ``name``.
 
     Raises:
         ValueError: The sizes of the policy and the environment differ.

@@ -42,7 +42,8 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     Args:
         policy: A module with the method ``act`` and the attribute ``nobs``.
         path: Path of the file; an existing file is replaced.
-        env: An environment of the policy's task. If given, an ONNX file also contains the ``deployment_metadata``.
+        env: An environment of the policy's task. With an environment, an ONNX file also contains the
+            ``deployment_metadata``.
 
     Returns:
         The file's path.

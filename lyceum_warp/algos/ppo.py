@@ -174,7 +174,7 @@ class PPO(OnPolicyLearner):
             self.update(samples)
             kl = self.divergence()
 
-        # one copy to the host
+        # copy all numbers to the host at once
         losses = self._losses / (config.epochs * config.minibatches)
         finite = torch.stack([numbers.isfinite().all() for numbers in (losses, *self._parameters)]).all()
         statistics, (update, *_) = gathered(rollout, team, {
@@ -230,7 +230,7 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """Compute the update's inputs, each (steps, nworld, ...), with the networks from before the update.
+        """Compute the inputs of the update, each (steps, nworld, ...).
 
         The value function's targets are its predictions plus the advantages. Advantages bootstrap from the observation
         after a step. This observation precedes the task's events, such as a push or a new command, because no action

@@ -23,7 +23,7 @@ class Transitions(NamedTuple):
     """Sampled transitions. A learner's target is ``reward + discount * value(next_obs)``."""
 
     obs: dict[str, torch.Tensor]
-    """Observations before the first step, by group, each (batch, size of the group)."""
+    """Observations of each group before the first step, (batch, size of the group)."""
     action: torch.Tensor
     """Actions of the first step, (batch, nact)."""
     reward: torch.Tensor
@@ -31,7 +31,7 @@ class Transitions(NamedTuple):
     discount: torch.Tensor
     """Factors that multiply the value of ``next_obs``, (batch,): gamma^k after k steps, or 0 after a termination."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after the last step and before any reset, by group."""
+    """Observations of each group after the last step and before any reset."""
 
 
 @document_attributes
@@ -65,7 +65,7 @@ class Replay:
     stored: int
     """Number of steps stored so far, including overwritten steps."""
     obs: dict[str, torch.Tensor]
-    """Observations before each step, by group, each (steps, nworld, size). Row ``t % steps`` stores step t."""
+    """Observations of each group before each step, (steps, nworld, size). Row ``t % steps`` stores step t."""
     action: torch.Tensor
     """Actions, (steps, nworld, nact)."""
     reward: torch.Tensor
@@ -75,7 +75,7 @@ class Replay:
     truncated: torch.Tensor
     """Whether the time limit or a fault ended the episode, (steps, nworld) bool."""
     next_obs: dict[str, torch.Tensor]
-    """Observations after each step and before any reset, by group."""
+    """Observations of each group after each step and before any reset."""
 
     def __init__(self, env: Env, capacity: int | None = None) -> None:
         check_kind("env of Replay", env, Env, "as lw.make(...) makes it")
@@ -198,7 +198,7 @@ class Replay:
             array[place] = rows[name].to(array.device)
 
     def restore(self, stored: int) -> None:
-        """Set the number of steps stored so far, after the last ``set_rows``."""
+        """Set the number of steps stored so far; call this after the last ``set_rows``."""
         self._set_stored(whole_number("stored", stored, low=0, high=2**62))
 
     def state_dict(self) -> dict[str, Any]:

@@ -49,9 +49,9 @@ class Rollout:
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations before each step by group; the entry "policy" is ``obs``."""
+    """Observations of each group before each step; the entry "policy" is ``obs``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after each step by group; the entry "policy" is ``final_obs``."""
+    """Observations of each group after each step; the entry "policy" is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
@@ -67,9 +67,9 @@ class Rollout:
     episode_length: torch.Tensor
     """Number of the episode's steps so far, (steps, nworld)."""
     episode_metrics: dict[str, torch.Tensor]
-    """Sums of the task's metrics over the episode so far, by name, each (steps, nworld)."""
+    """Each metric of the task, summed over the episode so far, (steps, nworld)."""
     metrics: dict[str, torch.Tensor]
-    """The task's metrics at each step, by name, each (steps, nworld)."""
+    """Each metric of the task at each step, (steps, nworld)."""
 
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that the statistics exclude."""
@@ -205,10 +205,10 @@ class Rollout:
         self.running_return.masked_fill_(mask, 0.0)
 
     def explain_not_finite(self) -> str:
-        """Describe in one sentence the first number that is infinite, NaN or too large for float32, and a remedy.
+        """Find the first number that is infinite, NaN or too large for float32, and describe it and a remedy.
 
         The environment treats infinite or NaN rewards and observations as faults. Rewards and observations can
-        therefore only be too large.
+        therefore be too large, but not infinite or NaN.
         """
         kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
         for groups in (self.obs_groups, self.final_obs_groups):

@@ -28,7 +28,7 @@ class SampledIteration(Iteration):
     time_mean: float
     """Seconds for evaluating the mean policy."""
     samples_per_second: float
-    """Samples per second of sampling; with SAC, per second of sampling and updates."""
+    """Samples per second during sampling. With SAC, the time of the updates counts too."""
 
     def row(self) -> dict[str, Any]:
         """Convert the statistics to a row of metrics.csv, including values that are None."""
@@ -55,10 +55,10 @@ def gathered(
     Args:
         rollout: This process's samples.
         team: The processes.
-        numbers: Further numbers of this process, scalar tensors by name.
+        numbers: Further numbers of this process, as scalar tensors.
 
     Returns:
-        The fields of ``SampledIteration`` that describe samples and episodes, by name; and ``numbers`` of each process.
+        The fields of ``SampledIteration`` that describe samples and episodes, and the ``numbers`` of each process.
     """
     named = {**_sums(rollout), **numbers}
     rows = team.gather(torch.stack([scalar.double() for scalar in named.values()])[None]).tolist()

@@ -217,7 +217,7 @@ class SAC(Learner):
         parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         team.copy_leader([*parameters, *self.target.parameters()])
 
-        # one copy to the host
+        # copy all numbers to the host at once
         finite = torch.stack([numbers.isfinite().all() for numbers in (self._sums, *parameters)]).all()
         sums = dict(zip(("critic_loss", "q_mean", "actor_loss", "entropy"), self._sums, strict=True))
         numbers = {"finite": finite, "temperature": self.log_temperature.detach().exp(), **sums}
@@ -397,7 +397,7 @@ class GradientStep:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step, and return the sums of the loss and the numbers over all processes."""
+        """Make a gradient step, and return the loss and ``numbers``, each summed over all processes."""
         # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
         parts = [*gradients, *(number.detach() for number in (loss, *numbers))]

@@ -28,8 +28,8 @@ class Difference:
     """A quantity's means in two simulations, and the difference of the means with a 95 % confidence interval."""
 
     quantity: str
-    """"return", "length" (in steps) or "terminated" (the fraction of episodes that ended by termination, such as a
-    fall)."""
+    """The quantity: "return", "length" (in steps) or "terminated" (the fraction of episodes that ended by termination,
+    such as a fall)."""
     first: float
     """The quantity's mean in the first simulation."""
     second: float
@@ -181,7 +181,7 @@ def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, 
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
-    """Get the task's and the environment's physics options by name, and the name of the environment's options.
+    """Get the physics options of the task and the environment, and the name of the environment's options.
 
     Options that only the Warp engine has are ignored.
     """
