@@ -68,7 +68,7 @@ def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
 
 
 def check_field_name(name: str) -> None:
-    """Refuse a name that neither MjData nor MjModel has."""
+    """Raise ValueError unless MjData or MjModel has a field of this name."""
     if is_data_field(name) or is_model_field(name):
         return
     hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
@@ -133,8 +133,8 @@ class BoundTask:
     """A task with its compiled model, its parameters and its kernels.
 
     Args:
-        fields: Fields that the engine provides in addition to those in ``World``.
-        dynamics: Model fields that may differ between worlds in addition to those that the task writes.
+        fields: More fields for the engine to provide. It always provides the fields of ``World``.
+        dynamics: Model fields that may differ between worlds, besides those that the task writes.
         params: Values for the fields of ``Params``: one value, or one value per world.
     """
 
@@ -155,7 +155,7 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.metrics = self.source.terms.metrics
-        """Reward terms, the names in the attribute ``metrics``, and terminations."""
+        """The names of all metrics: first the reward terms, then the task's ``metrics``, then the terminations."""
         self._check_class()
         memory = self.source.memory
         own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
@@ -165,11 +165,11 @@ class BoundTask:
         self.types = {name: v.type for name, v in self.source.world.vars.items() if name not in own_names}
         self.types |= {name: Row[float] for name in MEMORIES if any(part.kind == name for part in memory.values())}
         self.writes = self._checked_writes()
-        """The fields of World and the rows of memory that each function writes."""
+        """What each function writes: fields of World and rows of memory."""
         own = [name for name in named if is_data_field(name)]
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
-        """The model before ``edit_model``. A replica of the environment copies this model, not the file."""
+        """The model before ``edit_model``."""
         self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
@@ -187,7 +187,7 @@ class BoundTask:
             given=params or {}, weights=self.source.terms.weights,
         )  # fmt: skip
         self.actions = self._checked_actions()
-        """Sizes of an action's parts. None if the actions are MuJoCo's controls."""
+        """The size of each part of an action, or None if the actions are MuJoCo's controls."""
         self.memory = self._memory_layouts()
         """The layouts of ``memory`` and ``lasting_memory``."""
         self.obs_layouts = obs_layouts(self.source, self.params)
@@ -238,7 +238,7 @@ class BoundTask:
         }
 
     def _rights(self, function: TaskFunction) -> Rights:
-        """Return the fields that a function may write, for each of its arguments."""
+        """Return which fields of each argument a function may write."""
         model = [name for name in self.types if is_model_field(name)]
         memory = tuple(self.source.memory)
         lasting = (*(name for name, part in self.source.memory.items() if part.kind == "lasting_memory"), *model)
@@ -262,7 +262,7 @@ class BoundTask:
         varied = [name for name in dict.fromkeys([*named, *dynamics]) if name in written]
         self.dynamics = [describe_model_field(self.model, name) for name in varied]
         self.constants = [describe_model_field(self.model, name, varies=False) for name in named if name not in varied]
-        """The model fields that functions read and all worlds share."""
+        """The model fields that functions read and that have the same value in all worlds."""
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
@@ -275,7 +275,7 @@ class BoundTask:
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
             changed = "the observation's" if obs_layouts(self.source, self.params) != self.obs_layouts else ""
-        except ValueError:  # a size differs between worlds
+        except ValueError:  # the size of a part would differ between worlds
             changed = "the observation's"
         layouts = (self._memory_layouts(), self._shared_layouts())
         changed = changed or ("the memory's" if layouts != (self.memory, self.shared) else "")
@@ -369,7 +369,7 @@ class BoundTask:
         }
 
     def check_field(self, name: str, array: wp.array) -> None:
-        """Check that a field's type in World fits the engine's array, (nworld, ...)."""
+        """Check that the engine's array of a field, (nworld, ...), fits the type that World declares."""
         kind = self.types[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
         if not wp.types.types_equal(dtype, array.dtype) or ndim != array.ndim - 1:

@@ -1,7 +1,7 @@
 """Generate the source of a task's kernels, which call the task's functions for every world of a batch.
 
-The source defines a struct whose fields have an additional axis for the worlds, and a function that returns a view of
-one world. It is generated as text, because Warp compiles functions from their source.
+The source defines a struct with the fields of all worlds, and a function that returns a view of one world. It is
+generated as text, because Warp compiles functions from their source.
 """
 
 import dataclasses
@@ -104,7 +104,7 @@ def kernels_of(
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
 ) -> steps.Kernels:
-    """Return a task's kernels. Tasks with the same functions, structs and sizes share them (see ``make_kernels``)."""
+    """Return a task's kernels. Tasks with the same functions, structs and sizes share their kernels."""
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     called = tuple(source.terms.functions.items())
     key = (

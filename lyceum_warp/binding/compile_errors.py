@@ -10,9 +10,9 @@ def explained(error: Exception, task: str) -> Exception:
     text = str(error)
     if "while parsing function" not in text and not type(error).__module__.startswith("warp"):
         return error
-    # Warp's message names the kernel that Warp compiled first, perhaps one of another task
+    # Warp's message names the kernel that Warp compiled first, which may belong to another task
     flat = " ".join(text.split())
-    # the last function in Warp's message has the error; a kernel means that a function returns the wrong type
+    # the error is in the last function that Warp's message names; if this is a kernel, a result has the wrong type
     innermost = flat.rpartition("while parsing function")[2]
     call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", innermost)
     kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", flat)

@@ -66,7 +66,10 @@ class TaskSource:
         return {group: list(function.input_types.values())[2] for group, function in functions.items()}
 
     def _observers(self, owner: type[Task]) -> list[str]:
-        """Find functions that write observation groups: all in the class, and uncalled ones in its module."""
+        """Find the functions that write observation groups, in the class and in its module.
+
+        Functions of the module that other functions call are not included.
+        """
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]

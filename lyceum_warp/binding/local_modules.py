@@ -13,13 +13,13 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The modification time and the size of each file."""
 
 _taken: dict[str, Stamps] = {}
-"""For each module that a task's file imported from its folder, the stamp of the module's file."""
+"""The stamps of the modules that task files have imported from their folders, by module name."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
-    """Find the modules in a Python file's folder that the file imports, directly or indirectly, without running them.
+    """Find the modules that a Python file imports from its own folder, directly or indirectly.
 
-    For a package without ``__init__.py``, the result has the package's folder.
+    No module is run. A package without ``__init__.py`` is returned as its folder.
     """
     folder = file.resolve().parent
     found: dict[str, Path] = {}
@@ -58,7 +58,7 @@ def _prefixes(name: str) -> list[str]:
 
 
 def _module_file(folder: Path, name: str) -> Path | None:
-    """Return a module's file in a folder. For a package without ``__init__.py``, return the package's folder."""
+    """Return a module's file in a folder. A package without ``__init__.py`` is returned as its folder."""
     if not name:
         return None
     base = folder.joinpath(*name.split("."))

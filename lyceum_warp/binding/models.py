@@ -25,9 +25,9 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     """Load a model as an MjSpec that does not depend on the working directory.
 
     Args:
-        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec, which is copied. A relative
-            path is relative to the folder of the class ``owner``, or to the current folder without an owner.
-        owner: The task class that declares the model.
+        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec. An MjSpec is copied.
+        owner: The task class that declares the model. Relative paths start at the folder of this class. If None, they
+            start at the current folder.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -93,8 +93,9 @@ def compile_model(
 
     - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
-    - For each field that MuJoCo computes only for sensors, a sensor is added after the model's own sensors. Without
-      such fields, all sensors are turned off. The energy is computed if a function reads it.
+    - MuJoCo computes some fields only for sensors. If such a field is read, a sensor is added after the model's own.
+    - If no field is read that depends on sensors, all sensors are turned off.
+    - If the energy is read, its computation is turned on.
     - If ``contact`` lists a pair of geoms twice, only the first entry is kept. MuJoCo would make the contact twice,
       and MuJoCo Warp once.
 

@@ -15,7 +15,7 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""Set by the package: the seconds in a step and in a substep."""
+"""The durations of a step and of a substep in seconds, which the package sets."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
@@ -187,7 +187,7 @@ class Parameters:
         )
 
     def _table(self, name: str, value: Any) -> np.ndarray:
-        """Convert a table to a read-only array of float32 or int32, with the axes of a vector or matrix last."""
+        """Convert a table to a read-only array of float32 or int32. The last axes are those of a vector or matrix."""
         if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
             return value
         kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
@@ -220,7 +220,7 @@ class Parameters:
         return table
 
     def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace model elements in a table, and with ``field`` also names, by their indices."""
+        """Replace the model elements in a table by their indices. With ``field``, also replace names."""
         if isinstance(value, list | tuple):
             return [self._indices(what, entry, field) for entry in value]
         if isinstance(value, Element):
@@ -249,7 +249,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field with a table's default elements, such as "site_xpos" for a list of sites."""
+    """Return the field of the elements in a default, such as "site_xpos" for a list of sites."""
     while isinstance(default, list | tuple) and default:
         default = default[0]
     return default.field if isinstance(default, Element) else None

@@ -28,11 +28,11 @@ class Slice:
 
 
 Layout = dict[str, Slice]
-"""The slices of a row of floats by name, in order."""
+"""The slice of each part, by the part's name, in the order of the row."""
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """Return the fields of a struct that have parts as defaults. ``owner`` is the struct's name in error messages."""
+    """Return the parts that a struct declares, by field name. Error messages call the struct ``owner``."""
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}
     for name in parts:
@@ -46,7 +46,10 @@ def parts_of(struct: Any, owner: str) -> dict[str, Part]:
 
 
 def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Layout:
-    """Compute the layout of a struct's parts of one kind. A part's size may be the name of a table in ``params``."""
+    """Compute the layout of those parts of a struct that have the given kind.
+
+    A part's size may be the name of a table in ``params``.
+    """
     slices, start = dict[str, Slice](), 0
     for name, part in parts_of(struct, owner).items():
         if part.kind == kind:
@@ -57,7 +60,7 @@ def layout(struct: Any, kind: str, params: Mapping[str, Any], owner: str) -> Lay
 
 
 def sizes(layout: Layout) -> dict[str, int]:
-    """The number of floats of each part."""
+    """Return the number of floats in each part."""
     return {name: part.size for name, part in layout.items()}
 
 

@@ -25,7 +25,7 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""For each task module, the stamps of its file and of the modules that it imports from its folder, when it last ran."""
+"""The stamps of a task's file and of its local modules at the last run of the file, by module name."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""
@@ -39,7 +39,7 @@ _sources: "weakref.WeakKeyDictionary[type[Task], Mapping[Path, bytes]]" = weakre
 def register(task: type[Task]) -> type[Task]:
     """Class decorator: register a task. The task's name is the class name in snake_case.
 
-    A class may replace an earlier one of the same file, for example if a notebook runs a cell again.
+    A class may replace an earlier class of the same name and file. This happens if a notebook runs a cell again.
 
     Raises:
         ValueError: The name belongs to another task, or the class is not a task.
@@ -75,7 +75,7 @@ def package_task_names() -> list[str]:
 def _package_modules() -> dict[str, str]:
     """Find the modules of the package's tasks without importing them.
 
-    A module contains the task of the same name. A folder declares the modules of its tasks in ``TASKS``.
+    A single module contains the task of the same name. A folder lists its tasks and their modules in ``TASKS``.
     """
     found: dict[str, str] = {}
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
@@ -116,7 +116,7 @@ def spelled_task(task: type[Task]) -> str | None:
 def task_name(task: type[Task]) -> str:
     """Return the name under which a task is registered: the class's name in snake_case.
 
-    A name in one of the package's families may have a prefix, such as ``dm/walker_walk`` for WalkerWalk.
+    Some of the package's tasks have a prefix, such as ``dm/`` in ``dm/walker_walk``.
     """
     name = snake_case(task.__name__)
     declared = (known for known, module in _package_modules().items() if module == task.__module__)
@@ -168,9 +168,10 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:
-    """Return the source, as loaded, of a task's file and of the modules that it imports from its folder.
+    """Return the source of a task's file and of the modules that it imports from its folder.
 
-    A class without a file, as in a notebook, has no sources.
+    The source is the one that was loaded, even if a file has changed since then. A class in a notebook has no file, so
+    the result is empty.
     """
     if task not in _sources:
         file = Path(_file(task) or "")
@@ -253,7 +254,7 @@ def kernel_name(task: type[Task]) -> str:
 
 
 def _module_of_file(path: Path) -> ModuleType:
-    """Return the module of a task's file, and run the file if it or a module from its folder has changed."""
+    """Return the module of a task's file. Run the file again if it or one of its local modules has changed."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"

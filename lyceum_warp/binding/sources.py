@@ -66,7 +66,7 @@ class FunctionSource:
     def call(self, node: ast.Call) -> tuple[Literal["static", "helper", "native", "builtin", "other"], Any]:
         """Return a call's kind and its callee.
 
-        A helper has Python source, and a native function is a ``wp.func_native``.
+        A "helper" is a function with Python source, and a "native" function is a ``wp.func_native``.
         """
         callee = self.value(node.func)
         if self.is_static(node):
@@ -78,7 +78,7 @@ class FunctionSource:
         return "helper" if has_source(callee) else "native", callee
 
     def condition(self, node: ast.expr) -> bool | None:
-        """Evaluate a condition that is a ``wp.static(...)``, of which Warp compiles only the selected branch."""
+        """Evaluate a condition that is a ``wp.static(...)``. Return None for any other condition."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
 
@@ -104,7 +104,7 @@ def name_of(function: wp.Function) -> str:
 
 
 def builtin(name: str) -> Any:
-    """Find a builtin function of Warp or Python. Not all of Warp's are attributes of the module ``warp``."""
+    """Find a builtin function of Warp or Python."""
     return builtin_functions().get(name) or getattr(wp, name, None) or getattr(builtins, name, None)
 
 

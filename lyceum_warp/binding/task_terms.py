@@ -1,8 +1,8 @@
 """Find a task's terms and their arguments by name, and generate the functions that compute them.
 
-A term is a function. Its arguments are found by name, as pytest finds fixtures. A name refers to the state, the action,
-the result of another function, a parameter, or a field. The generated text calls each function once, and terms share
-the results.
+A term is a function. The names of its arguments select their values, as the names of fixtures do in pytest. A name
+refers to the state, the action, the result of another function, a parameter, or a field. The generated text calls each
+function once, and terms share the results.
 """
 
 import difflib
@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""Names of a reward term's or a metric's arguments in the generated text."""
+"""The arguments of reward terms and metrics, with their names in the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""Names of a termination's arguments in the generated text."""
+"""The arguments of terminations, with their names in the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Names that terms cannot have, because the generated text uses them."""
@@ -28,7 +28,7 @@ _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float
 
 
 class Terms:
-    """The terms of a task: its ``rewards``, its ``terminations``, and those metrics that ``measure`` does not write."""
+    """The terms of a task: ``rewards``, ``terminations``, and the metrics that have a function of their own."""
 
     def __init__(
         self,
@@ -89,7 +89,10 @@ class Terms:
         return {term: float(weight) for term, weight in rewards.items()}
 
     def _names(self, attribute: str, names: Any, *, written: bool = False) -> tuple[str, ...]:
-        """Check and return the names in an attribute. Return () if the task has ``written`` a function for them."""
+        """Check and return the names in an attribute.
+
+        If ``written`` is True, a function of the task computes all of them, so return ().
+        """
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
             raise ValueError(
                 f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
@@ -106,7 +109,7 @@ class Terms:
     # text
 
     def _written_text(self, metrics: tuple[str, ...], first: int) -> str:
-        """Generate the text. ``measure`` writes the first ``first`` metrics."""
+        """Generate the text. ``first`` is the number of metrics that ``measure`` writes."""
         parts = []
         if self.weights:
             body = _Body(self, _STEP)
@@ -140,12 +143,12 @@ class Terms:
     # names
 
     def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
-        """Select the overload of a function for which all arguments can be found, and return it with its result type.
+        """Return the first overload of a function whose arguments can all be found, and the type of its result.
 
         Args:
             name: The function's name.
             given: The text for each name that refers to a state, the action or Params.
-            within: The functions whose arguments led to this one, to detect cycles.
+            within: The chain of functions that need this function's result. It serves to detect cycles.
         """
         if name in within:
             raise ValueError(
@@ -168,7 +171,7 @@ class Terms:
     def source_of(
         self, function: wp.Function, name: str, given: Mapping[str, str], within: tuple[str, ...]
     ) -> tuple[Literal["expression", "function", "default"], str]:
-        """Find the source of an argument: an expression, the result of a function of that name, or the default."""
+        """Find an argument's value: an expression, the result of the function of that name, or the default."""
         source: Literal["expression", "function"] = "expression"
         if name in given:
             text = given[name]

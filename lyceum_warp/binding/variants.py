@@ -88,8 +88,8 @@ _made: dict[Any, Variant] = {}
 def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
-    Tasks with the same structs and replacements share a variant and its compiled kernels.
-    ``own`` is the task's declaration of Params. It is ``params``, or differs from it only in defaults.
+    Tasks with the same structs and replacements share a variant and its compiled kernels. ``own`` is the Params struct
+    that the task declares. If it changes only defaults, ``params`` is the struct of its base task instead.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]
@@ -133,7 +133,10 @@ def _home(function: wp.Function) -> str:
 
 
 def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[Any]:
-    """Yield the attributes of a module's tasks and the module's globals, now and when each task was defined."""
+    """Yield the attributes of a module's tasks, and the module's globals.
+
+    Globals include those that existed when a task was defined.
+    """
     for owner in owners:
         if owner.__module__ == module.__name__:
             own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())

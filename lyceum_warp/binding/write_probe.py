@@ -15,7 +15,7 @@ from lyceum_warp.support.arrays import launch_parts, launch_worlds
 from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
-"""Bytes of guard memory before and after every row. A write outside a row goes there and damages nothing."""
+"""Bytes of guard memory before and after every row. A write outside a row changes only guard memory."""
 
 _ALIGNED = 64
 
@@ -44,7 +44,10 @@ class GuardedRows:
             wp.copy(self.array, values[: shape[0]])
 
     def outside(self) -> np.ndarray:
-        """Return the ascending indices of elements written outside a row. Those before the row are negative."""
+        """Return the indices at which functions wrote outside a row, in ascending order.
+
+        An index before the start of the row is negative.
+        """
         words: np.ndarray = self._memory.numpy()
         changed = 4 * np.flatnonzero(words != _UNWRITTEN)[:, None] + np.arange(4)
         unwritten = np.array(_UNWRITTEN, dtype=np.uint32).reshape(1).view(np.uint8)
@@ -54,7 +57,7 @@ class GuardedRows:
         return np.unique(index[(index < 0) | (index >= self.size)])
 
     def written(self) -> np.ndarray:
-        """Return the mask of the written elements in a single row of 32-bit numbers."""
+        """Return which elements of the first row were written. The elements must have 32 bits."""
         start = _ROOM // 4
         written: np.ndarray = self._memory.numpy()[start : start + self.size] != _UNWRITTEN
         return written

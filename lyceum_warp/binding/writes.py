@@ -33,14 +33,14 @@ class Write:
     place: str
     """The file and the line of the write."""
     replaced: bool = False
-    """Whether the write assigns the field, as ``s.time = 0.0`` does, instead of an element of its row."""
+    """Whether the write assigns the field itself, as ``s.time = 0.0`` does. Other writes change an element of a row."""
     use: str | None = None
-    """An expression that may write the row but cannot be analysed."""
+    """The expression that may write the row, if it cannot be analysed."""
 
 
 @functools.cache
 def find_writes(function: wp.Function) -> tuple[Write, ...]:
-    """Find the writes of a function and of its callees into the function's arguments, in source order."""
+    """Find all writes into the arguments of a function, in source order. Writes by its callees are included."""
     kinds = enumerate(map(_kind, function.input_types.values()))
     places = tuple(None if kind is None else _Place(i, None, kind) for i, kind in kinds)
     arguments, writes = list(function.input_types), dict[Write, None]()
@@ -57,7 +57,7 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""For each argument, the fields that a function may write, or None for an output row."""
+"""The fields that a function may write, by argument. For an output row, the value is None."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
@@ -103,12 +103,12 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class _Place:
-    """What an expression refers to: an argument of the analysed function, or a field, a row or an element of it."""
+    """The part of an argument to which an expression refers: the whole argument, a field, a row or an element."""
 
     position: int
     field: str | None
     kind: Any
-    """A struct's type, or the number of axes and the element type of an array. None for an element."""
+    """The type of a struct, or an array's number of axes and element type. None for an element."""
 
     def attribute(self, name: str) -> "_Place | None":
         if is_struct(self.kind):
@@ -132,9 +132,9 @@ class _Reader:
     """Reads the source of one function and of its callees.
 
     Args:
-        places: What the caller has passed for each argument: an argument of the analysed function or a part of it.
+        places: The values that the caller passes, one for each argument. None is a value that cannot be written.
         arguments: Names of the arguments of the analysed function.
-        seen: The functions that were already read, each with the places of its arguments.
+        seen: The functions that were already read, with the ``places`` that their callers passed.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class _Reader:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Record a write, or if ``follows`` is False, a use of a row that the analysis cannot follow."""
+        """Record a write. If ``follows`` is False, record a use of a row that may write it."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)

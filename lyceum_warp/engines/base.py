@@ -25,8 +25,8 @@ class Engine(abc.ABC):
     (nworld,) bool, selects the worlds to which a method applies.
 
     In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
-    ``fault``. For worlds that restart, the caller then calls ``reset``, writes state fields and model fields, and calls
-    ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state, so reset all
+    ``fault``. To restart worlds, the caller first calls ``reset``, and writes state fields and model fields. Then it
+    calls ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state, so reset all
     worlds first. Model fields start at the model's values, and resets do not change them.
 
     Args:
@@ -38,14 +38,13 @@ class Engine(abc.ABC):
         initial: The initial state for ``reset``, (integration_size,); None for the model's initial state.
 
     Raises:
-        ValueError: A field is listed twice, as lagged and as current, or a model field cannot differ between worlds of
-            this model.
+        ValueError: A field is listed both as lagged and as current. Or a model field cannot differ between worlds.
     """
 
     name: str
     """The engine's name, as in ``make(engine=...)``."""
     launch_threads: int = 1
-    """The number of threads that launch kernels before and after a step, each for a part of the worlds.
+    """The number of threads that launch kernels before and after a step. Each thread handles a part of the worlds.
 
     With several threads, an engine must launch kernels only through ``lyceum_warp.support.arrays``.
     """
@@ -67,7 +66,7 @@ class Engine(abc.ABC):
     arrays: dict[str, wp.array]
     """The arrays of the fields and model fields, (nworld, ...), by name, filled by the engine's constructor."""
     ctrl: wp.array
-    """The controls of the next step, ``arrays["ctrl"]``, (nworld, nu), float32; part of the state."""
+    """The controls of the next step, (nworld, nu), float32. They are ``arrays["ctrl"]`` and part of the state."""
     fault: wp.array
     """The faults of each world as bits of ``Done``, (nworld,), int32; set by ``find_faults``."""
     stage: Stage
@@ -75,7 +74,7 @@ class Engine(abc.ABC):
     reset_stage: Stage
     """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
-    """The fields that cannot be computed from the integration state, in the order of the state vector."""
+    """Fields that the state stores because the integration state does not determine them, in the state's order."""
     integration_size: int
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
@@ -141,24 +140,27 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Find the faults of the masked worlds since the last call, and write them into ``fault``.
+        """Write the faults that occurred in the masked worlds since the last call into ``fault``.
 
         The method consists of Warp launches on every engine.
         """
 
     def check_room(self) -> None:  # noqa: B027
-        """Log a warning if worlds exceed the limits on contacts or constraints; called once, after the first reset."""
+        """Log a warning if worlds exceed the limits on contacts or constraints.
+
+        It is called once, after the first reset.
+        """
 
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
-        """Put the masked worlds into the initial state, by Warp launches on every engine.
+        """Put the masked worlds into the initial state.
 
-        The caller must then update derived fields by ``refresh``.
+        The method consists of Warp launches on every engine. The caller must then update derived fields by ``refresh``.
         """
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the state fields (by default all) of the masked worlds into the engine, by Warp launches."""
+        """Copy the named state fields of the masked worlds into the engine, by default all, by Warp launches."""
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
@@ -171,8 +173,8 @@ class Engine(abc.ABC):
     def settle(self, mask: wp.array, nstep: int) -> None:
         """Advance only the masked worlds by ``nstep`` substeps, and update state fields.
 
-        The time of these worlds is then 0. The caller must update derived fields by ``refresh``. No bit of any other
-        world changes.
+        The time of these worlds is then 0. The caller must update derived fields by ``refresh``. Other worlds stay
+        exactly the same.
         """
         raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
 
@@ -197,7 +199,7 @@ class Engine(abc.ABC):
     def rollout(self, state: wp.array, controls: wp.array, nstep: int, buffers: Mapping[str, wp.array]) -> None:
         """Roll out every world from a given state, and copy fields into buffers at each step.
 
-        The state fields and ``find_faults`` then describe the final state. Derived fields may be stale.
+        Afterwards, the state fields and ``find_faults`` refer to the final states. Derived fields may be stale.
 
         Args:
             state: Initial states, (nworld, state_size or more) float64, such as those of ``get_state``.

@@ -114,9 +114,9 @@ def bytes_per_world(
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
-    """Return the options to change for an environment with few worlds, such as that of an evaluation.
+    """Return the options to change for an environment with few worlds, as in an evaluation.
 
-    On a GPU, few worlds take nearly as long as thousands. With the engine "auto", they therefore run on the C engine.
+    On a GPU, few worlds take nearly as long as thousands. With engine="auto", few worlds therefore run on the C engine.
     """
     return options_on_cores() if engine == "auto" and engine_name(engine, device) == "warp" else {}
 

@@ -1,7 +1,7 @@
 """Capture the phases of a step, a reset or a plan as graphs, and replay them.
 
 ``Graphs.sequence`` turns a list of phases into calls. Consecutive phases that consist of Warp launches become one
-graph. The calls of an engine without Warp launches run between the graphs.
+graph. Other phases, such as a step of the C engine, run between the graphs.
 
 On the CPU, Warp runs each launch in one thread. Phases that process every world independently therefore become several
 graphs, one for each part of the worlds, and threads replay the graphs in parallel.
@@ -50,7 +50,7 @@ class Graphs:
         device: Device of the launches; Warp can also capture graphs on the CPU.
         enabled: Whether to capture graphs.
         capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
-        workers: Threads that replay the graphs of phases with ``by_world``; by default only the caller's thread.
+        workers: Threads that replay the graphs of phases with ``by_world``. By default, the calling thread does.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions that consist of launches, in one graph, or in one graph per thread if they take long.
+    """Captures functions that consist of launches as one graph. If they take long, each thread gets a graph.
 
     The first call runs the functions directly, and loads their modules. If there are workers, the first replays are
     timed, and the shortest time determines how many threads share the work.

@@ -104,9 +104,9 @@ class MujocoEngine(Engine):
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """The fields to copy before the call of ``forward``, because the call may use the MjData of another world."""
+        """The fields to copy before ``forward`` is called, which may replace them by values of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """The fields of ``_before_stage`` that ``forward`` computes in part, such as early sensors."""
+        """Those fields of ``_before_stage`` to copy again, because ``forward`` updates some of their elements."""
         self._last = [field for field in shown if field not in self._before_stage]
         # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
@@ -141,7 +141,7 @@ class MujocoEngine(Engine):
         initial = self.initial.copy()
         for name in STATE_FIELDS:
             if name in READ_ONLY:
-                continue  # this would shift the time stamps of delayed sensors
+                continue  # rounding would shift the time stamps of delayed sensors
             columns = state_columns(self.model, name)
             initial[columns] = initial[columns].astype(np.float32)
         return wp.array(initial, dtype=wp.float64, device=self.device)
@@ -199,8 +199,11 @@ class MujocoEngine(Engine):
             self._copy(self._after_stage, early=True)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
-        """Copy the masked worlds' fields into float32 arrays; ``early`` skips sensors of the acceleration stage."""
-        with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
+        """Copy the masked worlds' fields into float32 arrays.
+
+        If ``early`` is set, sensors of the acceleration stage are not copied.
+        """
+        with np.errstate(over="ignore"):  # numbers in worlds with faults may overflow
             for field in fields:
                 target, source = self._copies[field.name]
                 where: Any = True if mask is None else mask.reshape(-1, *[1] * (target.ndim - 1))

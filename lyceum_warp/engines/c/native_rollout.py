@@ -31,8 +31,8 @@ def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
 class NativeRollout:
     """Rolls out the worlds of a batch, and leaves the final states in the batch.
 
-    ``bind`` must not have been called on this batch. The snapshots and then the model fields follow the integration
-    state in a state vector.
+    ``bind`` must not have been called on this batch. A state vector consists of the integration state, the snapshots
+    and the model fields, in this order.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class NativeRollout:
         self.final: dict[str, np.ndarray] = {}
         """The results of a forward pass for the final states."""
         self.rows: dict[Any, np.ndarray] = {}
-        """The native rollout's outputs, with one row per substep."""
+        """The outputs of ``Batch.rollout``, with one row per substep."""
         column = batch.nstate
         for field in snapshots:
             self.start[field.name] = slice(column, column + field.size)
@@ -78,18 +78,18 @@ class NativeRollout:
         self._outputs: dict[str, Any] = {"record": list(self.rows), "out": self.rows}
 
     def run(self, initial: wp.array, controls: wp.array, buffers: Mapping[str, wp.array]) -> None:
-        """Roll out the worlds with the arguments of ``Engine.rollout``. Warnings stay in the batch."""
+        """Roll out the worlds. For the arguments, see ``Engine.rollout``. ``batch.warning`` counts the warnings."""
         batch, state = self.batch, initial.numpy()
         batch.state[:] = state[:, : batch.nstate]
         batch.warning[:] = 0
         if self.model_columns:
             self.models.apply({name: state[:, part].astype(np.float32) for name, part in self.model_columns.items()})
         np.copyto(self.by_step, controls.numpy().transpose(1, 0, 2)[:, :, None])
-        # after a warning, a world stops and repeats its last row
+        # MuJoCo stops a world after a warning, and repeats its last row
         call_batch(batch, batch.rollout, nstep=self.control.shape[1], control=self.control, **self._outputs)
         if self.stage > Stage.NONE:
             call_batch(batch, batch.forward, stage=self.stage)
-        with np.errstate(over="ignore"):  # worlds with faults may have huge numbers
+        with np.errstate(over="ignore"):  # numbers in worlds with faults may overflow
             for field in self.fields:
                 self._copy(field, state, buffers[field.name].numpy())
 
@@ -97,7 +97,7 @@ class NativeRollout:
         key = STATE_FIELDS[field.name].value if field.name in STATE_FIELDS else field.name
         rows, nstep = self.rows[key], self.nstep
         if field.name in self.final:
-            # the first substep's row has the values before the step
+            # the row of a step's first substep has the values before the step
             values, end = rows[:, ::nstep], self.final[field.name]
             np.copyto(target[:-1], values.swapaxes(0, 1).reshape(target[:-1].shape), "unsafe")
             np.copyto(target[-1], end.reshape(target[-1].shape), "unsafe")

@@ -31,7 +31,7 @@ class WorldModels:
             self._rounded[field.name] = self._own[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
-        # at first, call set_const in all worlds, so that equal values give equal constants
+        # recompute the constants of all worlds at first, so that equal values give equal constants
         self._stale = np.full(batch.nsim, bool(self._follows))
 
     def apply(self, values: Mapping[str, np.ndarray], mask: np.ndarray | None = None) -> None:
@@ -54,7 +54,7 @@ class WorldModels:
             self._set_const(chosen)
 
     def _set_const(self, worlds: np.ndarray) -> None:
-        """Recompute constants. If MuJoCo rejects a world's values, count a warning and try again next time."""
+        """Recompute constants. If MuJoCo rejects a world's values, the next call tries again."""
         counted = self.batch.warning[:, :, 1].sum(axis=1)
         call_batch(self.batch, self.batch.set_const, worlds)
         self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > counted)[worlds]

@@ -16,7 +16,7 @@ class CanonicalOrder:
     """Sorts a Data's contacts and constraint rows in every forward pass, through MuJoCo Warp's callbacks.
 
     MuJoCo Warp's own deterministic mode makes sums of atomic additions reproducible, but does not sort contacts and
-    rows. Each callback calls ``between`` before it sorts.
+    rows. The function ``between`` is called before each sort.
 
     Raises:
         ValueError: The model has flexes, or MuJoCo Warp's contacts have an unknown field.

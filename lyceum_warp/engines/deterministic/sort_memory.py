@@ -12,8 +12,7 @@ LARGEST_BUFFER = 2**31 - 1
 """Size of the largest byte array in Warp. An axis of a Warp array has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""Memory is extrapolated from these two numbers of worlds, with which all of Warp's buffers exceed their minimum
-size."""
+"""The two numbers of worlds with which memory is measured. They are so large that no buffer has its minimum size."""
 
 
 class Scratch(Reserve):
@@ -60,7 +59,7 @@ class Scratch(Reserve):
 
 @dataclasses.dataclass(frozen=True)
 class ScratchSizes:
-    """The scratch bytes of any number of worlds, and the largest number of worlds for which Warp can make buffers."""
+    """Computes the scratch bytes for a number of worlds, and the largest number of worlds that Warp supports."""
 
     fixed: int
     each: int

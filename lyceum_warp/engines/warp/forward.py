@@ -1,4 +1,4 @@
-"""Compute substeps and forward passes, whole or in part, for all worlds or a few."""
+"""Compute substeps and forward passes. A pass may be limited to some of its parts, or to some worlds."""
 
 import functools
 import inspect
@@ -21,11 +21,11 @@ from lyceum_warp.support.upstream import forward_functions
 Part = Callable[[mjw.Model, mjw.Data], None]
 
 POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The first parts of substeps and forward passes, which depend only on positions."""
+"""The parts with which a substep or a forward pass begins. They depend only on positions."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
-    """Advance every world of a Data by one substep, without the parts of ``POSITION`` in ``done``."""
+    """Advance every world of a Data by one substep. Skip the parts in ``done``, which must be parts of ``POSITION``."""
     _without(frozenset(done))["step"](model, data)
 
 
@@ -76,7 +76,7 @@ def _copy(function: str, **names: Any) -> Callable[..., Any]:
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
-    """Do nothing, in place of a part that is already computed."""
+    """Do nothing. This function replaces a part that is skipped."""
 
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
@@ -91,7 +91,7 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""The parts that each part needs, in order, without collisions and constraints. ``fwd_velocity`` includes
+"""The parts that must run before each part. None of them needs collisions or constraints. ``fwd_velocity`` includes
 ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
@@ -205,7 +205,7 @@ class PartialForward:
     def __call__(
         self, mask: wp.array, forward: Callable[[mjw.Model, mjw.Data], None], targets: Mapping[str, wp.array]
     ) -> None:
-        """Compute fields in the masked worlds by ``forward``, and copy them into the targets, by Warp launches only."""
+        """Call ``forward`` for the masked worlds, and copy their fields into the targets. Use only Warp launches."""
         group = self._group
 
         def work() -> None:

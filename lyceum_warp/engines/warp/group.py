@@ -95,14 +95,14 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Add the bits of the group's rows to the bits of the same worlds."""
+        """Set in each world of the group the bits that its row in the group has."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
 class Arena(Reserve):
     """An allocator for loops and branches of CUDA graphs, where Warp cannot allocate.
 
-    A run outside a graph counts the bytes, and reserves them. Graphs share this memory, because they never run at the
+    A run outside a graph determines how many bytes to reserve. Graphs share this memory, because they never run at the
     same time.
     """
 

@@ -27,7 +27,7 @@ _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
 elements, so a probe may miss many contacts. The second pair is MuJoCo Warp's default."""
 
-_FIRST = 32  # number of worlds that are checked
+_FIRST = 32  # the number of worlds to check
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
@@ -40,10 +40,12 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Measure how many contacts and constraints to allocate for each world.
 
-    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on: inactive equality
-    constraints, friction losses if randomized, and all limits if their ranges are randomized. In the rollouts, 32
-    worlds run 500 substeps on the C engine under random controls, each held for 20 substeps. The worlds start in the
-    model's initial state or a keyframe, half of them with random velocities. Results are cached for each model.
+    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on. These are inactive
+    equality constraints, friction losses if they are randomized, and all limits if their ranges are randomized.
+
+    In the rollouts, 32 worlds run 500 substeps on the C engine. The controls are random and held for 20 substeps. The
+    worlds start in the model's initial state or a keyframe, half of them with random velocities. Results are cached for
+    each model.
 
     Args:
         model: The compiled model.
@@ -159,9 +161,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""The memory of a world, divided by its memory in MuJoCo Warp's Data. In measurements, a step's temporary arrays took 1
-to 9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive
-and take up to three times as much."""
+"""A world takes this many times its memory in MuJoCo Warp's Data. In measurements, a step's temporary arrays took 1 to
+9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and
+take up to three times as much."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The same factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5

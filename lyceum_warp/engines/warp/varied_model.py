@@ -57,7 +57,7 @@ def constants_of(fields: Iterable[ModelField]) -> Constants:
 
 
 def outputs_of(fields: Collection[ModelField]) -> list[str]:
-    """Return the names of the constants that differ between worlds if the given fields do."""
+    """Return the names of the constants that differ between worlds if the given fields differ."""
     groups = constants_of(fields)
     names = [name for group, outputs in OUTPUTS.items() if group & groups for name in outputs]
     sized = any(field.name == "geom_size" for field in fields)
@@ -108,7 +108,7 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """Make the model of a group of worlds, which has its own rows of the given fields.
 
-    With the model of all worlds, MuJoCo Warp would read row w for world w of the group, which belongs to another world.
+    World w of the group is a different world from world w of the batch, so it must not read row w of the batch's model.
     The group also gets copies of the fields ``own``, because it writes them.
     """
 

@@ -103,7 +103,7 @@ class WarpEngine(Engine):
         if self.reset_stage < Stage.ACCELERATION:
             self._reset_parts = forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
-        # the parts of the next step's first forward pass that the last step or restart has already computed
+        # the parts that the next step can skip, because the last step or restart has computed them
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
@@ -191,7 +191,7 @@ class WarpEngine(Engine):
         data: mjw.Data | None = None,
         model: mjw.Model | None = None,
     ) -> None:
-        """Run the given parts of a forward pass in every world of a Data; if None, run all parts up to ``stage``."""
+        """Run parts of a forward pass in every world of a Data. By default, run all parts up to ``stage``."""
         m, d = self.m if model is None else model, self.d if data is None else data
         with self._on_device():
             if parts is not None:
@@ -304,7 +304,7 @@ class WarpEngine(Engine):
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
 
     def _partial_forward(self) -> PartialForward | None:
-        """Make a forward pass of the restarting worlds alone, unless this is impossible or saves nothing."""
+        """Make a forward pass of the restarting worlds only. Return None if it is impossible or saves nothing."""
         return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
@@ -317,7 +317,7 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Restore the sensor histories afterwards, because the next step adds the same samples."""
+        """Restore the sensor histories after the context, because the next step adds the same samples."""
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield

@@ -1,6 +1,7 @@
 """Define kernels that copy masked worlds into a small group and back, place static geoms, and correct constants.
 
-Each masked world has a rank. A group holds the worlds with consecutive ranks, beginning with rank ``first``.
+The masked worlds are numbered from 0 in any order. The number of a world is called its rank. A group holds the worlds
+with consecutive ranks, beginning with rank ``first``.
 """
 
 import warp as wp
