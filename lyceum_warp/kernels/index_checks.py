@@ -1,7 +1,7 @@
 """Check array indices while ``check_task`` runs instrumented copies of a task's functions.
 
-``report`` is (places, 3). Each row belongs to one place in the source at which an array is indexed. It holds the number
-of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
+``report`` is (places, 3). Each row describes one place in the source at which an array is indexed. A row holds the
+number of bad indices, the first bad index, and the size of the array. Functions are not inlined, because inlining would
 increase compile times.
 """
 

@@ -16,7 +16,7 @@ ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
 """Spline orders by name."""
 
 _NEEDED = {"zero": 1, "linear": 2, "cubic": 4}
-"""The number of knots from which a value is interpolated."""
+"""The number of knots that determine an interpolated value."""
 
 
 def knot_count(horizon: int, knots: int, spline: str) -> int:

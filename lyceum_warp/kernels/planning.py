@@ -11,9 +11,9 @@ from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
-"""Stands for the episode in the random streams of the noise, which thus differ from the worlds' streams."""
+"""Replaces the episode number in the random streams of the noise, so that they differ from all streams of worlds."""
 DRAWS = wp.constant(-3)
-"""Stands for the episode in the stream keys of the samples."""
+"""Replaces the episode number in the stream keys of the samples."""
 
 _TILES = f"{__name__}.tiles"
 """The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,

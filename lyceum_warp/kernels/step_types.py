@@ -50,7 +50,7 @@ class Findings:
 
 
 OUTCOMES = {name: field.type.dtype for name, field in Outcome.vars.items() if field.type.ndim == 1}
-"""Types of the fields of Outcome with the shape (nworld,)."""
+"""The fields of Outcome with the shape (nworld,), and their types."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ ALL_FAULTS = wp.constant(int(FAULTS))
 EVENT = wp.constant(-2)
 """The substream from which ``event`` draws, within a step's random stream."""
 STARTUP = wp.constant(-1)
-"""Stands for the episode in the random stream of ``startup``."""
+"""Replaces the episode number in the random stream of ``startup``."""
 
 
 def act_kernels(task: TaskCode) -> None:
@@ -260,7 +260,10 @@ class Kernels(SimpleNamespace):
     """The kernels of a step by name; kernels that the task does not need are None."""
 
     views: Mapping[Any, wp.Function]
-    """The functions that make the structs: of World from a batch and a world's index, of observations from a row."""
+    """The functions that make the structs of the task.
+
+    World is made from a batch and a world's index. The other structs are made from a row of floats.
+    """
     terms: Mapping[str, wp.Function]
     """The generated functions of a task with terms: ``reward``, ``score`` and ``terminated``."""
     Batch: Any

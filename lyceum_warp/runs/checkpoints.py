@@ -21,11 +21,11 @@ FORMAT = 1
 _FIX = "restore the file from a copy, or train again into another folder"
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The class of a network for files that do not name it."""
+"""The classes of networks in files that name no class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> dict[str, Any]:
-    """Copy a policy and a value function to the CPU: the entries ``iteration``, ``policy`` and, if any, ``value``."""
+    """Make the content of a policy's file, with copies of the networks on the CPU."""
     content: dict[str, Any] = {"lyceum_warp": FORMAT, "iteration": iteration}
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
@@ -74,7 +74,7 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # import only modules of algos, because importing a module runs its code, and the file could name any module
+        # the file could name any module, and importing a module runs its code: import only modules of algos
         kind = pydoc.locate(own) if own.startswith("lyceum_warp.algos.") and shape is not None else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""

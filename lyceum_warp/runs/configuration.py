@@ -26,14 +26,14 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
-"""The learner's class and the class of its hyperparameters, by the algorithm's name in config.json."""
+"""The class of each algorithm and the class of its hyperparameters, by the algorithm's name in config.json."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
     kept = ["horizon", "graphs", "fields", "dynamics"]
-    if learner.team.neighbours == 1:  # several processes may be resumed with another number of processes
+    if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
         kept.append("nthread")
     others = {name: value for name, value in options.given().items() if name in kept}
     if isinstance(options.model, str | Path):
@@ -80,7 +80,7 @@ class Configuration:
         try:
             # earlier releases stored --param options in "params", or wrote no "physics"
             words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # an option of earlier releases without effect on results
+            words.pop("unroll", None)  # earlier releases had this option, which did not affect results
             base = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
@@ -111,8 +111,8 @@ class Configuration:
     ) -> Learner:
         """Make the learner of one of the processes.
 
-        The run, if there is one, provides the task, unless another task is given. New networks are made if none are
-        given. For ``trust``, see ``run_env``.
+        With a run, the learner uses the run's task, unless ``task`` names another task. Without a run, it uses the task
+        of this configuration. New networks are made if none are given. For ``trust``, see ``run_env``.
         """
         try:
             if self.threads < 1:
@@ -142,8 +142,9 @@ class Configuration:
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
     """Load a learner's initial policy and value function from a run, and the iteration at which they were saved.
 
-    If ``which`` is None, the run is resumed. A resumed learner makes its networks from the hyperparameters, so None is
-    returned for them. The exceptions are networks with a ``limit``, and runs that started from another run.
+    If ``which`` is None, the run is resumed. A resumed learner usually makes its networks from the hyperparameters, so
+    None is returned for both. Networks with a ``limit`` are returned, and so are those of a run that started from
+    another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

@@ -20,10 +20,10 @@ from lyceum_warp.support.versions import versions
 
 _CONFIG, _TASK = "config.json", "task"
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
-"""Remains of a process that was killed while it created a run."""
+"""Temporary files that remain if a process is killed while it creates a run."""
 
 _COUNT = 0
-"""Stands for whole numbers from 0 in ``_ENTRIES``."""
+"""The type of entries that are whole numbers of at least 0."""
 
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
@@ -46,8 +46,11 @@ class Run:
     """The folder of a training run."""
 
     config: dict[str, Any]
-    """The content of ``config.json``: the task, its parameters, the engine, its physics, the seed and all
-    hyperparameters; the versions of the packages and of Python, the machine, the commit."""
+    """The content of ``config.json``.
+
+    It has the task, its parameters, the engine, its physics, the seed and all hyperparameters. It also has the
+    versions of the packages and of Python, the machine, and the commit.
+    """
     metrics: Path
     """Path of ``metrics.csv``, with one row per iteration."""
     policy: Path
@@ -55,7 +58,7 @@ class Run:
     best: Path
     """Path of ``best.pt``, with the policy of the best return."""
     checkpoint: Path
-    """Path of ``checkpoint.pt``: the complete state to resume from exactly, at the same iteration as ``policy.pt``."""
+    """Path of ``checkpoint.pt``, with the complete state at the iteration of ``policy.pt``, for an exact resume."""
     previous: Path
     """Path of ``previous.pt``, the previous checkpoint."""
     replay: Path
@@ -177,16 +180,16 @@ class Run:
             temporary.write_text(json.dumps(self.config, indent=2))
 
     def note_settings(self, error: Exception) -> None:
-        """Add the path of ``config.json`` to an error, because a setting in it may be the cause."""
+        """Add the path of ``config.json`` to an error that one of its settings may have caused."""
         if str(self.folder) not in str(error):
             error.add_note(f"with the settings in {self.folder / _CONFIG}")
 
     # metrics
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Append a row to the metrics table, by the names of columns. New columns are empty in earlier rows.
+        """Append a row to the metrics table. The keys of ``row`` are names of columns.
 
-        None becomes an empty cell. Floats are written with all digits.
+        New columns are empty in earlier rows. None becomes an empty cell. Floats are written with all digits.
         """
         known: list[str] = []
         rows: list[list[str]] = []
@@ -223,7 +226,7 @@ class Run:
                 ) from error
 
     def cut(self, iteration: int) -> None:
-        """Delete the rows after an iteration, and an incomplete last row, from the metrics table, if there is one."""
+        """Delete the rows after an iteration from the metrics table. Also delete an incomplete last row."""
         if not self.metrics.exists():
             return
         numbers = [row.get("iteration") or number for number, row in enumerate(self.rows(), 1)]
@@ -338,8 +341,8 @@ def load(
 
     Raises:
         FileNotFoundError: The run does not exist, or has no policy of this name or number.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. Or ``policy``
-            is missing or does not fit the file.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. The same
+            error is raised if the file needs the argument ``policy``, or does not fit it.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)

@@ -17,8 +17,8 @@ def pretrained_tasks() -> list[str]:
 def pretrained_run(task: str) -> Path:
     """Get the run folder of a task's pretrained policy.
 
-    ``lw.load`` and other functions accept it like every run's folder. Its config.json has the training settings and,
-    under ``evaluated``, the policy's return.
+    ``lw.load`` and other functions accept this folder as they accept the folder of any run. Its config.json has the
+    training settings and, under ``evaluated``, the policy's return.
 
     Example:
         >>> policy = lw.load(lw.pretrained_run("hopper"))

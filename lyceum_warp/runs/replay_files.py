@@ -17,9 +17,10 @@ _PARTS = 64
 
 
 def write_replay(run: Run | None, replay: Replay, team: Team, since: int) -> None:
-    """Write the parts of the replay buffer that have grown since the last save, when ``since`` steps were stored.
+    """Write the parts of the replay buffer that have grown since the last save.
 
-    All ranks must call this function. Ranks without a run do not write.
+    ``since`` is the number of stored steps at the last save. All ranks must call this function. Ranks without a run do
+    not write.
     """
     oldest = replay.stored - replay.count
     for start, end in _parts(replay, max(since, oldest), replay.stored):

@@ -13,9 +13,9 @@ class Saver:
     """Writes a run's files.
 
     Metrics, a new best policy, and a policy in a numbered file are written after each iteration. The last policy and
-    the complete state are saved together. The time between two saves is 100 times the duration of the last save, but at
-    most 30 s, and at least 20 times this duration. For example, saves of 20 ms happen every 2 s and take 1 % of the
-    time. After ``kill -9``, the run resumes from the last save.
+    the complete state are saved together. The time between two saves depends on the duration of the last save. It is
+    the smaller of 30 s and 100 times this duration, but at least 20 times this duration. For example, saves of 20 ms
+    happen every 2 s and take 1 % of the time. After ``kill -9``, the run resumes from the last save.
 
     All ranks have a saver and make the same calls. Ranks without a run do not write. ``lw.train`` describes
     ``keep_every`` and ``save_every``.
@@ -45,7 +45,7 @@ class Saver:
         """Write an iteration's metrics, and its policy if it is the best so far or needs a numbered file.
 
         Returns:
-            The iteration's return, or None.
+            The return by which policies are compared, or None if the iteration has none.
         """
         assert self.run is not None
         self.run.check()
@@ -81,7 +81,7 @@ class Saver:
         """Save the last policy and the complete state."""
         start = time.perf_counter()
         learner, run, replay = self.learner, self.run, self.learner.replay
-        state = learner.state_dict()  # on all ranks, because it gathers their worlds
+        state = learner.state_dict()  # all ranks must call this, because it gathers their worlds
         if replay is not None:
             write_replay(run, replay, learner.team, self._stored)
         with learner.team.together():

@@ -23,22 +23,21 @@ from lyceum_warp.runs.trust import check_trust
 log = logging.getLogger(__name__)
 
 Files = dict[Path, Path | bytes]
-"""The content of each file, or the file from which to copy it."""
+"""Maps the path of each new file to its content, or to an existing file to copy."""
 
 TABLES = "tables"
 _APART = 2
-"""If the task's file is more than this many levels below the folder that it shares with the model, the two are copied
-into separate folders.
-"""
+"""The largest depth of the task's file below the folder that it shares with the model. If the file is deeper, the task
+and the model are copied into separate folders."""
 _LARGEST = 512 * 2**20
 """Maximum size of a model that is copied, in bytes."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
-    """Collect the files of an environment's task that are not part of the package, for a run folder.
+    """Collect the files of an environment's task for the folder of a run. Files of the package are not included.
 
     Returns:
-        The entry ``kept`` of config.json, and the files for the folder ``task``, by their paths in it.
+        The entry ``kept`` of config.json, and the files of the folder ``task``, by their paths in this folder.
     """
     task, given = env.task.task, env.options.model is not None
     loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
@@ -179,10 +178,13 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
 
 
 def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
-    """Log how an environment's task differs from the run's, and its compiled model, which depends on the physics."""
+    """Log a warning if an environment's task or its compiled model differs from the run's.
+
+    The compiled model depends on the physics. Set ``model`` to False if the physics differ on purpose.
+    """
     kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
     file = next(iter(loaded), None)
-    # a task's file may also be the training script, and then a change may be unrelated to the task
+    # if the task's file is the training script, a change may have nothing to do with the task
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         log.warning("%s", f"{change}: it is used as it is now" if "changed" in change else change)
@@ -191,7 +193,10 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
 
 
 def _model_changed(run: Run, env: Env) -> bool:
-    """Check whether the model has changed since the run started. With another version of MuJoCo, the answer is no."""
+    """Check whether the model has changed since the run started.
+
+    With another version of MuJoCo, the result is False, because a new version may compile the model differently.
+    """
     known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
     return same_version and known not in (None, _model_hash(env))

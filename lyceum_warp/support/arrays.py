@@ -14,7 +14,7 @@ WORLDS_A_BLOCK = 32
 idle."""
 
 _SPARE = 256
-"""Number of elements that stand in for an empty array."""
+"""Number of elements that are allocated for an empty array."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
@@ -25,7 +25,7 @@ def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[i
 
 
 def flat(array: wp.array) -> wp.array:
-    """View an array's memory as (nworld, n) float32, to copy it without regard to its type."""
+    """View an array's memory as (nworld, n) float32, so that one kernel can copy arrays of any type."""
     n = array.size * wp.types.type_size_in_bytes(array.dtype) // 4 // max(array.shape[0], 1)
     return alias(array, wp.float32, (array.shape[0], n))
 
@@ -37,9 +37,9 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array, or an array of the same shape with allocated memory if it is empty.
+    """Return the array. If it is empty, return an array of the same shape with allocated memory.
 
-    Otherwise a task that reads an element by mistake would crash the process.
+    Without this memory, a task that reads an element by mistake would crash the process.
     """
     if array.size:
         return array
@@ -52,7 +52,7 @@ def torch_view(array: wp.array) -> torch.Tensor:
 
 
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
-"""The part of the worlds that launches are restricted to: index and number of parts."""
+"""The part of the worlds to which launches are restricted: the index of the part, and the number of parts."""
 
 
 @contextlib.contextmanager
@@ -91,7 +91,7 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
     """Launch a kernel over (nworld, lanes).
 
     Its last arguments are the number of lanes and the first world's index. Lanes are threads that share the work on a
-    world: one on the CPU, and a warp on a GPU for coalesced memory access.
+    world. The CPU uses one lane. A GPU uses a warp, for coalesced memory access.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
@@ -106,13 +106,13 @@ def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.
 
 
 PAIRS_A_LAUNCH = 4
-"""Number of pairs of arrays per launch of ``narrow_four`` or ``widen_four``."""
+"""Number of pairs of arrays that one launch of ``narrow_four`` or ``widen_four`` copies."""
 
 
 def launch_several_rows(kernel: wp.Kernel, mask: wp.array, pairs: Sequence[tuple[wp.array, wp.array]]) -> None:
     """Copy the selected rows of several arrays with ``narrow_four`` or ``widen_four`` of ``kernels.state``.
 
-    One launch copies four arrays, because a launch on the CPU takes longer than a few copies.
+    One launch copies four arrays, because on the CPU a launch takes longer than a few copies.
     """
     pairs = [pair for pair in pairs if pair[1].size]
     for i in range(0, len(pairs), PAIRS_A_LAUNCH):

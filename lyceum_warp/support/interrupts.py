@@ -35,10 +35,10 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
     Args:
         handler: The handler of the signals; by default it raises Interrupted.
-        replaces: Replace only this handler. By default, replace all handlers except those that ignore a signal.
+        replaces: The only handler to replace. By default, all handlers are replaced except those that ignore a signal.
 
     Yields:
-        The replaced handlers by signal, which are restored afterwards.
+        The replaced handlers by signal. They are restored at the end of the context.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set signal handlers
@@ -54,7 +54,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted although ``signals`` has already raised it."""
+    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted again, after ``signals`` has raised it once."""
     return signals(replaces=_ignore)
 
 

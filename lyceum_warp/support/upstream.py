@@ -101,12 +101,12 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock for kernels with tiles on the CPU. On x86, a static variable has the address of a kernel's tiles, so two threads
-would overwrite each other's tiles."""
+"""Lock for kernels with tiles on the CPU. On x86, the address of a kernel's tiles is in a static variable, so two
+threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
-    """Serialise CPU launches of kernels with tiles, and set ``tiles.launched`` at each."""
+    """Serialise CPU launches of kernels with tiles, and set ``tiles.launched`` at each launch."""
     launch_tiled = wp.launch_tiled
 
     def launch(*args: Any, **options: Any) -> Any:
