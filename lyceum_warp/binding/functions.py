@@ -68,7 +68,7 @@ class TaskSource:
     def _observers(self, owner: type[Task]) -> list[str]:
         """Find the functions that write observation groups, in the class and in its module.
 
-        Functions of the module that other functions call are not included.
+        Functions of the module are left out if another function calls them.
         """
         module = vars(sys.modules[owner.__module__])
         functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}

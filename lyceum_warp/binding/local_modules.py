@@ -92,7 +92,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     folder, bytecode = str(file.resolve().parent), sys.dont_write_bytecode
     sys.path.insert(0, folder)
     importlib.invalidate_caches()
-    sys.dont_write_bytecode = True  # run folders must not get bytecode
+    sys.dont_write_bytecode = True  # write no bytecode into run folders
     try:
         yield
     except BaseException:

@@ -15,7 +15,7 @@ from lyceum_warp.options import OPTIONS, suggestion
 from lyceum_warp.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
-"""The durations of a step and of a substep in seconds, which the package sets."""
+"""Parameters that the package sets: the durations of a step and of a substep, in seconds."""
 
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:

@@ -19,7 +19,7 @@ class Slice:
     start: int
     count: int
     dtype: Any
-    """Float, or a vector or matrix of float."""
+    """The type of an element: float, or a vector or matrix of float."""
 
     @property
     def size(self) -> int:
@@ -28,7 +28,7 @@ class Slice:
 
 
 Layout = dict[str, Slice]
-"""The slice of each part, by the part's name, in the order of the row."""
+"""Maps the name of each part to its slice of a row of floats."""
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:

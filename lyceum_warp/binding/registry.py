@@ -25,7 +25,7 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""The stamps of a task's file and of its local modules at the last run of the file, by module name."""
+"""Maps the module of each task file to the stamps that the file and its local modules had when the file last ran."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""
@@ -89,7 +89,7 @@ def _package_modules() -> dict[str, str]:
 
 
 def _declared(file: Path) -> dict[str, str]:
-    """Read the dict ``TASKS`` from a file without running it: modules by task name."""
+    """Read the dict ``TASKS``, which maps task names to modules, from a file without running it."""
     for node in ast.parse(file.read_bytes()).body:
         if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["TASKS"]:
             declared: dict[str, str] = ast.literal_eval(node.value)

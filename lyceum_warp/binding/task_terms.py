@@ -1,8 +1,8 @@
 """Find a task's terms and their arguments by name, and generate the functions that compute them.
 
-A term is a function. The names of its arguments select their values, as the names of fixtures do in pytest. A name
-refers to the state, the action, the result of another function, a parameter, or a field. The generated text calls each
-function once, and terms share the results.
+A term is a function. Its arguments are found by name, like fixtures in pytest. A name refers to the state, the action,
+the result of another function, a parameter, or a field. The generated text calls each function once, and terms share
+the results.
 """
 
 import difflib
@@ -143,12 +143,12 @@ class Terms:
     # names
 
     def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
-        """Return the first overload of a function whose arguments can all be found, and the type of its result.
+        """Return a function's first overload whose arguments can all be found, and its result type.
 
         Args:
             name: The function's name.
             given: The text for each name that refers to a state, the action or Params.
-            within: The chain of functions that need this function's result. It serves to detect cycles.
+            within: The chain of functions that need this function's result, for the detection of cycles.
         """
         if name in within:
             raise ValueError(

@@ -57,7 +57,7 @@ def written_fields(function: wp.Function) -> frozenset[str]:
 
 
 Rights = Mapping[str, Collection[str] | None]
-"""The fields that a function may write, by argument. For an output row, the value is None."""
+"""Maps each argument of a function to the fields that the function may write. For an output row, the value is None."""
 
 
 def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
@@ -132,7 +132,7 @@ class _Reader:
     """Reads the source of one function and of its callees.
 
     Args:
-        places: The values that the caller passes, one for each argument. None is a value that cannot be written.
+        places: The values that the caller passes, one for each argument. A value that cannot be written is None.
         arguments: Names of the arguments of the analysed function.
         seen: The functions that were already read, with the ``places`` that their callers passed.
     """

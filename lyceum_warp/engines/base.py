@@ -38,7 +38,8 @@ class Engine(abc.ABC):
         initial: The initial state for ``reset``, (integration_size,); None for the model's initial state.
 
     Raises:
-        ValueError: A field is listed both as lagged and as current. Or a model field cannot differ between worlds.
+        ValueError: A field is listed both as lagged and as current. This error is also raised if a model field cannot
+            differ between worlds of this model.
     """
 
     name: str
@@ -74,7 +75,7 @@ class Engine(abc.ABC):
     reset_stage: Stage
     """The stage up to which MuJoCo's forward pass must run after a reset."""
     snapshots: list[Field]
-    """Fields that the state stores because the integration state does not determine them, in the state's order."""
+    """The fields that cannot be computed from the integration state. They have the order of the state vector."""
     integration_size: int
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     state_size: int
@@ -160,7 +161,7 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy the named state fields of the masked worlds into the engine, by default all, by Warp launches."""
+        """Copy state fields of the masked worlds into the engine, by Warp launches. By default, copy all of them."""
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.

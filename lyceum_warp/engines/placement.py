@@ -137,7 +137,7 @@ def place_samples(
 ) -> dict[str, Any]:  # fmt: skip
     """Return the options to change for the worlds of a planner's samples.
 
-    With engine="auto" on a GPU, the engine depends on the number of samples and on the noslip solver.
+    With engine="auto" on a GPU, the choice depends on the number of samples, and on whether the noslip solver runs.
 
     Raises:
         ValueError: This machine has no such device.

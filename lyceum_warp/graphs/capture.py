@@ -50,7 +50,7 @@ class Graphs:
         device: Device of the launches; Warp can also capture graphs on the CPU.
         enabled: Whether to capture graphs.
         capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
-        workers: Threads that replay the graphs of phases with ``by_world``. By default, the calling thread does.
+        workers: Threads that replay the graphs of phases with ``by_world``. By default, the caller's thread is used.
     """
 
     def __init__(

@@ -26,7 +26,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
-"""The class of each algorithm and the class of its hyperparameters, by the algorithm's name in config.json."""
+"""Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
 
 
 def describe(learner: Learner) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class Run:
     best: Path
     """Path of ``best.pt``, with the policy of the best return."""
     checkpoint: Path
-    """Path of ``checkpoint.pt``, with the complete state at the iteration of ``policy.pt``, for an exact resume."""
+    """Path of ``checkpoint.pt``, with the complete state for an exact resume. It is saved with ``policy.pt``."""
     previous: Path
     """Path of ``previous.pt``, the previous checkpoint."""
     replay: Path
@@ -274,7 +274,7 @@ class Run:
         return ", ".join([*known, *map(str, numbers)]) or "none yet"
 
     def best_score(self) -> tuple[int, float] | None:
-        """Read the iteration and the score of the best policy, or return None without one."""
+        """Read the iteration and the score of the best policy. Return None if there is no best policy."""
         if not self.best.is_file():
             return None
         try:
@@ -341,8 +341,8 @@ def load(
 
     Raises:
         FileNotFoundError: The run does not exist, or has no policy of this name or number.
-        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. The same
-            error is raised if the file needs the argument ``policy``, or does not fit it.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. This error is
+            also raised if ``policy`` is missing or does not fit the file.
     """
     check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)

@@ -26,7 +26,7 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
     """Check that this user made a run on this machine or trusts it. With ``trust``, record that the user trusts it.
 
-    The error names the file that the command would execute (``runs``) or read.
+    The error names the file ``named``. It says whether the command would execute (``runs``) or read this file.
     """
     if os.path.exists(_record(folder, config)):
         return

@@ -141,8 +141,9 @@ depends only on whether the mask is None."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Cache results in MuJoCo Warp's host code, which takes most of the time of a step or reset without graphs.
+    """Cache results in MuJoCo Warp's host code.
 
+    Without graphs, this code takes most of the time of a step or reset.
     For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and Warp then resolves overloads. The
     functions in ``_REMADE`` parse and hash their kernels in every call, and ``put_model`` parses metadata of packages.
     """

@@ -15,7 +15,7 @@ _COUNTED_AS = mujoco.mjtWarning.mjWARN_INERTIA.value
 def call_batch(batch: Batch, method: Callable[..., object], *args: Any, **options: Any) -> None:
     """Call a method of a batch, and turn errors of individual worlds into warnings, so that ``find_faults`` finds them.
 
-    After an error in a world, MuJoCo restores the world's state before the call, and steps the other worlds.
+    After an error in a world, MuJoCo restores the state that the world had before the call. It steps the other worlds.
     """
     try:
         method(*args, **options)

@@ -104,9 +104,9 @@ class MujocoEngine(Engine):
         shown = [field for field in kept if field.name != "ctrl"]  # an input
         late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
         self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """The fields to copy before ``forward`` is called, which may replace them by values of another world."""
+        """The fields to copy before the call of ``forward``. The call may replace them by values of another world."""
         self._after_stage = [field for field in self._before_stage if field in computed]
-        """Those fields of ``_before_stage`` to copy again, because ``forward`` updates some of their elements."""
+        """The fields of ``_before_stage`` to copy again after ``forward``, which updates some of their elements."""
         self._last = [field for field in shown if field not in self._before_stage]
         # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
         without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
@@ -126,7 +126,7 @@ class MujocoEngine(Engine):
         self._models.apply(self._values)
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
-        """Return a mask's memory as a NumPy array, cached because creating a view takes longer than reading it."""
+        """Return a NumPy view of a mask. Views are cached, because creating a view takes longer than reading it."""
         if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask, and thus its id
             return kept[1]
         view: np.ndarray = mask.numpy()

@@ -13,7 +13,7 @@ from lyceum_warp.model_fields import ModelField
 class WorldModels:
     """Writes values of model fields into a batch, and recomputes the constants derived from them.
 
-    A value that equals the model's value, rounded to float32, is replaced by the model's float64 value.
+    If a value equals the model's value after rounding to float32, the model's float64 value is written.
     """
 
     def __init__(self, batch: Batch, fields: Iterable[ModelField]) -> None:

@@ -1,4 +1,4 @@
-"""Compute substeps and forward passes. A pass may be limited to some of its parts, or to some worlds."""
+"""Compute substeps, forward passes and parts of forward passes, for all worlds or for a group of worlds."""
 
 import functools
 import inspect

@@ -95,7 +95,7 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Set in each world of the group the bits that its row in the group has."""
+        """Combine the bits of each row of the group with the bits of the row's world, by bitwise or."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
