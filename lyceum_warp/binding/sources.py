@@ -109,7 +109,7 @@ def builtin(name: str) -> Any:
 
 
 def overloads(function: wp.Function) -> list[wp.Function]:
-    """Return the overloads of a function that have Python source."""
+    """Return those overloads of a function that have Python source."""
     found = [*function.user_overloads.values(), *function.user_templates.values()]
     # the overloads include the instances that Warp has made of a generic function
     return [overload for overload in found if overload.generic_parent is None] or [function]

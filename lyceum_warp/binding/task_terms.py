@@ -55,7 +55,7 @@ class Terms:
             self.text = self._written_text(functions, len(task.metrics) - len(functions))
 
     def generated(self, file: str) -> dict[str, wp.Function]:
-        """Generate ``reward``, ``score`` and ``terminated``, except the functions that the task defines.
+        """Generate those functions of ``reward``, ``score`` and ``terminated`` that the task does not define.
 
         ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` names
         the generated text in error messages.

@@ -89,7 +89,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels. ``own`` is the Params struct
-    that the task declares. If it changes only defaults, ``params`` is the struct of its base task instead.
+    that the task declares. If this struct changes only defaults, ``params`` is the struct of the base task instead.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]

@@ -162,7 +162,7 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Record the writes in an expression or a statement. Return the part of an argument that it refers to."""
+        """Record the writes in an expression or a statement. Return the place to which an expression refers."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
                 if place is not None and name.startswith(f"{node.id}."):  # a local struct of rows, used as a whole

@@ -20,7 +20,7 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
     The batch has already allocated ``held`` bytes.
 
     Raises:
-        NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that does.
+        NotEnoughMemoryError: The batch does not fit; the message names the largest number of worlds that fit.
     """
     free = free_memory(device)
     if free is not None and nworld > _most(bytes_per_world, free + held):

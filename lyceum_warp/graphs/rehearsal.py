@@ -20,7 +20,7 @@ def rehearse() -> Iterator[dict[tuple[Any, int | None], None]]:
     other threads launch kernels as usual.
 
     Yields:
-        Modules and block sizes (None for Warp's default) in launch order, as the keys of a dict.
+        Modules and block sizes in launch order, as the keys of a dict. A block size of None is Warp's default.
     """
     modules: dict[tuple[Any, int | None], None] = {}
 

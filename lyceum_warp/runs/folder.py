@@ -115,13 +115,14 @@ class Run:
         Args:
             folder: A new or empty folder.
             config: The configuration, as JSON values.
-            files: The content of the folder ``task``: maps paths in it to files to copy, or to bytes to write.
+            files: The files of the folder ``task``. The keys are paths in this folder. The values are files to copy, or
+                bytes to write.
         """
         folder = Path(folder)
         cls.check_free(folder)
         found = versions(config.get("device", "cpu"))
         run, task = cls(folder, {"format": FORMAT, **config, "versions": found}), folder / f"{_TASK}.tmp"
-        text = json.dumps(run.config, indent=2)  # before the folder is created, because this may fail
+        text = json.dumps(run.config, indent=2)  # this may fail, so do it before the folder is created
         try:
             shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)

@@ -236,7 +236,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         spec = env.task.spec.copy()
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # already logged when the environment was made
+                warnings.simplefilter("ignore")  # logged when the environment was made
                 spec.compile()
                 text = spec.to_xml()
         except (ValueError, mujoco.FatalError) as error:

@@ -24,7 +24,7 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
-    """Check that this user made a run on this machine or trusts it. With ``trust``, record that the user trusts it.
+    """Check that this user made a run on this machine or trusts it. If ``trust`` is set, record the run as trusted.
 
     The error names the file ``named``. It says whether the command would execute (``runs``) or read this file.
     """

@@ -23,7 +23,7 @@ def versions(device: str = "cpu") -> dict[str, Any]:
             found[package.replace("-", "_")] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             found[package.replace("-", "_")] = None
-    found["torch"] = torch.__version__  # includes the build, such as +cpu
+    found["torch"] = torch.__version__  # the version includes the build, such as +cpu
     found["python"] = platform.python_version()
     found["platform"] = platform.platform()
     found["cpu"] = platform.processor() or platform.machine()

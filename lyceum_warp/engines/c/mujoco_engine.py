@@ -127,7 +127,7 @@ class MujocoEngine(Engine):
 
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """Return a NumPy view of a mask. Views are cached, because creating a view takes longer than reading it."""
-        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask, and thus its id
+        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so its id stays unique
             return kept[1]
         view: np.ndarray = mask.numpy()
         if len(self._masks) < _MOST_MASKS:

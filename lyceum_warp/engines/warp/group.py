@@ -83,7 +83,7 @@ class Turns:
                 wp.capture_while(self._left, while_body=body)
 
     def take(self, source: wp.array, target: wp.array) -> None:
-        """Copy rows of all worlds (nworld, ...) into the rows of the group (size, ...)."""
+        """Copy the group's rows from an array of all worlds (nworld, ...) to an array of the group (size, ...)."""
         rows = flat(target)
         if rows.size:
             wp.launch(kernels.take_rows, rows.shape, [self._world, self._left, flat(source), rows])
