@@ -5,7 +5,7 @@ from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults
 from lyceum_warp.testing import state_rules as state
 
-# rules that depend on the model; slow engines and models check only these
+# the checks that depend on the model; slow engines and models run only these
 MODEL_CHECKS = (
     buffers.check_spaces,
     state.check_restoring,
@@ -154,4 +154,4 @@ PLUGINS = {
         ARM, actuated('<orientation name="aim" site="tip" refsite="here" kp="1"/>', '<motor joint="wrist"/>')
     ),
 }
-"""Models that only the C engine supports, with the Warp engine's error message for each."""
+"""Models that only the C engine supports, and the error message of the Warp engine for each model."""

@@ -26,7 +26,7 @@ def check_formula(ours: torch.Tensor, formula: np.ndarray) -> None:
 
 
 def check_uniform(samples: np.ndarray) -> None:
-    """Check that each column is U(-1, 1), and independent of the others."""
+    """Check that each column is U(-1, 1) and independent of the other columns."""
     n, k = samples.shape
     assert np.abs(samples).max() <= 1.0
     assert samples.max(axis=0).min() > 1.0 - 20.0 / n and samples.min(axis=0).max() < 20.0 / n - 1.0
@@ -37,7 +37,7 @@ def check_uniform(samples: np.ndarray) -> None:
 
 
 def check_normal(samples: np.ndarray) -> None:
-    """Check that each column is N(0, 1), and independent of the others."""
+    """Check that each column is N(0, 1) and independent of the other columns."""
     n, k = samples.shape
     quantiles = torch.special.ndtr(torch.from_numpy(np.sort(samples, axis=0))).numpy()
     ranks = (np.arange(n)[:, None] + 0.5) / n
@@ -47,7 +47,7 @@ def check_normal(samples: np.ndarray) -> None:
 
 
 def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the Kolmogorov-Smirnov distance between two samples of each column, (columns,)."""
+    """Compare two samples by the Kolmogorov-Smirnov distance of each column, (columns,)."""
     order = np.argsort(np.concatenate([a, b]), axis=0)
     ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
     return np.abs(ranks).max(axis=0)

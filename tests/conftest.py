@@ -26,7 +26,7 @@ TaskFile = Callable[[str, str], Path]
 
 @pytest.fixture(scope="session", autouse=True)
 def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Keep the user's list of trusted runs unchanged: tests and their subprocesses use a temporary directory."""
+    """Use a temporary list of trusted runs, so that tests and their subprocesses do not change the user's list."""
     with pytest.MonkeyPatch.context() as patched:
         folder = tmp_path_factory.mktemp("state")
         patched.setenv("XDG_STATE_HOME", str(folder))
@@ -35,9 +35,9 @@ def state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="session", autouse=True)
 def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
-    """Cache probed sizes of contact buffers between test runs, because a probe takes seconds.
+    """Cache the probed sizes of contact buffers between test runs, because a probe takes seconds.
 
-    If the probe or MuJoCo's version changes, the cache starts empty.
+    A change of the probe or of MuJoCo's version empties the cache.
     """
     sizes, cache = sys.modules.get("lyceum_warp.engines.warp.sizes"), getattr(pytestconfig, "cache", None)
     if sizes is None or cache is None:
@@ -52,9 +52,9 @@ def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def shared_env() -> Iterator[SharedEnv]:
-    """Make environments that the tests of a file share, one for each set of ``lw.make`` arguments.
+    """Make one environment for each set of ``lw.make`` arguments, and share it among the tests of a file.
 
-    Every call resets the worlds. A test that changes parameters or attributes calls ``lw.make`` itself.
+    Every call resets the worlds. A test that changes parameters or attributes must call ``lw.make`` itself.
     """
     made: dict[tuple[Any, ...], lw.Env] = {}
 
@@ -87,9 +87,9 @@ def task_file(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFact
 
 
 def settle() -> None:
-    """Exempt all live objects from garbage collection, because scanning a million of them is slow.
+    """Exempt all live objects from garbage collection, because scanning a million objects is slow.
 
-    Do not call this while an object that a test must free is alive.
+    Call this only before the creation of objects that a test must free.
     """
     gc.collect()
     gc.freeze()
@@ -136,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark as ``long`` all cases that the test's mark ``quick`` does not name."""
+    """Mark cases as ``long``, except those that the mark ``quick`` of their test names."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:

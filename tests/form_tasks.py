@@ -183,7 +183,7 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
 
 
 class Practiced(lw.Task):
-    """The puck starts further away as ``practice``, a number in lasting memory, grows."""
+    """A larger ``practice``, which is stored in lasting memory, moves the puck's start further away."""
 
     model = Drawn.model
     frame_skip = 3

@@ -74,7 +74,7 @@ class HeadlessViewer(viewer_protocol.Viewer):
 
 
 class Bench:
-    """A panel without a window. It stores the messages that the panel sends."""
+    """The viewer's panel without a window. ``sent`` contains the messages of the panel."""
 
     def __init__(self, model: mujoco.MjModel, scene: Scene) -> None:
         self.model, self.data = model, mujoco.MjData(model)

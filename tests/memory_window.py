@@ -9,7 +9,10 @@ from lyceum_warp.viewer.session.clock import Session
 
 
 class MemoryWindow:
-    """A window that collects frames. ``script`` gets a frame and its number; it returns commands, or None to close."""
+    """A window that collects frames.
+
+    ``script`` gets a frame and its number. It returns commands, or None to close the window.
+    """
 
     wants_frame = True
     error: str | None = None
@@ -43,7 +46,7 @@ class MemoryWindow:
 
 
 def run(session: Session, *script: Iterable[Command] | Callable[[Frame], bool]) -> MemoryWindow:
-    """Run a session with a script of one entry per frame: commands, or a condition to wait for."""
+    """Run a session. Each entry of ``script`` contains the commands of a frame, or is a condition to wait for."""
     entries = list(script)
 
     def after(frame: Frame, number: int) -> Iterable[Command] | None:

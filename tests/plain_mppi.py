@@ -1,4 +1,4 @@
-"""Plan with MPPI, CEM and predictive sampling in NumPy, directly from their definitions."""
+"""Implement MPPI, CEM and predictive sampling in NumPy, directly from their definitions."""
 
 from collections.abc import Callable
 from fractions import Fraction
@@ -11,7 +11,10 @@ import lyceum_warp as lw
 
 
 def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
-    """Smooth noise over time, (horizon, ...). From the third step on, each step is mixed with the previous two."""
+    """Smooth noise of shape (horizon, ...) over time.
+
+    From the third step on, each step is mixed with the previous two.
+    """
     result = noise.copy()
     for t in range(2, len(noise)):
         result[t] = betas[0] * noise[t] + betas[1] * result[t - 1] + betas[2] * result[t - 2]
@@ -26,7 +29,7 @@ def hermite(before: Any, left: Any, right: Any, after: Any, f: float) -> Any:
 
 
 class Grid:
-    """A grid of knots at fixed times: with K knots over H steps, knot j is at step j H / K."""
+    """A grid of knots at fixed times. With K knots over H steps, knot j is at step j H / K."""
 
     def __init__(self, horizon: int, knots: int, spline: str) -> None:
         self.horizon, self.distance, self.spline, self.now = horizon, Fraction(horizon, knots), spline, 0
@@ -52,12 +55,12 @@ class Grid:
 
 
 class Plain:
-    """A planner in float64 that follows the definitions; the caller passes the standard normal numbers.
+    """A planner in float64 that follows the definitions. The caller passes the standard normal numbers.
 
     Args:
-        knots: Number of knots over the horizon, or None for an independent number at each step.
+        knots: Number of knots over the horizon. None draws an independent number at each step.
         count: Number of knots in a plan.
-        fields: Model fields by name, (models, size); world i uses row i modulo the number of models.
+        fields: Model fields by name, (models, size). World i uses row i modulo the number of models.
     """
 
     def __init__(

@@ -11,7 +11,7 @@ from lyceum_warp.binding.sources import is_row, overloads, run_source
 
 N = 256
 MODULE = wp.Module("term_calls", None)
-"""One Warp module for all kernels, so that Warp compiles them together."""
+"""The Warp module of all kernels, so that Warp compiles them together."""
 
 
 def kernel_of(function: wp.Function, number: int) -> wp.Kernel:
@@ -38,7 +38,7 @@ KERNELS = {
 
 @dataclasses.dataclass
 class Call:
-    """A function's return values, (N, ...), and its arguments after the call."""
+    """The return values (N, ...) of a function, and its arguments after the call."""
 
     result: np.ndarray
     after: dict[str, np.ndarray]

@@ -1,4 +1,7 @@
-"""Define a variant of a task in another file. It adds a parameter, field, memory and term, and replaces a helper."""
+"""Define a variant of a task in another file.
+
+It adds a parameter, a field, memory and a term, and it replaces a helper function.
+"""
 
 import terms_task as parent
 import warp as wp

@@ -33,7 +33,7 @@ def name_of(path: Path) -> str:
 
 
 def python_of(page: Path) -> str:
-    """Return a page's Python code with its line numbers, so that a traceback points into the page."""
+    """Return a page's Python code. The line numbers match the page, so that a traceback points into the page."""
     lines, language = [], None
     for line in page.read_text().splitlines():
         if line.startswith("```"):
@@ -171,9 +171,9 @@ def test_tasks_in_own_task_md_pass_check_task(empty_folder: Path, monkeypatch: p
 
 
 def generated(folder: str, kind: str) -> list[str]:
-    """Return the words in all comments ``<!-- kind: ... -->`` of a folder's pages.
+    """Return the words in the ``<!-- kind: ... -->`` comments of a folder's pages.
 
-    docs/conf.py replaces these comments by generated sections.
+    The file docs/conf.py replaces these comments by generated sections.
     """
     pages = sorted((ROOT / "docs" / folder).glob("*.md"))
     return [word for page in pages for word in words_of(page, kind)]

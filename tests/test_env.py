@@ -42,7 +42,7 @@ def test_pickling_or_copying_an_environment_raises_an_error(spoil: Any) -> None:
 
 
 def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
-    """Send the parent process the error messages of all calls that raise RuntimeError."""
+    """Call several methods, and send the messages of their RuntimeErrors to the parent process."""
     messages = []
     for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:
@@ -86,7 +86,7 @@ def _make_another(connection: Connection) -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_engine_of_a_deleted_environment_is_freed_before_a_fork(engine: str) -> None:
-    gc.disable()  # reference cycles would keep the engine alive
+    gc.disable()
     try:
         env = lw.make("hopper", nworld=64, engine=engine)
         env.get_reward(state := env.get_state(), env.action, state)

@@ -34,7 +34,7 @@ def numbers(pattern: str, lines: list[str]) -> list[float]:
 def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 6  # one for each of five iterations, and one for the mean policy
+    assert len(returns) == 6  # five iterations, and the mean policy
     assert returns[-1] > 2 * returns[0] > 0
     assert lines[-1] == "saved in policy.pt: 5126 parameters"
     assert (tmp_path / "policy.pt").is_file()
@@ -44,7 +44,7 @@ def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> Non
 def test_example_own_policy_improves_its_policy(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 9  # one for each of eight iterations, and one for the mean policy
+    assert len(returns) == 9  # eight iterations, and the mean policy
     assert returns[-1] > max(returns[:3]) + 50
     assert lines[-1].endswith("370 parameters")
 
@@ -52,7 +52,7 @@ def test_example_own_policy_improves_its_policy(run) -> None:
 @pytest.mark.long
 def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
-    assert max(once) == 200.0 > 1.5 * once[0]  # the robot gets a reward in every step
+    assert max(once) == 200.0 > 1.5 * once[0]
     run("random_search.py", "--out", "twice", "--iterations", "3")
     run("random_search.py", "--out", "twice", "--iterations", "6", "--resume", "--seed", "0")
     rows = [Run.open(tmp_path / name).rows() for name in ("once", "twice")]
@@ -63,7 +63,7 @@ def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path)
     assert cli.main(["train", "--resume", "twice", "--iterations", "9"]) == 2
 
 
-@pytest.mark.long  # tests of SAC and of random_search.py already cover the components of TD3
+@pytest.mark.long
 def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]
@@ -82,7 +82,7 @@ def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
 
 @pytest.mark.long
 def test_example_own_task_passes_check_task_and_runs() -> None:
-    # in a subprocess, because the task is registered and its module is __main__
+    # the example registers a task of the module __main__, so it needs a subprocess
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
@@ -121,7 +121,7 @@ def test_example_commanded_speed_trains_and_records_its_terms(tmp_path: Path) ->
 def test_example_torch_loop_learns_to_approach_the_target(run) -> None:
     lines = run("torch_loop.py", "--iterations", "24")
     distances = numbers(r"256 episodes ended ([\d.]+) m", lines)
-    assert len(distances) == 6  # an episode of 128 steps ends in every fourth iteration of 32 steps
+    assert len(distances) == 6  # an episode takes 128 steps, which are four iterations of 32 steps
     assert distances[-1] < 0.75 * distances[0]
 
 

@@ -1,8 +1,3 @@
-"""Test faults that need particular models.
-
-The conformance suite covers non-finite and out-of-range states and actions.
-"""
-
 import warnings
 from pathlib import Path
 from typing import Any
@@ -28,14 +23,14 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """A hopper on the floor has five contacts, and a standing hopper has none."""
+    """Put a hopper on the floor, where it has five contacts. A standing hopper has none."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a fault and one without. All other worlds must be bitwise equal."""
+    """Step ``env``, in which one world has a fault, and ``clean``. All other worlds must be bitwise equal."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -84,7 +79,6 @@ def test_constraint_overflow_of_the_warp_engine_causes_a_fault_in_one_world() ->
 
 
 def test_contact_overflow_on_warp_is_a_fault_in_every_world_that_loses_contacts() -> None:
-    """All worlds share one contact buffer."""
     env = hopper("warp", nconmax=1, njmax=64)
     lay_down(env, BAD)
     before = env.obs.clone()
@@ -101,8 +95,6 @@ def test_contact_overflow_on_warp_is_a_fault_in_every_world_that_loses_contacts(
 
 
 def test_overflow_of_a_contact_sensor_in_the_warp_engine_is_an_engine_warning() -> None:
-    """A contact sensor has more matches than fit into its buffer."""
-
     def make() -> lw.Env:
         spec = lw.gymnasium_model("hopper.xml").spec()
         sensor = spec.add_sensor(
@@ -149,7 +141,6 @@ def test_faults_print_and_log_nothing_over_150_steps(
 @pytest.mark.parametrize("autoreset", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
 def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str, autoreset: bool) -> None:
-    """Resetting only positions and velocities would keep the warm start, and every step would have a fault."""
     env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
     for each in (env, clean):
         lay_down(each, BAD)

@@ -97,7 +97,7 @@ def test_name_of_an_element_gives_its_indices_in_a_field(
 @pytest.mark.parametrize(
     ("element", "place"),
     [
-        (lw.actuator("turn"), 3),  # this index follows the three outputs of another actuator
+        (lw.actuator("turn"), 3),
         (lw.ctrl("turn"), 3),
         (lw.act("slow"), 0),
         (lw.tendon("string"), 0),

@@ -33,16 +33,16 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""Each module or subpackage imports only from lower levels and from itself."""
+"""The level of each module or subpackage. Each imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
     "world_arrays": "test_worlds.py",
 }  # fmt: skip
-"""Tests whose file or folder is not named after the module."""
+"""The tests of modules whose test file or folder has another name."""
 
 ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
-"""Folders of tests that test several modules or subpackages."""
+"""Folders whose tests cover several modules or subpackages."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
 """Public names that begin with an underscore."""
@@ -166,7 +166,6 @@ def private_names() -> dict[str, set[str]]:
 
 
 def test_no_module_uses_private_names_of_another_module() -> None:
-    """Attributes are matched by name only, so private names of Warp, MuJoCo and torch do not count."""
     found, private = [], private_names()
     for name, tree in trees().items():
         for node in ast.walk(tree):
@@ -209,7 +208,6 @@ def test_private_names_of_other_packages_are_used_only_in_the_upstream_module() 
 
 
 def test_type_checkers_see_every_public_name() -> None:
-    """Type checkers take a name of a stub file as public only if an import repeats it."""
     imports = [node for node in ast.parse((ROOT / "__init__.pyi").read_text()).body if isinstance(node, ast.ImportFrom)]
     assert all(alias.asname == alias.name for node in imports for alias in node.names)
     assert {"NPG", "make", "quat_mul"} < set(lw.__all__) == {name for name in lw.__all__ if hasattr(lw, name)}
@@ -223,7 +221,7 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_the_name_of_a_public_function() -> None:
-    """An import of the submodule would set an attribute of the package, which would hide the function."""
+    """Importing such a submodule would hide the function of the same name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 
@@ -237,7 +235,6 @@ def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
 
 @pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
-    """The tests in ``tests/support/test_warp_log.py`` import the package before Warp."""
     program = """
         import warp as wp
         import lyceum_warp as lw

@@ -121,7 +121,7 @@ def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: Arm
 
 
 class Forgetful(lw.Task):
-    """Actions are controls, so the C engine computes a rollout in one native call."""
+    """The actions are controls, so the C engine computes a rollout in one native call."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 3
@@ -147,7 +147,7 @@ class Servo(Forgetful):
 
 
 class Sensing(lw.Task):
-    """The velocity sensor belongs to the state, and the acceleration sensor to the last substep."""
+    """The velocity sensor describes the state, and the acceleration sensor describes the last substep."""
 
     model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
     frame_skip = 2
@@ -169,7 +169,7 @@ def rollouts(task: str | type[lw.Task], steps: int, *, engine: str, nworld: int 
 
 
 def random_actions(env: lw.Env, steps: int, seed: int) -> torch.Tensor:
-    """Return actions, many of which exceed the bounds (-1 and 1 for unbounded actions)."""
+    """Draw actions, many of which are out of bounds. Unbounded actions are drawn as if their bounds were -1 and 1."""
     generator = torch.Generator().manual_seed(seed)
     bounds = (torch.from_numpy(bound) for bound in (env.action_space.low, env.action_space.high))
     low, high = (bound.nan_to_num(neginf=-1.0, posinf=1.0) for bound in bounds)
@@ -194,7 +194,7 @@ def run(loop: OpenLoop, state: torch.Tensor, actions: torch.Tensor) -> dict[str,
 
 
 def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None:
-    """Compare several rollouts with steps. Later rollouts replay graphs."""
+    """Compare several rollouts with single steps. The later rollouts replay graphs."""
     for seed in range(rounds):
         state, actions = some_state(env, seed), random_actions(env, loop.horizon, 10 + seed)
         low, high = env.action_space.low, env.action_space.high
@@ -219,7 +219,7 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 @pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
     steps = 3 if task == "humanoid" or task.startswith("adroit") else 5
-    # a substep of the Warp engine has hundreds of launches on the CPU, so the test takes only two
+    # on a CPU, a substep of the Warp engine takes hundreds of launches, so this test uses at most two
     options = {"frame_skip": min(2, find_task(task).frame_skip)} if engine == "warp" else {}
     env = lw.make(task, engine=engine, nworld=4, autoreset=False, **options)
     check_against_stepping(rollouts(task, steps, engine=engine, **options), env)
@@ -259,8 +259,6 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
 ) -> None:
-    """The tasks have random task memory, per-world parameters, RK4 with derived fields, a ``control`` function, or
-    sensors."""
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
     assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
@@ -269,7 +267,6 @@ def test_rollout_of_every_kind_of_task_equals_steps(
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    """A parameter may change from a shared number to one number per world after graphs were captured."""
     loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
     check_against_stepping(loop, env)
     for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
@@ -282,7 +279,6 @@ def test_parameters_may_change_between_rollouts(engine: str) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 def test_random_numbers_of_worlds_depend_on_the_given_keys(task: type[lw.Task], engine: str) -> None:
-    """Steps from states with these keys use the same random numbers."""
     env = lw.make(task, engine=engine, nworld=4, autoreset=False)
     numbers = np.array([5, 2**32 - 1, 77, 1234567890], dtype=np.uint32)
     keys = wp.zeros(4, dtype=wp.uint32, device="cpu")
@@ -310,7 +306,7 @@ def test_keys_of_wrong_shape_or_type_raise_an_error(shared_env: SharedEnv) -> No
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
 def test_terminated_is_computed_for_each_state_separately(engine: str) -> None:
-    """The arm swings out and back in. Only the states outside are terminal."""
+    """The states are terminal only while the arm is swung out."""
     loop = rollouts(Forgetful, 40, engine=engine, nworld=2, bound=0.05)
     loop.env.reset()
     actions = torch.zeros(40, 2, 2)
@@ -330,7 +326,6 @@ BAD = 1
 @pytest.mark.parametrize("task", [Forgetful, Servo])
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_non_finite_action_causes_a_fault_in_its_world(task: type[lw.Task], engine: str, number: float) -> None:
-    """The action is replaced by zero. Other worlds and the next rollout do not change."""
     loop = rollouts(task, 5, engine=engine)
     state, actions = some_state(loop.env, 0), random_actions(loop.env, 5, 0)
     zeroed, wrong = actions.clone(), actions.clone()
@@ -416,10 +411,7 @@ class PushedRunaway(Runaway):
 def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
     size: float, how: str, step: int, engine: str
 ) -> None:
-    """Rollouts after the diverging one have no fault.
-
-    On the C engine, a diverging world stops with its last finite values, and only the fault marks them as invalid.
-    """
+    """On the C engine, a diverging world keeps its last finite values, and only the fault marks them as invalid."""
     task = PushedRunaway if how == "control" else Runaway
     model = mujoco.MjSpec.from_string(RUNAWAY.format('integrator="RK4"' if how == "rk4" else ""))
     loop = rollouts(task, 6, engine=engine, model=model)
@@ -446,7 +438,7 @@ def test_diverging_world_has_a_fault_and_does_not_change_other_worlds(
 @pytest.mark.quick("PushedRunaway")
 @pytest.mark.parametrize("task", [Runaway, PushedRunaway])
 def test_fault_within_a_rollout_is_reported_at_its_end(task: type[lw.Task]) -> None:
-    """A ball is pushed into the floor, so the constraint buffer overflows. Then it flies up again."""
+    """A ball is pushed into the floor until the constraint buffer overflows. Then the ball flies up again."""
     loop = rollouts(task, 20, engine="warp", nworld=3, nconmax=8, njmax=2)
     loop.env.reset()
     state = loop.env.get_state()[0].clone()

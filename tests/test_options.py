@@ -103,7 +103,7 @@ def test_replica_has_the_options_of_the_original_except_for_given_changes() -> N
     replica = env.replicate(nworld=3, horizon=6)
     assert replica.options.given() == {
         "nworld": 3, "horizon": 6, "integrator": "euler", "solver": {"iterations": 4},
-        "model": env.task.spec,  # even if the file has changed since, the replica has the loaded spec
+        "model": env.task.spec,  # the replica has the loaded spec even if the file has changed since
     }  # fmt: skip
 
 

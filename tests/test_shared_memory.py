@@ -188,7 +188,7 @@ def test_sums_of_shared_memory_are_added_over_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
     _, ended = steps(env, 30)
-    env.update_shared(lambda sums: sums.mul_(2))  # as if another process had computed the same sums
+    env.update_shared(lambda sums: sums.mul_(2))  # simulate another process that computed the same sums
     assert env.shared["falls"].sum() == ended.sum()
 
 

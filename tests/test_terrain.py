@@ -62,7 +62,7 @@ def test_equal_seeds_give_equal_fields_and_a_new_column_does_not_change_others()
     np.testing.assert_array_equal(lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=3).heights, field)
     assert (lw.Terrain({"rough": 1, "steps": 1}, levels=2, seed=4).heights != field).any()
     more = lw.Terrain({"rough": 1, "steps": 1, "flat": 2}, levels=3, seed=3, scale={"rough": 0.12, "steps": 0.3})
-    # the first two levels do not change with one more level and 1.5 times the height
+    # another level and a height factor of 1.5 do not change the first two levels
     np.testing.assert_allclose(more.heights[40:200, 40:200], field[40:200, 40:200], atol=1e-12)
 
 
@@ -174,9 +174,9 @@ def test_ball_rests_on_every_kind_of_patch_at_the_height_in_the_table(shared_env
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
-    # the tolerance is the ball's radius: MuJoCo Warp drops a contact of a ball between two walls
+    # the expected distance is the ball's radius; MuJoCo Warp drops a contact of a ball between two walls
     np.testing.assert_allclose(nearest, 0.05, atol=2e-3 if engine == "mujoco" else 5e-3)
     assert np.median(abs(nearest - 0.05)) < 5e-4
     assert np.ptp(obs[:, 2]) > 0.4
-    # the engine's rangefinder measures the distance downwards; at x = 16 m and a slope of 5, float32 is exact to 2e-5 m
+    # on a slope of 5 at x = 16 m, float32 is exact to 2e-5 m for these distances
     np.testing.assert_allclose(obs[:, 3], obs[:, 4 + 21 * 21 // 2], atol=5e-5)

@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Tests that compare numbers do not use this environment: each algorithm advances its random streams."""
+    """Tests that compare numbers make their own environment, because each algorithm advances its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
@@ -40,7 +40,6 @@ def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Pat
 def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A message reports that a package's version has changed."""
     folder = Path(shutil.copytree(six, tmp_path / "run"))
     run = Run.open(folder)
     run.amend(versions=run.config["versions"] | {"torch": "2.0"})
@@ -126,7 +125,6 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
 
 
 def test_best_policy_without_evaluations_has_the_highest_sampled_return(tmp_path: Path) -> None:
-    """In each iteration, the policy samples episodes before it is updated."""
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
@@ -153,7 +151,6 @@ def test_run_is_complete_after_an_error_in_the_callback(six: Path, tmp_path: Pat
 def test_last_save_remains_after_an_interrupted_iteration(
     six: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Worlds and networks may have changed after the save."""
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     fit = ValueFit.__call__
 
@@ -200,7 +197,7 @@ def test_training_ends_after_the_given_minutes(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
-    """The test simulates kill -9 in iteration 5: iteration 3 was saved, and iteration 4 wrote the last row."""
+    """Simulate kill -9 in iteration 5. The last save is from iteration 3, and the last row is from iteration 4."""
     folder = tmp_path / "run"
     states = {}
 
@@ -225,7 +222,6 @@ def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_pat
 def test_training_from_another_run_starts_with_its_policy(
     six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Only one parameter differs between the runs. The old run's policy collects the new run's first samples."""
     out = tmp_path / "out"
     arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
     assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
@@ -293,11 +289,10 @@ def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
     assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
     config = Run.open(out).config
     assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma  # PPO does not use the settings of NPG
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma
 
 
 def test_run_folder_contains_the_result_of_the_transfer_test(env: lw.Env, tmp_path: Path) -> None:
-    """By default, the test runs only if physics are not exact, because compiling other kernels may take minutes."""
     run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
     assert not run.transfer.exists()
     coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))

@@ -40,7 +40,7 @@ XML = """
 """
 """A robot with a leg of 3 joints and a leg of 1 joint.
 
-One body has two joints outside its origin, one of them with ``ref``. Another body is fixed.
+One body has two joints away from its origin. One of these joints has ``ref``. Another body is fixed.
 """
 
 
@@ -201,7 +201,7 @@ def test_round_feet_have_the_lowest_height_and_the_friction_of_their_boxes() -> 
     assert (model.geom_friction[geoms] == model.geom_friction[box]).all() and (model.geom_priority[geoms] == 1).all()
     place = [walkers.spheres_of(model, data, geom) for geom in geoms]
     inside = (np.concatenate(place)[:, :3] - data.geom_xpos[box]) @ data.geom_xmat[box].reshape(3, 3)
-    # the capsules' ends touch the sides and the bottom of the box with half-sizes 0.03, 0.04 and 0.02
+    # the ends of the capsules touch the sides and the bottom of the box, whose half-sizes are 0.03, 0.04 and 0.02
     np.testing.assert_allclose(sorted(map(tuple, abs(inside).round(9))), 4 * [(0.02, 0.03, 0.01)], atol=1e-9)
     assert (inside[:, 2] < 0.0).all()
     with pytest.raises(ValueError, match=r"'ankle' is 0\.06 m wide: use a smaller radius"):

@@ -56,11 +56,6 @@ def outcomes_with_faults(
 def test_several_threads_per_world_give_the_same_results_as_one_thread(
     engine: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a GPU, a warp's lanes divide the work of a world, and each observation group has separate threads.
-
-    On the CPU, they run one after another.
-    """
-
     def launch_three(kernel: wp.Kernel, nworld: int, args: list[Any], device: wp.Device) -> None:
         wp.launch(kernel, (nworld, 3), [*args, 3, 0], device=device)
 
@@ -73,7 +68,6 @@ def test_several_threads_per_world_give_the_same_results_as_one_thread(
 
 
 def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three threads replay the launches around the C engine's calls, each for a part of the four worlds."""
     together, counts = outcomes_with_faults("mujoco")
     monkeypatch.setattr(capture, "SECONDS_A_THREAD", 1e-9)
     monkeypatch.setattr(mujoco_engine, "cpu_cores", lambda: 3)
@@ -86,7 +80,10 @@ def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pyt
 
 
 def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
-    """Make two tasks whose success needs three steps and one step. Goals differ between worlds."""
+    """Make two tasks.
+
+    Success takes three steps in the first task, and one step in the second. The goals of the worlds differ.
+    """
     goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
     held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
     for env in (held, plain):
@@ -98,7 +95,6 @@ def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.En
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_success_steps_must_be_consecutive_within_an_episode(engine: str) -> None:
-    """The end of an episode or a fault restarts the count of success steps. All other results stay unchanged."""
     held, plain = held_and_plain(engine, horizon=12)
     rows, rises, falls = torch.zeros(16), 0, 0
     generator = torch.Generator().manual_seed(0)

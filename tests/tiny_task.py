@@ -1,4 +1,4 @@
-"""Define the source of the shortest task, in which tests change a line."""
+"""Define the source code of the shortest task. Tests change single lines of it."""
 
 from pathlib import Path
 

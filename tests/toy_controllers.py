@@ -19,9 +19,9 @@ def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
 
 
 class StepPlanner:
-    """A planner whose actions encode the plan's step and the action's index.
+    """A planner whose actions encode the step of the plan and the index of the action.
 
-    Both numbers are divided by 100; ``hundredths`` converts the actions back.
+    Both numbers are divided by 100. ``hundredths`` converts the actions back.
     """
 
     def __init__(self, env: lw.Env, horizon: int = 8, seconds: float = 0.0) -> None:
@@ -117,7 +117,7 @@ def simulated_run(
 ) -> Trajectory:
     """Run the asynchronous loop on the simulated clock.
 
-    Times are in seconds, and the period is one second. ``busy`` gives durations of steps by index.
+    Times are in seconds, and the period is one second. ``busy`` maps the index of a step to its duration.
     """
     env.rand_reset(0)
     clock = SimulatedClock()

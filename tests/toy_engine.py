@@ -1,4 +1,4 @@
-"""Define a third engine, which follows only the contract in ``engines/base.py``."""
+"""Define a third engine that relies only on the contract in ``engines/base.py``."""
 
 import copy
 from collections.abc import Collection, Iterable
@@ -19,10 +19,8 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 class ToyEngine(Engine):
     """An engine that steps one world at a time, with states in float64 rows.
 
-    Each world has its own MjModel, and ``apply_model`` writes the world's fields into it.
-
-    Launches between engine calls become graphs, so ``reset``, ``commit``, ``find_faults`` and ``get_state`` only launch
-    Warp kernels.
+    Each world has its own MjModel. ``apply_model`` writes the world's fields into this model. ``reset``, ``commit``,
+    ``find_faults`` and ``get_state`` only launch Warp kernels, because their launches become graphs.
     """
 
     name = "toy"

@@ -36,7 +36,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: str) -> None:
 
 
 def interrupted(argv: list[str]) -> int:
-    """Return the exit code of a command that receives SIGINT, which it must handle."""
+    """Run a command that must handle SIGINT, and return its exit code."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return cli.main(argv)

@@ -23,7 +23,7 @@ def test_step_types_discounts_and_values_follow_dm_env() -> None:
     env, twin = DmEnvironment("hopper", seed=3, horizon=4), lw.make("hopper", seed=3, horizon=4, autoreset=False)
     action = np.array([0.5, -0.5, 1.0], np.float32)
     twin.rand_reset()
-    first = env.step(action)  # without a reset, the first step starts the first episode
+    first = env.step(action)
     assert first.first() and first.reward is None and first.discount is None
     for _ in range(4):
         np.testing.assert_array_equal(np.concatenate(list(first.observation.values())), twin.obs[0])

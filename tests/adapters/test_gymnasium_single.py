@@ -32,14 +32,14 @@ def draws() -> bool:
 
 
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
-"""Gymnasium's own robots cause these warnings about unbounded observations."""
+"""Gymnasium's own environments cause these warnings, too, because their observations are unbounded."""
 
 
 def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(hopper.unwrapped, skip_render_check=not draws)
-        check_env(GymnasiumEnv(Full), skip_render_check=True)  # observation groups
+        check_env(GymnasiumEnv(Full), skip_render_check=True)
     said = [str(warning.message) for warning in caught]
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 

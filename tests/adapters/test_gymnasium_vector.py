@@ -166,7 +166,6 @@ def test_fault_truncates_the_episode_with_the_last_valid_observation(
 
 
 def test_next_step_mode_resets_a_world_in_the_step_after_its_end(vector: Callable[..., GymnasiumVectorEnv]) -> None:
-    """The step ignores the action of a world that it resets, so an invalid action is not a fault."""
     envs = vector(autoreset_mode=AutoresetMode.NEXT_STEP)
     envs.reset(seed=5)
     faults, ended, ends = envs.env.fault_counts, np.zeros(N, dtype=bool), 0

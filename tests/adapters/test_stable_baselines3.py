@@ -77,7 +77,7 @@ def test_off_policy_learner_stores_final_observations(
     assert buffer is not None and buffer.pos == 50 and buffer.timeouts[:50].any()
     ended = np.argwhere(buffer.dones[:49])
     assert len(ended)
-    for step, world in ended:  # the stored next observation is not the first observation of the next episode
+    for step, world in ended:
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
 
 

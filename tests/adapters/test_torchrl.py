@@ -21,7 +21,7 @@ CASES = [
 
 
 def wrapped(mode: str, *, tensors: bool, task: Any) -> Any:
-    from torchrl.envs.libs.gym import GymWrapper  # the import takes a second
+    from torchrl.envs.libs.gym import GymWrapper
 
     env = GymnasiumVectorEnv(task, N, autoreset_mode=mode, torch=tensors)
     return GymWrapper(env, convert_actions_to_numpy=not tensors)

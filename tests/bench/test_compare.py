@@ -29,7 +29,6 @@ QUICK: dict[str, Any] = {"engines": ("mujoco",), "parts": ("env",), "steps": 3}
 
 @pytest.mark.long
 def test_changed_reward_and_broken_tasks_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Compare the working tree with a copy that has two broken tasks and a changed reward."""
     changes = {
         "tasks/point_mass.py": ("return 1.0 - distance(s1)", "return 2.0 - distance(s1)"),
         "tasks/cartpole_swingup.py": ("import warp as wp\n", "import os\nos._exit(3)\n"),
@@ -45,7 +44,6 @@ def test_changed_reward_and_broken_tasks_are_reported(tmp_path: Path, capsys: py
     }  # fmt: skip
     steps = found["point_mass/mujoco/steps/reward"]
     assert " at step 0, world 0; max |difference| 1; 12 of 12 differ" in steps
-    # a transition with a fault has a reward of 0
     assert found["point_mass/mujoco/fault/reward"].endswith("2 of 4 differ")
     assert found["cartpole/mujoco"] == "new failed: RuntimeError: broken on purpose"
     assert found["cartpole_swingup/mujoco"] == "new failed: the process ended with 3"

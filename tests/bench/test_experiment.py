@@ -27,7 +27,7 @@ RATES = {"ours": 3.0, "theirs": 2.0}
 
 @pytest.fixture
 def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """An experiment with known measurements. ``toy.measured`` lists the measured cases."""
+    """An experiment with predefined results. ``toy.measured`` lists the cases that ran."""
     measured: list[Case] = []
 
     def cases(options: Any) -> list[Case]:
@@ -163,7 +163,7 @@ def test_figures_and_tables_are_made_from_stored_results(
     assert plot.main(plot.Options(("toy",), tmp_path)) == 0
     drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
     assert len(drawn) == 1
-    for _ in range(2):  # the second run replaces the page of the first
+    for _ in range(2):
         assert plot.main(plot.Options(("toy",), tmp_path)) == tables.main(tables.Options((), tmp_path)) == 0
         text = (tmp_path / "toy.md").read_text()
         assert text.startswith("# toy\n") and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1

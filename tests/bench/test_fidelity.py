@@ -27,7 +27,7 @@ def test_short_fidelity_run_compares_trajectories(tmp_path: Path, capsys: pytest
         low, high = found["obs"]["median"], found["obs"]["p99"]
         assert all(0.0 <= a <= b < 1e-5 for a, b in zip(low, high, strict=True))
         assert found["half_apart"] is None and found["faults"] == 0
-    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0  # the engines round moving worlds differently
+    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0
     assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 

@@ -35,7 +35,7 @@ def test_python_planner_earns_what_mppi_earns(tmp_path: Path, capsys: pytest.Cap
     rows = experiment.read(out)
     assert all(row.result["plan_ms"] > 0.0 for row in rows)
     returns = [row.result["return"] for row in rows if row.case["part"] == "episodes"]
-    assert max(returns) - min(returns) < 0.2 * abs(min(returns))  # both contestants have the same planner and plant
+    assert max(returns) - min(returns) < 0.2 * abs(min(returns))
 
 
 def test_episode_that_was_measured_in_two_blocks_counts_once() -> None:

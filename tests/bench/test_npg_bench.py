@@ -49,7 +49,6 @@ def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
         for name in ("obs", "action", "final_obs", "reward", "step", "terminated", "done", "episode_length"):
             mine, theirs = (getattr(rollout, name)[:until, world] for rollout in (ours, fed))
             assert torch.allclose(mine.float(), theirs.float(), atol=1e-4), name
-        # the first episodes are shortened, so neither buffer counts their returns
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()

@@ -26,7 +26,6 @@ def test_different_functions_have_different_kernels(tmp_path: Path) -> None:
 
 
 def test_copied_task_file_shares_kernel_modules_until_it_changes(tmp_path: Path) -> None:
-    """Warp caches compiled kernels by the module's name."""
     (tmp_path / "copy").mkdir()
     file, copy = (tiny_task.write(folder, tiny_task.TINY) for folder in (tmp_path, tmp_path / "copy"))
     first = TaskSource(find_task(file), "tiny").kernel_name

@@ -10,7 +10,7 @@ from lyceum_warp.task import FUNCTIONS
 MEANT = {
     name: f"def {function.signature}:\n    {function.default or 'obs[0] = 1.0'}"
     for name, function in FUNCTIONS.items()
-    if name not in ("tally", "share")  # these functions must be defined together, with additional structs
+    if name not in ("tally", "share")
 }
 
 

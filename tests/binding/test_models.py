@@ -103,7 +103,6 @@ PAIRS = """<mujoco model="pairs"><worldbody>
 
 
 def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    """Without this change, MuJoCo would create two contacts, and MuJoCo Warp would create one."""
     assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
     with caplog.at_level("INFO"):
         model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
@@ -151,10 +150,6 @@ def test_error_of_an_invalid_model_names_the_model() -> None:
 
 
 def test_replica_has_the_model_of_its_original_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Later edits of the MjSpec do not change a replica.
-
-    A ``model`` function could return another model at each call, so a replica does not call it again.
-    """
     spec = lw.gymnasium_model("hopper.xml").spec()
     env = lw.make("hopper", model=spec)
     spec.geom("torso_geom").density = 5000

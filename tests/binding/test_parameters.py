@@ -228,7 +228,6 @@ def test_array_parameter_accepts_each_kind_of_element(model: mujoco.MjModel) -> 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_new_arrays_after_graphs_are_captured(engine: str) -> None:
-    """The new arrays have the same shape, a different shape, or one value per world."""
     env = lw.make(Follow, engine=engine, nworld=2)
 
     def first_steps() -> torch.Tensor:
@@ -251,10 +250,9 @@ def test_functions_read_new_arrays_after_graphs_are_captured(engine: str) -> Non
 
 
 def test_changed_arrays_reach_replicas_planners_and_evaluations() -> None:
-    """The arrays reach a larger replica, ``get_obs``, environments that called ``follow``, planners and evaluations."""
     motion = np.array([[0.25, 0.0]])
     env = lw.make(Follow, motion=motion, gain=[1.0, 2.0], nworld=2)
-    motion[:] = 9.0  # the environment has a copy of the array
+    motion[:] = 9.0
     more = env.replicate(nworld=3)
     assert more.obs[:, 1].tolist() == [0.25] * 3
     env.set_params(motion=[[0.75, 0.0], [0.5, 0.0]])
@@ -273,7 +271,6 @@ def test_changed_arrays_reach_replicas_planners_and_evaluations() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("found", ["number", "nan"])
 def test_check_task_finds_an_out_of_range_read_of_an_array(task_file: Any, found: str, engine: str) -> None:
-    """An out-of-range read is reported even if it returns NaN."""
     source = (Path(__file__).parent.parent / "table_task.py").read_text()
     wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
     value = {"number": "0.0", "nan": "wp.nan"}[found]

@@ -162,7 +162,6 @@ def test_invalid_part_raises_a_one_line_error_that_names_it(
 
 
 def test_helper_function_called_by_observe_defines_no_observation_group(tmp_path: Path) -> None:
-    """The helper is named like the function of an observation group."""
     helper = struct_of(PART, "observe_all(s, p, obs)").replace(
         "@wp.func\n",
         "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",

@@ -29,7 +29,6 @@ def test_variant_has_the_terms_of_its_parent_and_additional_terms(engine: str) -
         env.step(action)
         work += action[:, 0] * (env.field("qpos")[:, 0] - x) + 0.001 * env.time
         torch.testing.assert_close(env.metrics["lasting"], 0.5 * env.timestep * 2.0 * work, atol=1e-7, rtol=1e-4)
-        # the variant's helper doubles this metric, and its default target divides the metric by 3
         torch.testing.assert_close(env.metrics["change"], parent.metrics["change"] * 2 / 3, rtol=1e-4, atol=1e-7)
         assert torch.equal(env.metrics["effort"], parent.metrics["effort"])
     total = sum(env.metrics[name] for name in Variant.rewards)

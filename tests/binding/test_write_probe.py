@@ -1,5 +1,3 @@
-"""Detect functions that write out of range, before they damage memory."""
-
 from pathlib import Path
 
 import pytest
@@ -22,7 +20,10 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""For each function: value of the parameter, size and name of the array, and words of the error."""
+"""The functions that write out of range.
+
+Each has a parameter value, the size and name of its array, and words of the error.
+"""
 
 
 @pytest.mark.parametrize("name", ROWS)

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.browser
 SECONDS = 120.0
 """Time limit for a page, in seconds. Without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Seconds after which the test repeats a key or a click, because a busy browser may lose it."""
+"""Seconds before a test repeats a key or a click, because a busy browser may lose it."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -158,7 +158,7 @@ class Tab:
     def repeat(self, act: Callable[[int], None], until: Callable[[], Any]) -> None:
         """Repeat an action until a condition holds.
 
-        The pauses matter: a second key or click might undo the first.
+        Wait after each action, because a second click may undo the first.
         """
         for attempt in range(20):
             act(attempt)
@@ -220,7 +220,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start a headless browser: that of LYCEUM_WARP_BROWSER, playwright's or the system's."""
+    """Start the headless browser of LYCEUM_WARP_BROWSER, of playwright or of the system."""
     with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
@@ -238,7 +238,7 @@ def browser(launch: Callable[[], Browser]) -> Iterator[Browser]:
 
 
 def new_context(browser: Browser) -> BrowserContext:
-    """Open a browser context without cookies. The window is small, for machines without a GPU."""
+    """Open a browser context without cookies. Its window is small, so that machines without a GPU draw it quickly."""
     return browser.new_context(viewport=VIEW, device_scale_factor=0.25)  # type: ignore[arg-type]
 
 
@@ -251,7 +251,7 @@ def context(browser: Browser) -> Iterator[BrowserContext]:
 
 @pytest.fixture(scope="module")
 def viewer() -> Iterator[Viewer]:
-    """Show two worlds, two policies, and an episode in which the block moves to the right."""
+    """Start a viewer with two worlds, two policies, and an episode in which the block moves to the right."""
     episode = lw.control(lw.make(Block, autoreset=False), lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
     env = lw.make(Block, nworld=2)
     session = Session(env, controllers={"right": push(1.0), "left": push(-1.0)}, episodes={"right": episode}, seed=0)
@@ -294,7 +294,7 @@ def test_keys_and_buttons_pause_step_and_choose_a_controller(tab: Tab) -> None:
     tab.click_near(*LEFT, lambda: viewer.status.controller == "left")
 
 
-@pytest.mark.long  # a double click needs frames within 0.3 s; without a GPU, this takes many attempts
+@pytest.mark.long
 def test_dragging_a_body_pushes_it(tab: Tab) -> None:
     viewer = tab.viewer
     middle = tab.place()
@@ -335,7 +335,7 @@ def test_slider_and_play_button_show_a_saved_episode(tab: Tab) -> None:
 @pytest.mark.long
 def test_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
     assert tab.page.title() == "block"
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)  # without the token
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)
     assert tab.page.evaluate("document.cookie") == ""
     assert not [line for line in tab.log if line.startswith("error")]
     file = tmp_path / "recorded.html"
@@ -384,7 +384,7 @@ def test_another_browser_gets_control_after_the_first_is_closed_or_killed(
         tab.logs("role=controller")
         paused = viewer.status.paused
         tab.press("Space", lambda: viewer.status.paused != paused)  # noqa: B023
-        address = tab.page.url  # the cookie remains
+        address = tab.page.url
         tab.page.close()
     assert viewer.window.is_open()
 

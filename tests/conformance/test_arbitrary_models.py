@@ -88,8 +88,6 @@ def test_model_that_the_warp_engine_does_not_support_raises_a_one_line_error(rea
         lw.make(task, engine="warp")
 
 
-# not every model has these fields
-
 RICH = task_with(text(
     ARM + '<flexcomp name="cloth" type="grid" dim="2" count="3 3 1" spacing=".1 .1 .1" pos="2 0 3" radius=".02" '
     'mass=".1"><contact selfcollide="none"/><edge equality="true"/></flexcomp>',
@@ -121,7 +119,6 @@ def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujo
 
 
 def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines(shared_env: SharedEnv) -> None:
-    """The engine also accepts boolean values."""
     ends = []
     for engine in ("mujoco", "warp"):
         env = shared_env(RICH, engine=engine, nworld=2, fields=FIELDS)
@@ -155,7 +152,7 @@ def test_a_rollout_accepts_an_empty_field(engine: str) -> None:
     assert rollout.reward.abs().min() > 0
 
 
-# models without actuators, in tasks that define actions
+# models without actuators, whose tasks define the actions
 
 
 @wp.struct

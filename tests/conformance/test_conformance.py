@@ -15,14 +15,14 @@ EVERY_RULE = {
     "mujoco": ("hopper", "humanoid", "adroit_pen", "soft_ball"),
     "warp": ("hopper", "adroit_pen", "soft_ball"),
 }
-"""For these tasks, all rules are checked. Together they use most features of models."""
+"""The tasks that pass every check on an engine. Together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""For other tasks on the C engine, two slow rules are omitted. Their results hardly depend on the task."""
+"""The checks of other tasks on the C engine. Two slow checks are missing, which hardly depend on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""For other tasks on the Warp engine, only a few rules are checked, because this engine is slow on a CPU."""
+"""The checks of other tasks on the Warp engine. They are few, because this engine is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -33,10 +33,10 @@ def settled_again() -> None:
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """Return how many steps the long rules take.
+    """Return the options of ``check_task``.
 
-    For hopper, the steps suffice to find a leak of one number per step. On a CPU, a step of the Warp engine takes
-    milliseconds.
+    On hopper, the steps suffice to find a leak of one number per step. The Warp engine takes fewer steps, because each
+    step takes milliseconds on a CPU.
     """
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
@@ -46,7 +46,6 @@ def options(task: str, engine: str) -> dict[str, int]:
     return {"steps": 100 if every else 40, "frame_skip": min(2, find_task(task).frame_skip)}
 
 
-# contacts, tasks without contacts, and tasks for planners; test_rules.py covers events and dynamics
 @pytest.mark.quick("mujoco-cartpole_swingup", "mujoco-reach", "warp-half_cheetah", "warp-point_mass")
 @pytest.mark.parametrize(("engine", "task"), [(engine, task) for engine in EVERY_RULE for task in PACKAGE])
 def test_task_passes_all_checks_of_check_task(task: str, engine: str) -> None:

@@ -106,7 +106,7 @@ class Right(lw.Task):
     observe, advance = right, count
 
 
-# mistakes in each function; conditions keep results finite, and hide writes when the task is bound
+# functions with wrong indices; their conditions keep results finite
 
 
 @wp.func

@@ -25,7 +25,7 @@ def episode(env: lw.Env) -> Trajectory:
 
 
 def with_plan_times(episode: Trajectory, times: np.ndarray) -> Trajectory:
-    """Set planning times; the first plan takes one second."""
+    """Replace the planning times. The first plan takes one second."""
     plans = len(times) + 1
     return dataclasses.replace(
         episode, plan_times=torch.tensor([1.0, *times], dtype=torch.float64), plan_of=torch.zeros_like(episode.plan_of),
@@ -97,7 +97,6 @@ def test_report_of_no_or_different_episodes_raises_an_error(env: lw.Env) -> None
         control_report([one, dataclasses.replace(one, controller=controller)])
     with pytest.raises(ValueError, match=r"differ in their params \(success_distance\)"):
         control_report([one, dataclasses.replace(one, params={**one.params, "success_distance": 1.0})])
-    # NaN parameters of two episodes count as equal
     odd = dataclasses.replace(one, params={**one.params, "odd": math.nan})
     assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2
 

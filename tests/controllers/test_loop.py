@@ -18,7 +18,6 @@ def test_control_returns_the_complete_episode(env: lw.Env) -> None:
     assert episode.obs.shape == (41, 6) and episode.actions.shape == (40, 2)
     assert episode.evals[-1] < episode.evals[0]
     assert episode.mode == "sync" and episode.period == episode.timestep == env.timestep
-    # each action comes from a plan for its state
     assert torch.equal(episode.plan_of, torch.arange(40)) and not episode.age_steps.any() and not episode.late.any()
     assert torch.allclose(episode.actions[7], towards(episode.states[7], episode.obs[7]))
     assert (episode.ages >= episode.plan_times).all() and (episode.times.diff() > 0).all()

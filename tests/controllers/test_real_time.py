@@ -1,5 +1,3 @@
-"""Test the real-time loop on a simulated clock with exact times, and with a thread on the real clock."""
-
 import math
 import subprocess
 import sys
@@ -28,8 +26,8 @@ def test_actions_are_one_step_old_if_plans_take_less_than_a_period(env: lw.Env) 
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
     assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # the step from which the plan started.
-    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # Index of the applied action in its plan
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # step at which the plan started
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # index of the applied action in its plan
     assert episode.wall_seconds == pytest.approx(6)
     report = control_report(episode)
     assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
@@ -39,7 +37,6 @@ def test_actions_are_one_step_old_if_plans_take_less_than_a_period(env: lw.Env) 
 
 def test_a_slow_planner_misses_its_deadlines(env: lw.Env) -> None:
     episode = simulated_run(env, seconds=2.5, steps=9)
-    # the plan from state 1 is ready at 3.5 s; the next plan starts from the newest state and is ready at 6 s
     assert episode.plan_of.tolist() == [0, 0, 0, 0, 1, 1, 2, 2, 2]
     assert episode.plan_steps[:3].tolist() == [0, 1, 3]
     assert episode.ages.tolist() == pytest.approx([0, 1, 2, 3, 3, 4, 3, 4, 5])
@@ -65,7 +62,7 @@ def test_slow_step_does_not_delay_later_steps(env: lw.Env) -> None:
 
 
 def predicted_and_measured(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
-    """Run a controller with predicted states; return the predicted and the measured states, with observations."""
+    """Run a controller that gets predicted states. Return the predicted and the measured states, with observations."""
     planned = []
 
     def controller(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
@@ -90,7 +87,7 @@ def test_predicted_states_equal_the_next_states_of_the_plant_except_for_the_rand
 
 
 def test_predicted_states_do_not_contain_the_pushes_of_events() -> None:
-    times = [0.015 * k for k in range(1, 13)]  # after every step
+    times = [0.015 * k for k in range(1, 13)]
     env = lw.make("humanoid_stand", autoreset=False, push_times=times, push_impulse=[10.0, 10.0])
     predicted, measured = predicted_and_measured(env)
     x_and_y = slice(start := env.state_space.parts["qvel"].start, start + 2)
@@ -109,7 +106,6 @@ def test_a_slow_planner_in_a_thread_plans_while_the_plant_steps(env: lw.Env) -> 
     assert planner.resets == [6, 6]
     assert planner.shifts[:3] == [0, 0, 0]
     assert planner.shifts[3:] == episode.plan_steps.diff().tolist()
-    # even on a busy machine, each action is the plan's action for its step
     assert hundredths(episode.actions[:, 0]) == episode.plan_steps[episode.plan_of].tolist()
     assert hundredths(episode.actions[:, 1]) == episode.age_steps.clamp(max=7).tolist()
     assert episode.plan_starts[0] < 0 and episode.ages[0] == 0 and (episode.plan_starts[1:] > 0).all()

@@ -1,7 +1,6 @@
 """Run ``lyceum-warp`` with random command lines.
 
-A case is "COMMAND SEED" or the name of a case in ``minimal_cases.py``. Flags come from the help texts, so new ones are
-included.
+A case is "COMMAND SEED" or the name of a case in ``minimal_cases.py``.
 """
 
 import contextlib
@@ -45,14 +44,14 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     "view": {},
     "bench": {},
 }  # fmt: skip
-"""Commands, each with flags that make it quick."""
+"""The commands under test, with flags that make them quick."""
 
 FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict.fromkeys(
     ("train --resume good", "train --from good"), ""
 )
 
 _OMIT = ("--help", "--video", "--video-every", "--frame-skip")
-"""These flags are omitted: they print, start other processes, or make native calls run for hours."""
+"""Flags that no case uses, because they print help, start other processes, or make native calls run for hours."""
 
 
 @functools.cache
@@ -133,7 +132,7 @@ def run(line: list[str]) -> str:
         warnings.simplefilter("ignore")
         try:
             code = cli.main(line)
-        except SystemExit as end:  # the parser prints its error in a box
+        except SystemExit as end:
             code, parsed = end.code, False
         except KeyboardInterrupt:
             raise

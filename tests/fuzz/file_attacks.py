@@ -29,7 +29,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
-"""Documented errors for invalid files and arguments."""
+"""The documented errors for invalid files and arguments."""
 BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
 
 TASK = """
@@ -148,13 +148,13 @@ READERS: dict[str, Callable[[], object]] = {
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
-"""Files to delete, so a reader must use another file."""
+"""Files that a case deletes first, so that the command must read another file."""
 SLIDE_PY = str(BASE / "slide.py")
 _NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):
-    """A command exited with 2 and printed one line to stderr."""
+    """Raised for a command that exited with 2 and printed one line to stderr."""
 
 
 def command(*words: object) -> None:
@@ -251,7 +251,7 @@ def _make(folder: Path) -> None:
         path = folder / run / "metrics.csv"
         path.write_text(re.sub(r"\d+\.\d{9,}", lambda found: found[0][:8], path.read_text()))
     config = json.loads((folder / "kept/config.json").read_text())
-    # without the original files, readers use the run's copies
+    # the original files are missing, so a command must read the copies in the run
     config |= {"task": "/nowhere/slide.py", "params": {"motion": "/nowhere/table.npy"}}
     (folder / "kept/config.json").write_text(json.dumps(config, indent=2))
     plant = lw.make("point_mass", autoreset=False, horizon=4)

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 MEMORY = 512 * 2**20
-"""Additional address space for a case, in bytes."""
+"""Bytes of address space that a case may add."""
 PATIENCE = 3.0
-"""Seconds between SIGINTs, which must end a command."""
+"""Seconds until the first SIGINT, and between later SIGINTs. A command must end when it receives one."""
 LIMIT = 60.0
 """Seconds after which a case that ignores SIGINT is killed."""
 ROOT = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 
 @dataclasses.dataclass
 class Outcome:
-    """The outcome: "refused", "worked", "interrupted", or a one-line problem."""
+    """The result of a case: "refused", "worked", "interrupted", or a one-line problem."""
 
     case: str
     did: str
@@ -39,7 +39,7 @@ class Outcome:
 
 
 Attack = Callable[[str], str]
-"""Runs a case and returns its outcome, or raises ProblemError."""
+"""A function that runs a case. It returns the outcome or raises ProblemError."""
 
 
 class ProblemError(Exception):
@@ -69,10 +69,7 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def serve(attack: Attack, warm_up: Callable[[], None]) -> None:
-    """Run the cases of the command line.
-
-    ``warm_up`` loads modules before memory is limited.
-    """
+    """Run the cases that the command line names. ``warm_up`` loads modules before memory is limited."""
     results = sys.argv[2] if sys.argv[1:2] == ["--results"] else None
     cases = sys.argv[3:] if results else sys.argv[1:]
     os.environ["XDG_STATE_HOME"] = str(Path("state").absolute())

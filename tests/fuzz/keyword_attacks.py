@@ -1,7 +1,6 @@
 """Call public functions with random values for each argument.
 
-A case is "CALL SEED" or the name of a case in ``minimal_cases.py``. Arguments come from the signatures, so new ones are
-included.
+A case is "CALL SEED" or the name of a case in ``minimal_cases.py``.
 """
 
 import dataclasses
@@ -39,7 +38,7 @@ OBJECTS: tuple[Any, ...] = (
 
 @dataclasses.dataclass(frozen=True)
 class Call:
-    """A function, its valid arguments, and keyword arguments that are missing in its signature."""
+    """A function, its valid arguments, and further keyword arguments that its signature does not name."""
 
     function: Callable[..., Any]
     valid: Callable[[], dict[str, Any]]
@@ -47,7 +46,7 @@ class Call:
 
     @property
     def names(self) -> list[str]:
-        """Return the arguments to replace. Videos are excluded, because a subprocess makes them."""
+        """Return the names of the arguments that cases replace."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
         return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]

@@ -82,7 +82,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
-"""Cases as (kind of file, reader, change). A reader must reject the file, or read it if the change does not matter."""
+"""Each case is a kind of file, a reader and a change. If the change matters, the reader must reject the file."""
 
 KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),
@@ -101,7 +101,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "a run that is a list": ("load", {"run": []}),
     "resume that is a number": ("train", {"resume": 7}),
 }
-"""Cases as (call, arguments). The error must name an argument or its value."""
+"""Each case is a call and its arguments. The error must name an argument or its value."""
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",

@@ -24,7 +24,7 @@ TEXTS = (
     "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000,
 )  # fmt: skip
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [0], [[1.5]], [None], {"x": 1}, {"": []})
-"""Values of JSON's types; most are invalid everywhere."""
+"""Values of every JSON type. Most arguments accept none of them."""
 
 
 class Canary:

@@ -1,6 +1,6 @@
-"""Damage files, command lines and arguments at random. Each must work or raise a documented error.
+"""Damage files, command lines and arguments at random.
 
-A failure prints the case and the command that repeats it.
+The damaged input must work or raise a documented error. A failure prints the case and the command that repeats it.
 """
 
 import functools
@@ -19,9 +19,9 @@ KINDS: dict[str, Iterable[str]] = {
     "file_attacks.py": file_attacks.KINDS, "keyword_attacks.py": keyword_attacks.CALLS,
     "command_attacks.py": command_attacks.SMALL,
 }  # fmt: skip
-"""Kinds of random cases, by attack program."""
+"""The kinds of random cases of each attack program."""
 COUNTS = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
-"""Number of random cases of each kind, by attack program."""
+"""How many cases of each kind a program runs."""
 MINIMAL: dict[str, Mapping[str, Any]] = {
     "file_attacks.py": FILES, "keyword_attacks.py": KEYWORDS, "command_attacks.py": COMMANDS,
 }  # fmt: skip

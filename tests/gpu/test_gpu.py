@@ -22,7 +22,7 @@ CUDA = "cuda:0"
 
 @contextlib.contextmanager
 def nothing_waits() -> Iterator[None]:
-    """Make every call that waits for the device raise an exception."""
+    """Raise an exception in every call that waits for the device."""
     patch = pytest.MonkeyPatch()
 
     def forbid(name: str) -> Callable[..., None]:
@@ -146,7 +146,6 @@ def test_deterministic_graphs_equal_direct_launches(task: str) -> None:
 
 
 def test_capture_does_not_disturb_running_graphs() -> None:
-    """Graphs share memory that a capture clears. Nothing else in this test waits for the running graphs."""
     replayed, direct = (
         lw.make("humanoid", nworld=1024, device=CUDA, deterministic=True, graphs=graphs) for graphs in (True, False)
     )
@@ -163,7 +162,6 @@ def test_capture_does_not_disturb_running_graphs() -> None:
 
 @pytest.mark.parametrize("task", ["hopper", "humanoid", "half_cheetah"])
 def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
-    """Thousands of worlds need more blocks than the device runs at once."""
     env = lw.make(task, nworld=8192, device=CUDA, deterministic=True)
     first = run(env, 50)
     for a, b in zip(first, run(env, 50), strict=True):
@@ -206,7 +204,6 @@ def test_deterministic_mode_uses_the_estimated_memory() -> None:
 
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: bool) -> None:
-    """The fields are computed inside a loop of the step's graph."""
     env, other = (lw.make("humanoid", nworld=512, device=CUDA, deterministic=deterministic) for _ in range(2))
     other.engine.partial_refresh = False  # type: ignore[attr-defined]
     seen = 0
@@ -226,7 +223,6 @@ def test_restarting_worlds_get_the_fields_of_a_full_forward_pass(deterministic: 
 
 
 def test_fault_of_one_humanoid_does_not_change_the_other_worlds() -> None:
-    """The contact buffer has room for one world with excessive contacts."""
     from lyceum_warp.testing import CHECKS
 
     checks = [check for check in CHECKS if check.__name__ in ("check_bad_state", "check_bad_action")]

@@ -17,11 +17,11 @@ pytestmark = pytest.mark.gpu
 
 DRAWN = "body_mass body_inertia geom_friction geom_quat dof_damping dof_armature actuator_gear gravity".split()
 N = 200
-CHOSEN = [0, 3, *range(50, 150)]  # the number of worlds exceeds the size of a refresh group
+CHOSEN = [0, 3, *range(50, 150)]
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Return factors for the model fields. Only those of the worlds ``CHOSEN`` depend on ``turn``."""
+    """Return factors for the model fields. Only the factors of the worlds ``CHOSEN`` depend on ``turn``."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size

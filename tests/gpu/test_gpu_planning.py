@@ -42,7 +42,6 @@ def plant(task: str) -> lw.Env:
 @pytest.mark.parametrize("task, horizon", [("reach", 16), ("half_cheetah", 8), ("cartpole_swingup", 20)])
 def test_plans_agree_with_plans_on_the_cpu(task: str, horizon: int) -> None:
     env = plant(task)
-    # at a low temperature, rounding errors could change the best sample
     gpu, cpu = (
         lw.MPPI(task, device=device, engine=engine, horizon=horizon, samples=30, temperature=10.0, seed=3)
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
@@ -69,7 +68,6 @@ def test_planner_for_several_plants_gives_the_plans_of_separate_planners(update:
             plan(states[i])
             torch.testing.assert_close(together.standard_noise[:, i], plan.standard_noise)
             torch.testing.assert_close(together.returns[i], plan.returns, rtol=1e-3, atol=1e-3)
-            # rounding may change the elites, so both plans are computed from the same returns
             if torch.equal(together.returns[i], plan.returns):
                 torch.testing.assert_close(actions[i].to(CUDA), plan.actions[0])
             plan.actions.copy_(together.actions[:, i])
@@ -93,7 +91,6 @@ def test_actions_are_on_the_device_of_the_states(of_plants: str, of_plan: str) -
 
 @pytest.mark.parametrize("update", UPDATES)
 def test_equal_returns_give_equal_plan_updates_on_gpu_and_cpu(update: str) -> None:
-    """Rounding errors may swap samples with almost equal returns."""
     gpu, cpu = (
         lw.MPPI("reach", device=device, engine=engine, samples=200, seed=3, **UPDATES[update])
         for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))

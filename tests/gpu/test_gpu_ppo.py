@@ -21,7 +21,6 @@ def made(**changes: Any) -> lw.PPO:
     {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
 ])  # fmt: skip
 def test_captured_epochs_equal_epochs_without_graphs(changes: dict[str, Any]) -> None:
-    """The graph must read the entropy weight on the device."""
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
     captured, direct = made(**changes), made(**changes)
     direct.minibatches.epoch.enabled = False

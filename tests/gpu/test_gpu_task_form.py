@@ -21,7 +21,7 @@ def test_worlds_on_a_gpu_equal_worlds_of_the_c_engine() -> None:
         gpu.step(action.cuda())
         cpu.step(action)
         for name in gpu.obs_groups:
-            # float32 and float64 differ: in a few worlds, a contact may begin in a different substep
+            # in float32, a contact may begin in a different substep in a few worlds
             error = (gpu.obs_groups[name].cpu() - cpu.obs_groups[name]).abs().amax(dim=1)
             assert error.median() < 1e-5
             assert (error < 1e-2).float().mean() > 0.9

@@ -88,7 +88,6 @@ def test_threads_divide_the_worlds_in_phases_that_allow_it(monkeypatch: pytest.M
         for call in calls:
             call()
         assert digits.numpy().tolist() == [1234] * 5
-    # launch for all worlds, then capture, then split the worlds in phases that allow it
     assert sizes == [5, 5, 5, 5, 5, 5, 5, 5, *(2, 2, 3, 3), *(2, 3)]
 
 
@@ -99,7 +98,6 @@ def count_down(number_inout: wp.array[int], turns_inout: wp.array[int]):
 
 
 def test_graph_contains_only_launches_of_its_own_thread() -> None:
-    """While one thread captures, another thread launches, copies, captures and runs a loop."""
     mine, captured = Digits(), []
     cpu, number, turns, copied = wp.get_device("cpu"), *(wp.full(1, 3, dtype=int, device="cpu") for _ in range(3))
     own = Digits()

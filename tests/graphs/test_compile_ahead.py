@@ -45,7 +45,6 @@ print(len(compile_ahead(launches, wp.get_device("cpu"), "a test")))
 def test_kernels_are_compiled_once_with_progress_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A subprocess compiles into a new cache, from which this process then loads the kernels."""
     script, cache = tmp_path / "script.py", tmp_path / "cache"
     script.write_text(SCRIPT)
     env = {**os.environ, "WARP_CACHE_PATH": str(cache)}

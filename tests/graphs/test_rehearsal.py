@@ -1,5 +1,3 @@
-"""Test rehearsals, which list the kernels that a function would launch."""
-
 import subprocess
 import sys
 import threading
@@ -105,7 +103,6 @@ def test_rehearsals_in_two_threads_run_one_after_the_other(arrays: tuple[wp.arra
 
 @pytest.mark.long
 def test_a_rehearsal_finds_every_module_that_a_step_loads() -> None:
-    """A subprocess checks that MuJoCo Warp launches kernels only through the patched functions."""
     done = subprocess.run([sys.executable, "-c", WHOLE_STEP], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

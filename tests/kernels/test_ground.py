@@ -26,7 +26,10 @@ def ground(model: mujoco.MjModel) -> wp.array:
 
 
 def ray_heights(model: mujoco.MjModel, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ground's heights and normals from MuJoCo's rays, (n,) and (n, 3); NaN without a hit."""
+    """Return the ground's heights (n,) and normals (n, 3) from MuJoCo's rays.
+
+    The height is NaN if a ray hits nothing.
+    """
     data, hit, normal = mujoco.MjData(model), np.zeros(1, np.int32), np.zeros(3)
     mujoco.mj_forward(model, data)
     heights, normals = np.full(len(points), np.nan), np.zeros((len(points), 3))
@@ -49,7 +52,11 @@ def look_up(ground: wp.array2d[float], points: wp.array[wp.vec2], out: wp.array2
 
 
 def looked_up(ground: wp.array, points: np.ndarray) -> np.ndarray:
-    """Return the ground's height, normal and presence, and its distance to points at 2 m, (n, 6)."""
+    """Call the ground functions at n points.
+
+    Return the height, normal, presence and distance of the ground, (n, 6). The distance is measured from points at a
+    height of 2 m.
+    """
     out = wp.zeros((len(points), 6), dtype=float, device="cpu")
     wp.launch(look_up, len(points), [ground, wp.array(points, dtype=wp.vec2, device="cpu"), out], device="cpu")
     found: np.ndarray = out.numpy()

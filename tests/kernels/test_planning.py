@@ -42,7 +42,6 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
 
 
 def test_planner_samples_and_plants_have_distinct_random_keys() -> None:
-    """Planner and plant have equal seeds and world indices."""
     n = 256
     found, plants = [], []
     mask, episode = wp.full(n, True, dtype=bool, device="cpu"), wp.zeros(n, dtype=int, device="cpu")

@@ -63,7 +63,6 @@ def test_random_vector_equals_its_elements_drawn_one_by_one() -> None:
 
 
 def test_different_counters_give_different_random_numbers() -> None:
-    """Counters with equal sums also give different random numbers."""
     counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
     found = draws(counters)
     assert len(np.unique(found[:, 0])) > 0.999 * len(counters)

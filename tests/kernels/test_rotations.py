@@ -111,7 +111,7 @@ def test_rotation_vectors_equal_those_of_mujoco(found: dict[str, np.ndarray]) ->
     a, b, _, _ = inputs()
     check(found["to_rotvec"], mju(lambda row, q: mujoco.mju_quat2Vel(row, q, 1.0), 3, a), 1e-5)
     difference = mju(mujoco.mju_subQuat, 3, a, b)
-    close = np.linalg.norm(difference, axis=1) < 3.1  # both signs of the rotation vector are correct near pi
+    close = np.linalg.norm(difference, axis=1) < 3.1  # near pi, both signs of the rotation vector are correct
     assert close.mean() > 0.95
     check(found["difference"][close], difference[close], 1e-5)
     check(found["angle"], np.linalg.norm(difference, axis=1), 1e-5)
@@ -150,7 +150,6 @@ def test_euler_angles_equal_those_of_mujoco(found: dict[str, np.ndarray]) -> Non
 
 
 def test_random_rotations_are_uniform_and_independent() -> None:
-    """Two components of a uniform unit quaternion are a vector with a uniform angle. Its squared length is U(0, 1)."""
     n = 4000
     rng, quats = (wp.zeros((n, k), dtype=t, device="cpu") for k, t in ((1, wp.uint32), (2, wp.vec4)))
     wp.launch(draw, n, [rng, quats], device="cpu")

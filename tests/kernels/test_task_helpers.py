@@ -226,7 +226,6 @@ def stand_up(yaw: wp.array[float], qpos: wp.array2d[float], after: wp.array[int]
 
 
 def test_upright_free_body_is_rotated_about_the_vertical() -> None:
-    """The first coordinate of qpos belongs to another joint and does not change."""
     spec = mujoco.MjSpec.from_string(
         "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body>"
         "<body name='free'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"

@@ -79,7 +79,6 @@ def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
 @pytest.mark.quick("61")
 @pytest.mark.parametrize("every", [61, 7])
 def test_checkpoint_with_a_flipped_bit_has_the_same_content_or_raises_an_error(run: Run, every: int) -> None:
-    """One of the bits marks a zip entry as a folder, so torch reads no numbers."""
     data = run.checkpoint.read_bytes()
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
@@ -109,7 +108,6 @@ def test_policy_of_a_custom_class_is_loaded_into_a_given_policy(tmp_path: Path) 
 
 
 def test_network_of_the_package_is_recreated_from_its_class_and_shape(tmp_path: Path) -> None:
-    """A value function stands for a policy class that a later release adds."""
     run = Run.create(tmp_path / "run", {})
     run.save(policy_content(1, ValueFunction(3, (4,))), {})
     loaded = load(run)

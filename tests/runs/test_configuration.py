@@ -74,7 +74,6 @@ def test_configuration_of_a_user_defined_learner_has_no_hyperparameters() -> Non
 
 
 def test_processes_on_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The number of threads is not saved, because other processes may continue the run."""
     monkeypatch.setattr("lyceum_warp.runs.configuration.cpu_cores", lambda: 6)
     learner = read(BASE | {"nworld": 4}).learner(Team(1, 2, "cpu", neighbours=2))
     assert (learner.env.options.nthread, learner.env.nworld, learner.env.first_world) == (3, 2, 2)

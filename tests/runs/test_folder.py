@@ -158,7 +158,6 @@ def test_error_of_an_invalid_setting_names_the_file(
 
 
 def test_a_new_column_of_metrics_is_empty_in_earlier_rows(tmp_path: Path) -> None:
-    """A newer task or package may add a column. The order of the names in a row does not matter."""
     run = Run(tmp_path, {})
     run.append({"iteration": 1, "kl": 0.5})
     run.append({"iteration": 2, "kl": None, "metrics/forward, m": 1.5})

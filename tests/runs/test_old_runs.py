@@ -38,7 +38,7 @@ def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: flo
 
 @pytest.fixture(params=["old_run", "runs_0_1/command", "runs_0_1/python", "runs_0_1/task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations: before release 0.1, or by 0.1 from the command line, from Python or of a task file."""
+    """A run of two iterations, made before release 0.1 or by release 0.1."""
     return Path(shutil.copytree(DATA / request.param, tmp_path / "run"))
 
 
@@ -65,7 +65,7 @@ def test_run_of_an_early_release_is_resumed_and_new_training_starts_from_it(run:
 
 @pytest.fixture
 def rsl_rl_run(tmp_path: Path) -> Path:
-    """A run of rsl_rl's PPO. Early releases named its algorithm rsl-rl."""
+    """A run of PPO in rsl_rl. Early releases named this algorithm rsl-rl."""
     return Path(shutil.copytree(DATA / "rsl_rl_run", tmp_path / "rsl_rl"))
 
 

@@ -43,7 +43,6 @@ class Killed(BaseException):
 def test_run_continues_identically_after_a_save_was_killed_at_any_point(
     owner: Any, name: str, calls: int, whole: list[dict[str, Any]], tmp_path: Path
 ) -> None:
-    """Each iteration overwrites 12 of 20 steps, so a killed save has already replaced files of the last checkpoint."""
     sac, function = made(), getattr(owner, name)
     left = [calls]
 

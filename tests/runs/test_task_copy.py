@@ -53,7 +53,6 @@ def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 
 def test_run_resumes_after_its_task_was_moved(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The included files, meshes and arrays are moved together with the task."""
     out = trained(folder)
     before = returns(capsys, str(out))
     assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
@@ -84,7 +83,6 @@ URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="tru
 
 @pytest.mark.parametrize("kind", ["attached", "urdf", "python"])
 def test_run_copies_all_files_of_a_model(kind: str, folder: Path) -> None:
-    """The models attach another model, are read from a URDF, or are made in Python."""
     robot = folder / "mine" / "robot"
     (robot / "arm.urdf").write_text(URDF)
     (robot / "whole.xml").write_text(
@@ -180,7 +178,6 @@ def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytes
 
 
 def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """The algorithm was constructed after the change, so training uses the changed files."""
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
     def train(iterations: int, **words: Any) -> None:
@@ -231,7 +228,7 @@ EDITS = [
     lambda text: "",
     None,
 ]
-"""Edits of a task's files during training. None deletes the file."""
+"""Changes of a task's files during training. The value None deletes the file."""
 
 
 def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:

@@ -1,5 +1,3 @@
-"""Test that code and files in another user's run are not used until the run is trusted."""
-
 import json
 import shutil
 from pathlib import Path
@@ -109,7 +107,6 @@ def test_run_of_another_user_raises_an_error_until_it_is_trusted(
 def test_run_with_an_edited_path_raises_an_error(
     entries: dict[str, Any], kept: dict[str, str], named: str, made: Path, witness: Path, tmp_path: Path
 ) -> None:
-    """The run's folder was trusted before it was edited."""
     folder, evil = Path(shutil.copytree(made / "named", tmp_path / "named")), tmp_path / "evil.py"
     (folder / "task").mkdir()
     for file in (evil, folder / "task" / "point_mass.py") if "point_mass" in named else [evil]:
@@ -118,7 +115,6 @@ def test_run_with_an_edited_path_raises_an_error(
     change(folder, **entries, kept=Run.open(folder).config["kept"] | kept)
     run = Run.open(folder)
     saved = Configuration.of(run)
-    # a given task would also read a table or a model that the run names
     for task in (None, "point_mass") if named.startswith("/home") else [None]:
         with pytest.raises(ValueError, match=r"was not made by you .*--trust") as refusal:
             run_env(run, saved.options, saved.params, task=task)

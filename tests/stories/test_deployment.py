@@ -1,5 +1,3 @@
-"""Run a robot in plain MuJoCo with only the policy's ONNX file, and compare it with the environment."""
-
 import copy
 import json
 import math
@@ -73,14 +71,13 @@ def test_control_loop_in_the_documentation_equals_the_environment(
         env.step(policy(env.obs))
         mujoco.mj_step(model, data, robot.substeps)
         np.testing.assert_allclose(robot.action, env.action[0], atol=1e-5)
-        # contacts amplify the rounding of actions, up to 2e-5 within ten steps of a G1
+        # contacts amplify the rounding of actions, and the error reaches 2e-5 within ten steps of a G1
         np.testing.assert_allclose(robot.observation(data, command), env.obs[0], atol=1e-4, rtol=1e-4)
         moved = max(moved, np.abs(robot.action).max())
     assert moved > 0.3 and not env.done.any()
 
 
 def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
-    """The program in the documentation uses these names."""
     env = lw.make("go1_velocity")
     policy, model = walking_policy(env), copy.copy(env.model)
     robot = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), model)

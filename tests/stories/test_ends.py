@@ -57,7 +57,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 class Leave(lw.Task):
-    """A pole that may start in terminal states, and may leave them."""
+    """A pole that may start in a terminal state and leave it again."""
 
     model, frame_skip, obs, horizon = "inverted_pendulum.xml", 2, {"angle": 1, "speed": 1}, 50
 

@@ -1,5 +1,3 @@
-"""Define tasks in a notebook, where cells run in one module and may run repeatedly."""
-
 import sys
 import types
 from pathlib import Path
@@ -26,7 +24,6 @@ def run_cell(module: types.ModuleType, file: Path) -> None:
 
 
 def test_notebook_task_uses_the_functions_of_its_own_cell(notebook: types.ModuleType, tmp_path: Path) -> None:
-    """Every cell redefines World, Params and observe. Only the first cell defines evaluate."""
     evaluate = "def evaluate(s: World, p: Params) -> float:\n    return 1.0"
     first = tiny_task.with_function(evaluate)
     second = tiny_task.changed(("s.qpos[0]", "2.0"), ("class Tiny", "class Other"))
@@ -38,7 +35,6 @@ def test_notebook_task_uses_the_functions_of_its_own_cell(notebook: types.Module
     assert tiny.eval.item() == 1.0
     assert torch.equal(tiny.obs, tiny.field("qpos")[:, :1])
     assert other.obs.item() == 2.0
-    # the second cell uses the default evaluation, not the function of the first cell
     assert torch.equal(other.eval, other.reward)
 
 

@@ -1,5 +1,3 @@
-"""``check_task`` tests each feature for any task. These tests need particular tasks."""
-
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +22,7 @@ def copied(s: PuckWorld, action: Row[float], p: PuckParams, ctrl: Row[float]):
 
 
 class DrawnWithControl(Drawn):
-    """The ``control`` makes rollouts run step by step."""
+    """Because of ``control``, rollouts run step by step."""
 
     control = copied
 

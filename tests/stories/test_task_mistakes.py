@@ -1,5 +1,3 @@
-"""New users of the package made the mistakes in this file."""
-
 from pathlib import Path
 
 import pytest

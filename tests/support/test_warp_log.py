@@ -30,7 +30,6 @@ main(["check", "hopper", "--device", "cuda"])
 
 @WITHOUT_GPU
 def test_warp_alone_prints_that_the_driver_is_missing() -> None:
-    """If this test fails, the previous test proves nothing."""
     assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
 
 

@@ -19,7 +19,7 @@ def unit(rows: np.ndarray) -> np.ndarray:
 
 
 def clocks(steps: int) -> np.ndarray:
-    """Draw random numbers of substeps, half of which are 0."""
+    """Draw random substep counts, half of which are 0."""
     return SUBSTEP * RNG.integers(1, steps, (N, FEET)) * RNG.integers(0, 2, (N, FEET))
 
 
@@ -50,7 +50,7 @@ VALUES: dict[str, Any] = {
     "qpos": QPOS, "qvel": normal(12), "qacc": normal(12), "qfrc_actuator": normal(12), "row": normal(6),
     "sensordata": normal(24), "subtree_angmom": normal(4, 3), "base": 2, "site_xpos": normal(6, 3),
 }  # fmt: skip
-"""Each argument's value: one shared value, or one entry per world."""
+"""The value of each argument: one shared value, or one entry per world."""
 
 
 def total(rows: np.ndarray) -> np.ndarray:

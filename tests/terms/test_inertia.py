@@ -7,9 +7,9 @@ RNG = np.random.default_rng(0)
 
 
 def of_points(mass: np.ndarray, points: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Compute mass, centre of mass and inertia of point masses (k,) at (k, 3).
+    """Compute the mass, centre and inertia of k point masses (k,) at positions (k, 3).
 
-    The inertia is about their centre, in the body's axes.
+    The inertia is about the centre of mass, in the body's axes.
     """
     centre = mass @ points / mass.sum()
     x = points - centre

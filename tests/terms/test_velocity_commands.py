@@ -1,5 +1,3 @@
-"""test_go1_velocity.py checks the distributions of velocity commands."""
-
 import numpy as np
 import pytest
 from term_calls import N, call

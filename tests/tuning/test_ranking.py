@@ -14,9 +14,7 @@ def test_rank_correlations_are_spearman_correlations_with_mean_ranks_for_ties() 
     first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
     second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
     found = rank_correlations(first, second)
-    assert found.tolist() == pytest.approx(
-        [0.8, 0.9487, -1.0, 0.0], abs=1e-4
-    )  # states with equal returns of all samples are omitted
+    assert found.tolist() == pytest.approx([0.8, 0.9487, -1.0, 0.0], abs=1e-4)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from lyceum_warp.viz.render import Shot
 
 SMALL = (96, 64)
 
-# in a subprocess, because imageio forks, and this process may be too large for a fork
+# imageio forks, and a fork of this process may be too large, so a subprocess reads the video
 READ = """
 import json, sys
 import imageio.v2 as imageio
@@ -39,7 +39,7 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def frames_of(path: Path) -> dict[str, Any]:
-    """Return a video's rate, shape and number of frames, and each frame's brightest and red pixels."""
+    """Return the rate, shape and number of frames of a video, and the brightest and the red pixels of each frame."""
     done = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))
 
