@@ -62,7 +62,7 @@ MISTAKES = WRONG.findall((ROOT / "docs" / "warp_for_python.md").read_text())
 
 
 @pytest.mark.parametrize("number", range(len(MISTAKES)))
-def test_mistakes_in_warp_for_python_give_the_printed_messages(number: int, task_file: TaskFile) -> None:
+def test_mistakes_on_a_page_raise_the_errors_that_the_page_shows(number: int, task_file: TaskFile) -> None:
     function, message = MISTAKES[number]
     task = python_of(ROOT / "docs" / "warp_for_python.md")
     assert task.count("class Measured") == 1

@@ -31,7 +31,7 @@ def numbers(pattern: str, lines: list[str]) -> list[float]:
     return [float(match[1]) for line in lines if (match := re.search(pattern, line))]
 
 
-def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
+def test_train_example_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
     assert len(returns) == 6  # five iterations, and the mean policy
@@ -41,7 +41,7 @@ def test_example_train_improves_and_saves_the_policy(run, tmp_path: Path) -> Non
 
 
 @pytest.mark.long
-def test_example_own_policy_improves_its_policy(run) -> None:
+def test_own_policy_example_improves_its_policy(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
     assert len(returns) == 9  # eight iterations, and the mean policy
@@ -50,7 +50,7 @@ def test_example_own_policy_improves_its_policy(run) -> None:
 
 
 @pytest.mark.long
-def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
+def test_random_search_example_writes_a_complete_run_folder(run, tmp_path: Path) -> None:
     once = numbers(r"return (-?[\d.]+)", run("random_search.py", "--out", "once", "--iterations", "6"))
     assert max(once) == 200.0 > 1.5 * once[0]
     run("random_search.py", "--out", "twice", "--iterations", "3")
@@ -64,7 +64,7 @@ def test_example_random_search_writes_a_complete_run_folder(run, tmp_path: Path)
 
 
 @pytest.mark.long
-def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
+def test_td3_example_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Path) -> None:
     ended = numbers(r": (\d+) episodes", run("td3.py", "--out", "once", "--iterations", "4"))
     assert ended[0] > 50 > 25 > ended[-1]
     run("td3.py", "--out", "twice", "--iterations", "2")
@@ -73,7 +73,7 @@ def test_example_td3_learns_and_resumes_with_its_replay_buffer(run, tmp_path: Pa
     assert Run.open(tmp_path / "once").rows() == Run.open(tmp_path / "twice").rows()
 
 
-def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
+def test_plan_example_reaches_the_target_in_each_episode(run) -> None:
     lines = run("plan.py", "--episodes", "2")
     assert sum("success after" in line for line in lines) == 2
     assert "success: 100% of 2 episodes" in lines
@@ -81,7 +81,7 @@ def test_example_plan_reaches_the_target_in_each_episode(run) -> None:
 
 
 @pytest.mark.long
-def test_example_own_task_passes_check_task_and_runs() -> None:
+def test_own_task_example_passes_check_task_and_runs() -> None:
     # the example registers a task of the module __main__, so it needs a subprocess
     command = [sys.executable, str(EXAMPLES / "own_task.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
@@ -95,7 +95,7 @@ def test_example_own_task_passes_check_task_and_runs() -> None:
 
 
 @pytest.mark.long
-def test_example_commanded_speed_passes_check_task_on_both_engines() -> None:
+def test_commanded_speed_example_passes_check_task_on_both_engines() -> None:
     command = [sys.executable, str(EXAMPLES / "commanded_speed.py")]
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)
@@ -109,7 +109,7 @@ def test_example_commanded_speed_passes_check_task_on_both_engines() -> None:
 
 
 @pytest.mark.long
-def test_example_commanded_speed_trains_and_records_its_terms(tmp_path: Path) -> None:
+def test_commanded_speed_example_trains_a_policy_and_logs_its_terms(tmp_path: Path) -> None:
     options = ["--iterations", "2", "--samples", "8000", "--nworld", "16"]
     assert train(tmp_path / "run", *options, task=str(EXAMPLES / "commanded_speed.py")) == 0
     for row in Run.open(tmp_path / "run").rows():
@@ -118,7 +118,7 @@ def test_example_commanded_speed_trains_and_records_its_terms(tmp_path: Path) ->
         assert 0 < terms[0] < 20 and 0 < terms[1] < 6 and terms[2] < 0 and terms[3] <= 0
 
 
-def test_example_torch_loop_learns_to_approach_the_target(run) -> None:
+def test_torch_loop_example_learns_to_approach_the_target(run) -> None:
     lines = run("torch_loop.py", "--iterations", "24")
     distances = numbers(r"256 episodes ended ([\d.]+) m", lines)
     assert len(distances) == 6  # an episode takes 128 steps, which are four iterations of 32 steps

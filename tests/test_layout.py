@@ -122,7 +122,7 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *window}
 
 
-def test_viewer_session_imports_nothing_of_the_window() -> None:
+def test_viewer_session_imports_nothing_from_the_window() -> None:
     session = [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")]
     imported = {other for name in session for other in imports()[name]}
     assert session and not [name for name in imported if name.startswith("lyceum_warp.viewer.window")]

@@ -184,7 +184,7 @@ def test_training_updates_shared_memory_and_resumes_bit_for_bit(tmp_path: Path, 
     assert torch.equal(env.get_shared(), expected)
 
 
-def test_sums_of_shared_memory_are_added_over_processes(env: lw.Env) -> None:
+def test_sums_of_shared_memory_are_added_across_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
     _, ended = steps(env, 30)

@@ -128,5 +128,5 @@ def test_no_excluded_word_is_used() -> None:
         "the roll out of a plan",
     ],
 )
-def test_excluded_phrase_is_found_in_code_in_names_and_over_two_lines(text: str) -> None:
+def test_excluded_phrases_are_found_in_code_names_and_across_lines(text: str) -> None:
     assert len(found_in(text)) == 1

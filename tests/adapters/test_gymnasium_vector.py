@@ -141,7 +141,7 @@ def test_ended_world_waits_for_a_masked_reset_if_autoreset_is_disabled(
     assert (envs.env.episode_step.numpy()[ended] == 0).all()
 
 
-def test_reset_accepts_a_mask_as_tensor(vector: Callable[..., GymnasiumVectorEnv]) -> None:
+def test_reset_accepts_a_tensor_as_mask(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(torch=True)
     before, _ = envs.reset(seed=1)
     mask = torch.tensor([True, False, False, True])

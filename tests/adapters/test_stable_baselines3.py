@@ -134,7 +134,7 @@ def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
         ("reward", "the task 'hopper' has no parameter 'reward': "),
     ],
 )
-def test_setting_an_attribute_without_effect_raises_an_error(
+def test_setting_an_attribute_that_would_have_no_effect_raises_an_error(
     name: str, message: str, hopper: StableBaselines3VecEnv
 ) -> None:
     with pytest.raises(ValueError, match=message) as error:

@@ -82,7 +82,7 @@ def test_numbers_that_differ_in_one_bit_are_reported(old: list, new: list, text:
     assert compare.difference("a", np.array(old, np.float32), np.array(old, np.float32)) is None
 
 
-def test_shape_type_and_text_are_compared() -> None:
+def test_shapes_types_and_texts_are_compared() -> None:
     assert compare.difference("a", np.zeros(2), np.zeros(3)).text == "float64 (2,) -> float64 (3,)"
     assert compare.difference("a", np.zeros(2), np.zeros(2, np.float32)).text == "float64 (2,) -> float32 (2,)"
     assert compare.difference("a", np.array("ab"), np.array("abc")).text == "ab -> abc"

@@ -11,7 +11,7 @@ def test_permutation_test_finds_curves_that_differ() -> None:
     assert np.isnan(comparison.permutation_test(noise[0][:1], noise[1])).all()
 
 
-def test_false_positive_rate_of_the_permutation_test_equals_the_level() -> None:
+def test_false_positive_rate_of_the_permutation_test_equals_the_significance_level() -> None:
     random = np.random.default_rng(0)
     wrong = sum(
         (comparison.permutation_test(*random.normal(size=(2, 4, 6)).cumsum(-1)) < 0.05).any() for _ in range(200)

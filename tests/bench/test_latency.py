@@ -31,7 +31,7 @@ def test_task_with_suggested_physics_is_also_planned_with_exact_physics() -> Non
     assert {(case.task, case.samples) for case in named} == {("humanoid", 4096)}
 
 
-def test_flag_own_uses_the_suggested_samples_and_horizon() -> None:
+def test_own_flag_uses_the_suggested_samples_and_horizon() -> None:
     (case,) = latency.cases(latency.Options(tasks=("reach",), own=True))
     assert (case.samples, case.horizon) == (30, 16)
     with pytest.raises(ValueError, match="omit --samples and --horizons"):

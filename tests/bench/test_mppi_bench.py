@@ -28,7 +28,7 @@ def test_plain_python_environments_return_the_same_rewards(task: str) -> None:
 
 
 @pytest.mark.long
-def test_python_planner_earns_what_mppi_earns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_python_planner_reaches_the_return_of_mppi(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "mppi.jsonl"
     assert main(out, "--contestants", "mppi", "python") == 0
     assert "| reach | 30 x 16 | lyceum_warp, C engine |" in capsys.readouterr().out

@@ -55,7 +55,7 @@ def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_first_gymnasium_episodes_continue_at_the_current_steps(mode: str) -> None:
+def test_first_episodes_in_gymnasium_start_at_the_step_counts_of_the_worlds(mode: str) -> None:
     env = lw.make("swimmer", nworld=2, nthread=1)
     state = env.get_state()
     state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)

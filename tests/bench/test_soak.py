@@ -42,7 +42,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 9,?600 \|", capsys.readouterr().out)
 
 
-def test_variant_of_a_task_among_several_uses_the_right_structs(tmp_path: Path) -> None:
+def test_variant_of_a_task_in_a_file_with_several_tasks_uses_its_struct(tmp_path: Path) -> None:
     file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
     own = TaskSource(find_task(file), "soak")
     observe = own.functions["observe"]

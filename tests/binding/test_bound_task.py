@@ -63,7 +63,7 @@ OBSERVATIONS = {
 
 
 @pytest.mark.parametrize("case", OBSERVATIONS)
-def test_observation_size_that_differs_from_obs_raises_an_error(case: str, task_file: TaskFile) -> None:
+def test_observation_that_does_not_match_obs_raises_an_error(case: str, task_file: TaskFile) -> None:
     observe, message = OBSERVATIONS[case]
     file = task_file(
         f"observes_{case.replace(' ', '_').replace('-', '_')}.py", tiny_task.changed(("obs[0] = s.qpos[0]", observe))

@@ -20,7 +20,7 @@ def source_of(folder: Path, text: str) -> TaskSource:
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_function_with_the_signature_in_the_table_is_found(name: str, tmp_path: Path) -> None:
+def test_function_with_the_documented_signature_is_found(name: str, tmp_path: Path) -> None:
     source = source_of(tmp_path, tiny_task.with_function(MEANT[name]))
     assert [key for key, function in source.functions.items() if function] == sorted(
         {"observe", name}, key=list(FUNCTIONS).index
@@ -28,7 +28,7 @@ def test_function_with_the_signature_in_the_table_is_found(name: str, tmp_path: 
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_error_of_a_function_with_other_arguments_shows_the_correct_line(name: str, tmp_path: Path) -> None:
+def test_error_of_a_function_with_wrong_arguments_shows_the_signature(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))

@@ -39,7 +39,9 @@ def test_relative_model_path_is_relative_to_the_task_file(tmp_path: Path, monkey
     assert task_spec(find_task(file)).modelname == "hopper"
 
 
-def test_only_a_model_option_is_relative_to_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_path_in_the_option_model_is_relative_to_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.geom("torso_geom").density = 5000
     (tmp_path / "hopper.xml").write_text(spec.to_xml())
@@ -89,7 +91,7 @@ def test_pgs_solver_is_replaced_by_newton() -> None:
     assert compile_model(ball('solver="CG"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_CG
 
 
-def test_sleep_is_disabled_with_a_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_disabling_sleep_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO"):
         model = compile_model(ball('timestep="0.002"><flag sleep="enable"/></option><option'), (), PHYSICS)
     assert not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP

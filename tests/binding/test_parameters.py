@@ -51,7 +51,7 @@ def parameters(model: mujoco.MjModel, struct: Any = Params, nworld: int = 2, **g
     return Parameters(struct, struct.cls, "arm", model, nworld=nworld, timestep=0.02, given=given)
 
 
-def test_defaults_come_from_the_struct_and_dt_from_the_timestep(model: mujoco.MjModel) -> None:
+def test_defaults_come_from_the_struct_and_dt_equals_the_timestep(model: mujoco.MjModel) -> None:
     values = parameters(model).values
     assert {name: values[name] for name in ("dt", "gain", "count", "lively")} == {
         "dt": 0.02, "gain": 1.0, "count": 3, "lively": False

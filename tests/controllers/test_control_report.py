@@ -84,7 +84,7 @@ def test_several_episodes_give_one_report(episode: Trajectory) -> None:
     assert control_report(episode).return_std is None
 
 
-def test_report_of_no_or_different_episodes_raises_an_error(env: lw.Env) -> None:
+def test_report_of_unsuitable_episodes_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match="at least one trajectory"):
         control_report([])
     one = control(env, SamplingPlanner(0), steps=2)
@@ -136,7 +136,7 @@ def test_json_has_null_for_infinite_numbers(episode: Trajectory, tmp_path: Path)
     assert [file.name for file in path.parent.iterdir()] == ["report.json"]
 
 
-def test_report_rows_have_units_and_dashes_for_missing_values(episode: Trajectory, env: lw.Env) -> None:
+def test_report_shows_units_and_replaces_missing_values_by_dashes(episode: Trajectory, env: lw.Env) -> None:
     rows = dict(control_report(episode).rows())
     assert rows["episodes"] == "1 of point_mass (40 steps, sync)"
     assert rows["planning time p99.9"] == "-" and rows["planning time p50"].endswith(" ms")

@@ -17,7 +17,7 @@ def env() -> lw.Env:
     return lw.make("hopper", nworld=3, horizon=60, autoreset=False)
 
 
-def test_episodes_of_a_policy_have_the_returns_that_evaluate_gives(env: lw.Env, shared_env: SharedEnv) -> None:
+def test_policy_episodes_have_the_same_returns_as_evaluate(env: lw.Env, shared_env: SharedEnv) -> None:
     counts: list[tuple[int, int]] = []
     evaluated = lw.evaluate(shared_env("hopper", nworld=3, horizon=60), push, 5, seed=2)  # type: ignore[arg-type]
     progress = lambda *count: counts.append(count)  # noqa: E731

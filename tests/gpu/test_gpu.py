@@ -168,7 +168,7 @@ def test_deterministic_runs_are_equal_bit_for_bit(task: str) -> None:
         assert torch.equal(a, b)
 
 
-def test_deterministic_mode_uses_the_estimated_memory() -> None:
+def test_memory_use_of_the_deterministic_mode_matches_the_estimate() -> None:
     def free() -> int:
         gc.collect()
         torch.cuda.empty_cache()
@@ -239,7 +239,7 @@ def test_evaluation_with_few_worlds_runs_on_the_cpu() -> None:
     assert math.isfinite(next(npg).mean_return or math.nan)
 
 
-def test_worlds_use_the_estimated_memory() -> None:
+def test_memory_use_of_worlds_matches_the_estimate() -> None:
     small, large = 1024, 8192
     sizes = []
     for nworld in (small, large):

@@ -22,7 +22,7 @@ def interpolated(
 
 @pytest.mark.parametrize("spline", SPLINES)
 @pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1)])
-def test_interpolated_actions_equal_the_plain_implementation_at_every_phase(
+def test_interpolated_actions_equal_the_numpy_implementation_at_every_phase(
     horizon: int, count: int, spline: str
 ) -> None:
     number = knots.knot_count(horizon, count, spline)

@@ -41,7 +41,7 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
             assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
 
 
-def test_planner_samples_and_plants_have_distinct_random_keys() -> None:
+def test_random_keys_of_samples_and_plants_are_distinct() -> None:
     n = 256
     found, plants = [], []
     mask, episode = wp.full(n, True, dtype=bool, device="cpu"), wp.zeros(n, dtype=int, device="cpu")

@@ -31,7 +31,7 @@ def test_new_run_folder_contains_the_package_versions(run: Run) -> None:
     assert packages | {"python", "platform", "cpu"} <= versions.keys()
 
 
-def test_run_reads_back_the_saved_state(run: Run) -> None:
+def test_loaded_state_of_a_run_equals_the_saved_state(run: Run) -> None:
     state = Run.open(run.folder).read()["state"]
     assert state["counter"] == 5
     assert state["tensor"].tolist() == [0, 1, 2]
@@ -169,7 +169,7 @@ def test_a_new_column_of_metrics_is_empty_in_earlier_rows(tmp_path: Path) -> Non
     ]
 
 
-def test_numbers_of_metrics_rows_are_read_exactly(tmp_path: Path) -> None:
+def test_numbers_in_metrics_rows_are_read_exactly(tmp_path: Path) -> None:
     run = Run(tmp_path, {})
     rows = [{"iteration": i, "value": i / 3, "mean": None if i % 2 else 1e-30, "bad": float("nan")} for i in (1, 2, 3)]
     for row in rows:

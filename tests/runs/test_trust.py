@@ -179,6 +179,6 @@ def test_training_continues_if_the_run_cannot_be_added_to_trusted_runs(
     assert f"need --trust for the run in {tmp_path / 'run'}" in line
 
 
-def test_command_trust_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_trust_command_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "point_mass", "--trust", "--out", str(tmp_path / "run")]) == 2
     refused(capsys, "--trust has no effect without --resume or --from")

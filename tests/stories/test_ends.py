@@ -104,7 +104,7 @@ def test_reset_clears_the_done_reason_of_the_previous_episode() -> None:
         assert terminated == bool(env.env.get_terminated(env.env.get_state())[0]) and not truncated
 
 
-def test_rule_gives_the_same_result_after_other_rules() -> None:
+def test_rule_gives_the_same_result_alone_and_after_other_rules() -> None:
     rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
     check_task(Leave, steps=20, nworld=8)
     check_task(Leave, steps=20, nworld=8, checks=[rule])

@@ -393,7 +393,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 
 
 @pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_error_in_a_task_definition_raises_one_line_that_names_it(
+def test_mistake_in_a_task_definition_raises_a_one_line_error(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(ValueError, match=message) as caught:

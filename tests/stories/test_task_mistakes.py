@@ -79,7 +79,7 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
 
 
 @pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_error_in_a_task_file_raises_one_line_that_names_it(
+def test_mistake_in_a_task_file_raises_a_one_line_error(
     change: tuple[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny_task.write(tmp_path, OTHER_FILE, "other_rewards.py")

@@ -8,7 +8,7 @@ from lyceum_warp.cli.arguments import Physics, given
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 
 
-def test_settings_for_hopper_have_lower_limits_and_the_same_time_step(shared_env: SharedEnv) -> None:
+def test_settings_for_hopper_lower_the_solver_limits_and_keep_the_time_step(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", solver={"iterations": 3})  # hopper uses RK4 and 4 substeps of 2 ms
     settings = candidates(env)
     names = [setting.name for setting in settings]

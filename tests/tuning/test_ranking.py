@@ -37,7 +37,7 @@ def test_sparse_jacobian_keeps_the_ranks_of_samples_but_coarse_physics_change_th
     assert verdict(crude, "strict") in ("ranks badly", "not shown") and verdict(crude, "any") in ("same", "no gain")
 
 
-def test_standing_moving_and_fallen_start_states_have_the_expected_step_counts(rankings: Rankings) -> None:
+def test_step_counts_of_standing_moving_and_fallen_start_states(rankings: Rankings) -> None:
     columns = rankings.reference.state_space.parts["step"]
     steps = {kind: start[:, columns] for kind, start in rankings.starts.items()}
     assert (steps["standing"] == 0).all() and steps["moving"].flatten().tolist() == [30, 75, 120]

@@ -24,7 +24,7 @@ def model() -> mujoco.MjModel:
 @pytest.mark.parametrize("cameras, fixed, tracked", [
     ("<camera/><camera mode='trackcom'/>", 1, -1), ("<camera/>", -1, 1), ("", -1, 1),
 ])  # fmt: skip
-def test_default_camera_tracks_or_else_is_fixed_or_else_follows_the_first_body(
+def test_default_camera_is_a_tracking_or_fixed_camera_or_follows_the_first_body(
     model: mujoco.MjModel, cameras: str, fixed: int, tracked: int
 ) -> None:
     text = f"<mujoco><worldbody><body><freejoint/><geom size='1'/>{cameras}</body></worldbody></mujoco>"

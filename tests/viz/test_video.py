@@ -152,7 +152,9 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_video_of_single_shots_shows_fields_transparent_copies_and_lines(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_video_of_single_shots_shows_model_fields_transparent_copies_and_lines(
+    model: mujoco.MjModel, tmp_path: Path
+) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
     usual = {"geom_size": model.geom_size.copy()}
     mp4 = video_of(model, tmp_path / "video.mp4", fps=25)
