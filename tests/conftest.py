@@ -59,7 +59,7 @@ def shared_env() -> Iterator[SharedEnv]:
     made: dict[tuple[Any, ...], lw.Env] = {}
 
     def get(task: str | type[lw.Task], *, engine: str = "mujoco", nworld: int = 1, **options: Any) -> lw.Env:
-        # lists and arrays are not hashable, but their repr is
+        # lists and arrays are not hashable, so the key contains their repr
         key = (task, engine, nworld, *sorted((name, repr(value)) for name, value in options.items()))
         if key not in made:
             made[key] = lw.make(task, engine=engine, nworld=nworld, **options)
@@ -136,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Mark cases as ``long``, except those that the mark ``quick`` of their test names."""
+    """Mark a case as ``long`` unless the mark ``quick`` of its test lists the case."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:
@@ -146,7 +146,6 @@ def _mark_long(items: list[pytest.Item]) -> None:
             if not named:
                 item.add_marker(pytest.mark.long)
     for (test, *quick), found in cases.items():
-        # a command line may select single cases
         if len(found) > len(quick) and (unknown := set(quick) - found):
             raise pytest.UsageError(f"{test} has no cases {sorted(unknown)}: name some of {sorted(found)}")
 

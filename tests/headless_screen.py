@@ -1,4 +1,4 @@
-"""Run the panel in MuJoCo Studio's viewer without a browser or window."""
+"""Run the viewer's panel without a browser or a window."""
 
 from typing import Any
 

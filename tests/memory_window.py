@@ -11,7 +11,7 @@ from lyceum_warp.viewer.session.clock import Session
 class MemoryWindow:
     """A window that collects frames.
 
-    ``script`` gets a frame and its number. It returns commands, or None to close the window.
+    ``script`` receives a frame and its number, and returns commands. A return value of None closes the window.
     """
 
     wants_frame = True

@@ -58,7 +58,7 @@ class Plain:
     """A planner in float64 that follows the definitions. The caller passes the standard normal numbers.
 
     Args:
-        knots: Number of knots over the horizon. None draws an independent number at each step.
+        knots: Number of knots over the horizon. With None, the noise of each step is independent.
         count: Number of knots in a plan.
         fields: Model fields by name, (models, size). World i uses row i modulo the number of models.
     """
@@ -106,7 +106,7 @@ class Plain:
             self.smoothing = (1.0, 0.0, 0.0)
         self.knots = np.tile(np.clip(self.fill, self.low, self.high), (count or horizon, 1))
         self.deviation = np.tile(np.diag(self.factor), (len(self.knots), 1))
-        # the standard deviation of smoothed independent noise, from the impulse response
+        # the standard deviation of smoothed noise, computed from the impulse response
         self.spread = np.sqrt((smoothed(np.eye(len(self.knots)), self.smoothing) ** 2).sum(1))[:, None]
 
     @property

@@ -11,7 +11,7 @@ from lyceum_warp.binding.sources import is_row, overloads, run_source
 
 N = 256
 MODULE = wp.Module("term_calls", None)
-"""The Warp module of all kernels, so that Warp compiles them together."""
+"""All kernels are in one Warp module, so that Warp compiles them together."""
 
 
 def kernel_of(function: wp.Function, number: int) -> wp.Kernel:

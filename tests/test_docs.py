@@ -24,7 +24,10 @@ from lyceum_warp.viz.video import NoVideoError, check_video
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
 WALKTHROUGHS = [page for page in PAGES if "\n```sh\n" in page.read_text()]
-"""Pages with commands. Their blocks run in order in one folder. A block with a title is written to a file."""
+"""The pages with commands.
+
+The blocks of a page run in order in one folder. A block with a title is written to a file.
+"""
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES]
 
 

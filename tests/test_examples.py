@@ -34,7 +34,7 @@ def numbers(pattern: str, lines: list[str]) -> list[float]:
 def test_train_example_improves_and_saves_the_policy(run, tmp_path: Path) -> None:
     lines = run("train.py", "--iterations", "5", "--samples", "2000")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 6  # five iterations, and the mean policy
+    assert len(returns) == 6
     assert returns[-1] > 2 * returns[0] > 0
     assert lines[-1] == "saved in policy.pt: 5126 parameters"
     assert (tmp_path / "policy.pt").is_file()
@@ -44,7 +44,7 @@ def test_train_example_improves_and_saves_the_policy(run, tmp_path: Path) -> Non
 def test_own_policy_example_improves_its_policy(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
-    assert len(returns) == 9  # eight iterations, and the mean policy
+    assert len(returns) == 9
     assert returns[-1] > max(returns[:3]) + 50
     assert lines[-1].endswith("370 parameters")
 

@@ -23,14 +23,14 @@ def hopper(engine: str, **options: Any) -> lw.Env:
 
 
 def lay_down(env: lw.Env, world: int) -> None:
-    """Put a hopper on the floor, where it has five contacts. A standing hopper has none."""
+    """Put a hopper on the floor, where it has five contacts."""
     state, start = env.get_state(), env.state_space.parts["qpos"].start
     state[world, start + 1 : start + 3] = torch.tensor([0.05, 1.5], dtype=state.dtype)
     env.set_state(state, torch.arange(N) == world)
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step ``env``, in which one world has a fault, and ``clean``. All other worlds must be bitwise equal."""
+    """Step an environment with a faulty world, and one without faults. All other worlds must be bitwise equal."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):
@@ -52,10 +52,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 
 
 def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
-    """With less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts.
-
-    The memory sizes depend on the MuJoCo version, so the test tries many.
-    """
+    """With less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts."""
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
         spec = lw.gymnasium_model("hopper.xml").spec()
@@ -104,7 +101,6 @@ def test_overflow_of_a_contact_sensor_in_the_warp_engine_is_an_engine_warning() 
         env = hopper("warp", model=spec, nconmax=16, njmax=64)
         opt = env.engine.m.opt  # type: ignore[attr-defined]
         opt.contact_sensor_maxmatch = 1
-        # sensors are disabled, because the task needs none
         opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         return env
 

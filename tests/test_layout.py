@@ -33,7 +33,7 @@ LEVELS = {
     "adapters": 13, "viewer": 13,
     "cli": 14, "gym": 14,
 }  # fmt: skip
-"""The level of each module or subpackage. Each imports only from lower levels and from itself."""
+"""The level of each module or subpackage. A module imports only from lower levels and from itself."""
 
 TESTED_BY = {
     "done": "test_faults.py", "task": "binding", "testing": "conformance",
@@ -221,7 +221,7 @@ def in_new_process(program: str) -> str:
 
 
 def test_no_submodule_has_the_name_of_a_public_function() -> None:
-    """Importing such a submodule would hide the function of the same name."""
+    """The import of a submodule would hide a function of the same name."""
     assert not {room(name) for name in MODULES} & set(lw.__all__)
 
 

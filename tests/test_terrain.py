@@ -174,7 +174,7 @@ def test_ball_rests_on_every_kind_of_patch_at_the_height_in_the_table(shared_env
     obs = env.obs.cpu().numpy().astype(float)
     away = (lw.scan_grid(0.1, 0.1, spacing=0.005) ** 2).sum(axis=1)
     nearest = np.sqrt(away + obs[:, 4:] ** 2).min(axis=1)
-    # the expected distance is the ball's radius; MuJoCo Warp drops a contact of a ball between two walls
+    # the tolerance is larger on MuJoCo Warp, which drops a contact of a ball between two walls
     np.testing.assert_allclose(nearest, 0.05, atol=2e-3 if engine == "mujoco" else 5e-3)
     assert np.median(abs(nearest - 0.05)) < 5e-4
     assert np.ptp(obs[:, 2]) > 0.4

@@ -20,7 +20,7 @@ class ToyEngine(Engine):
     """An engine that steps one world at a time, with states in float64 rows.
 
     Each world has its own MjModel. ``apply_model`` writes the world's fields into this model. ``reset``, ``commit``,
-    ``find_faults`` and ``get_state`` only launch Warp kernels, because their launches become graphs.
+    ``find_faults`` and ``get_state`` only launch Warp kernels, because the launches become graphs.
     """
 
     name = "toy"

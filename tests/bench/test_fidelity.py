@@ -35,7 +35,7 @@ def test_trajectories_with_different_dynamics_diverge(monkeypatch: pytest.Monkey
     make = fidelity.lw.make
 
     def replaced(task: str, **words: Any) -> lw.Env:
-        """Replace the Warp engine by the C engine with longer steps."""
+        """Replace the Warp engine by a C engine that takes longer steps."""
         return make(task, **(words | ({"engine": "mujoco", "frame_skip": 60} if words["engine"] == "warp" else {})))
 
     monkeypatch.setattr(fidelity.lw, "make", replaced)

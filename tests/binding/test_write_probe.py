@@ -20,10 +20,6 @@ ROWS = {
     "randomize": (11, 6, "qpos", "the model has 6"),
     "randomize of a stream": (12, 1, "rng", "a stream has 1"),
 }
-"""The functions that write out of range.
-
-Each has a parameter value, the size and name of its array, and words of the error.
-"""
 
 
 @pytest.mark.parametrize("name", ROWS)

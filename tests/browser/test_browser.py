@@ -35,7 +35,7 @@ pytestmark = pytest.mark.browser
 SECONDS = 120.0
 """Time limit for a page, in seconds. Without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
-"""Seconds before a test repeats a key or a click, because a busy browser may lose it."""
+"""Seconds before a test repeats an input that a busy browser may have lost."""
 VIEW = {"width": 1000, "height": 640}
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
@@ -73,7 +73,7 @@ class BlockWorld:
 
 @wp.struct
 class BlockParams:
-    dt: float  # a further parameter would add a line to the panel, and move what the tests click
+    dt: float  # a further parameter would move the buttons that the tests click
 
 
 @wp.func
@@ -191,7 +191,7 @@ class Tab:
             self.frames(1)
 
     def click_near(self, x: float, y: float, until: Callable[[], Any]) -> None:
-        """Click at a point of the panel, or slightly above or below it."""
+        """Click near a point of the panel."""
         self.repeat(lambda attempt: self.click(x, y + (0, 0, 20, -20, 0, 40, -40)[attempt % 7]), until)
 
     def release(self) -> None:
@@ -220,7 +220,7 @@ def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def launch() -> Iterator[Callable[[], Browser]]:
-    """Start the headless browser of LYCEUM_WARP_BROWSER, of playwright or of the system."""
+    """Start a headless browser."""
     with sync_playwright() as playwright:  # playwright runs an event loop in this thread until it is closed
         candidates = [os.environ.get("LYCEUM_WARP_BROWSER"), playwright.chromium.executable_path]
         candidates += map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))

@@ -14,7 +14,7 @@ from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing import episode_rules as episodes
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "mujoco": {  # all checks except a slow one that does not depend on the model
+    "mujoco": {
         "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},

@@ -17,12 +17,12 @@ EVERY_RULE = {
 }
 """The tasks that pass every check on an engine. Together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""The checks of other tasks on the C engine. Two slow checks are missing, which hardly depend on the task."""
+"""The checks of other tasks on the C engine, without two slow checks that hardly depend on the task."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""The checks of other tasks on the Warp engine. They are few, because this engine is slow on a CPU."""
+"""The few checks of other tasks on the Warp engine, which is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 
@@ -33,11 +33,7 @@ def settled_again() -> None:
 
 
 def options(task: str, engine: str) -> dict[str, int]:
-    """Return the options of ``check_task``.
-
-    On hopper, the steps suffice to find a leak of one number per step. The Warp engine takes fewer steps, because each
-    step takes milliseconds on a CPU.
-    """
+    """Return the options of ``check_task``. They include fewer steps for the Warp engine, which is slow on a CPU."""
     every = task in EVERY_RULE[engine]
     if engine == "mujoco":
         return {"steps": 1000 if task == "hopper" else 300 if every else 100}

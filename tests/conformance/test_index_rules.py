@@ -106,7 +106,7 @@ class Right(lw.Task):
     observe, advance = right, count
 
 
-# functions with wrong indices; their conditions keep results finite
+# functions with wrong indices
 
 
 @wp.func

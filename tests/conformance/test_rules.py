@@ -72,7 +72,7 @@ def spoil_rewards(env: lw.Env) -> None:
 
 
 def count_steps_as_none(method: Function) -> Function:
-    """Set the step counters to 0 during an observation, so that its noise repeats the noise of the reset."""
+    """Set the step counters to 0 during an observation."""
 
     def judge(self: Worlds, *args: Any, **kwargs: Any) -> None:
         kept = self.counters.step.numpy().copy()
@@ -159,7 +159,7 @@ BREAKS: list[Break] = [
     ("bad_warmstart", MujocoEngine, "__init__", then(keep_warm_start)),
     ("not_finite", lw.Env, "step", then(spoil_rewards)),
 ]
-"""Patches of the package, each of which violates a rule on hopper."""
+"""Each patch makes hopper violate one rule."""
 
 FULL_BREAKS: list[Break] = [
     ("bad_state", lw.Env, "step", then(another_critic)),

@@ -26,8 +26,8 @@ def test_actions_are_one_step_old_if_plans_take_less_than_a_period(env: lw.Env) 
     assert episode.times.tolist() == pytest.approx([0, 1, 2, 3, 4, 5])
     assert episode.age_steps.tolist() == [0, 1, 1, 1, 1, 1]
     assert episode.ages.tolist() == pytest.approx([0, 1, 1, 1, 1, 1])
-    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]  # step at which the plan started
-    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]  # index of the applied action in its plan
+    assert hundredths(episode.actions[:, 0]) == [0, 0, 1, 2, 3, 4]
+    assert hundredths(episode.actions[:, 1]) == [0, 1, 1, 1, 1, 1]
     assert episode.wall_seconds == pytest.approx(6)
     report = control_report(episode)
     assert (report.misses, report.late_ticks, report.age_steps_max, report.deadline_ms) == (0, 0, 1, 1000)
@@ -62,7 +62,7 @@ def test_slow_step_does_not_delay_later_steps(env: lw.Env) -> None:
 
 
 def predicted_and_measured(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
-    """Run a controller that gets predicted states. Return the predicted and the measured states, with observations."""
+    """Run a controller that gets predicted states. Return the predicted states and the measured states."""
     planned = []
 
     def controller(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 class Machine:
-    """A simulated machine. Its planning time grows linearly with samples times horizon."""
+    """A simulated machine. The planning time is proportional to samples times horizon."""
 
     def __init__(self, microseconds: float, constant: float = 1e-3, **faster: float) -> None:
         self.cost, self.constant, self.faster = 1e-6 * microseconds, constant, faster

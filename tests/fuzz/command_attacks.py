@@ -166,7 +166,7 @@ def warm_up() -> None:
         assert cli.main(_line("train", "point_mass", SMALL["train"])) == 0
         (HERE / "out").rename(RUN)
     for command in SMALL:
-        if command != "bench":  # bench starts another process
+        if command != "bench":
             run(_line(command, FIRST.get(command, "point_mass"), SMALL[command]))
 
 

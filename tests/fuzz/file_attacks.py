@@ -1,4 +1,4 @@
-"""Read randomly damaged files of runs, saved episodes, models and tables.
+"""Damage the files of runs, saved episodes, models and tables at random, and read them.
 
 A case is "KIND SEED" or the name of a case in ``minimal_cases.py``.
 """

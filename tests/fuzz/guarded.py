@@ -22,7 +22,7 @@ from typing import Any
 MEMORY = 512 * 2**20
 """Bytes of address space that a case may add."""
 PATIENCE = 3.0
-"""Seconds until the first SIGINT, and between later SIGINTs. A command must end when it receives one."""
+"""Seconds after which a running case receives a SIGINT."""
 LIMIT = 60.0
 """Seconds after which a case that ignores SIGINT is killed."""
 ROOT = Path(__file__).parents[2]

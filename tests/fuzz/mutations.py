@@ -133,7 +133,7 @@ def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> 
     ))  # fmt: skip
     file = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(file, "w") as archive:
-        warnings.simplefilter("ignore")  # an archive may have the same name twice
+        warnings.simplefilter("ignore")  # an archive may contain two files of the same name
         for entry in (*entries[:place], *new, *entries[place + 1 :]):
             archive.writestr(*entry)
     return file.getvalue()

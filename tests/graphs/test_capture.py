@@ -46,7 +46,7 @@ def test_consecutive_phases_become_one_graph_in_the_second_call() -> None:
     calls = graphs().sequence([digits.phase(1), digits.phase(2, engine=True), digits.phase(3)])
     assert len(calls) == 1
     assert [digits.after(calls) for _ in range(4)] == [123] * 4
-    assert digits.calls == 6  # the first call launches, and the second call captures
+    assert digits.calls == 6  # the first call launches kernels, and the second call captures graphs
 
 
 def test_engine_calls_without_launches_run_between_graphs() -> None:

@@ -27,7 +27,7 @@ def test_calls_run_in_parallel_threads() -> None:
 
 
 def test_threads_start_on_demand_and_end_with_the_last_reference_to_their_pool() -> None:
-    before = own_threads()  # threads of other tests' engines may end in the meantime
+    before = own_threads()
     workers = Workers(3)
     assert not own_threads() - before
     for calls in (1, 2, 3, 2):

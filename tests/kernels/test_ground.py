@@ -95,7 +95,7 @@ def test_heights_on_edges_and_diagonals_equal_those_of_mujoco_rays(model: mujoco
     heights, _ = ray_heights(model, points[inside])
     assert len(heights) > 200 and np.isfinite(heights).all()
     np.testing.assert_allclose(looked_up(ground, points[inside])[:, 0], heights, atol=1e-6)
-    # the heights at the outer edge are the numbers in the model
+    # at the outer edge, the expected heights come from the model
     numbers = OFFSET[2] + SIZE[2] * model.hfield_data.reshape(NROW, NCOL)
     x = OFFSET[0] + np.linspace(-SIZE[0], SIZE[0], NCOL)
     top = np.stack([x, np.full(NCOL, OFFSET[1] + SIZE[1])], axis=1)

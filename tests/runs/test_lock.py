@@ -28,7 +28,7 @@ with run_lock(Path(sys.argv[1])):
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[str]:
-    """Lock a folder in another process. Yield the name of that process in errors."""
+    """Lock a folder in another process. Yield the words that describe that process in error messages."""
     command = [sys.executable, "-c", OTHER, str(folder)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "locked\n"

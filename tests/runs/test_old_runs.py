@@ -38,7 +38,7 @@ def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: flo
 
 @pytest.fixture(params=["old_run", "runs_0_1/command", "runs_0_1/python", "runs_0_1/task_file"])
 def run(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A run of two iterations, made before release 0.1 or by release 0.1."""
+    """A run of two iterations, made by release 0.1 or an earlier version."""
     return Path(shutil.copytree(DATA / request.param, tmp_path / "run"))
 
 

@@ -80,7 +80,6 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
 def test_save_writes_only_files_of_the_buffer_that_have_grown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The buffer of 200 steps has files of 4 steps. Each iteration fills three files."""
     written: list[str] = []
     write: Callable[..., None] = replay_files.write_content
 

@@ -5,7 +5,6 @@ DT, SUBSTEP, SKIP = 0.02, 0.005, 4
 
 
 def test_contact_sequences_determine_foot_timers_and_swings() -> None:
-    """Each world has its own contact sequence. The expected timers are counts of substeps."""
     rng = np.random.default_rng(1)
     touching = rng.random((N, 200)) < 0.5
     touching = np.repeat(touching, rng.integers(1, 5), axis=1)[:, :200]

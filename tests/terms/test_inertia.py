@@ -33,7 +33,7 @@ def tensor(moments: np.ndarray, quat: np.ndarray) -> np.ndarray:
 
 
 def bodies(thickness: float) -> tuple[list[tuple[np.ndarray, np.ndarray]], dict[str, np.ndarray]]:
-    """Draw a flat cloud of six point masses per world. The second of two bodies consists of these masses."""
+    """Draw a flat cloud of six point masses per world."""
     clouds = [
         (RNG.uniform(0.1, 2.0, 6), RNG.standard_normal((6, 3)) * [1.0, 0.3, thickness] + RNG.standard_normal(3))
         for _ in range(N)
