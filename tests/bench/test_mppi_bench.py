@@ -14,7 +14,7 @@ def main(out: Path, *words: str) -> int:
 
 
 @pytest.mark.parametrize("task", ["reach", "half_cheetah", "adroit_pen"])
-def test_plain_python_environments_return_the_same_rewards(task: str) -> None:
+def test_plain_python_environments_return_the_rewards_of_the_package(task: str) -> None:
     if task == "adroit_pen":
         pytest.importorskip("gymnasium_robotics")
     env = lw.make(task, autoreset=False, nthread=1, seed=3)

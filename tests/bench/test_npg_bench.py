@@ -24,7 +24,7 @@ def row(contestant: str, seed: int, curve: list[Any], **result: Any) -> Any:
     return npg.Row(dataclasses.asdict(made), found | result, {}, 1.0)
 
 
-def test_gymnasium_fills_the_rollout_buffer_with_the_same_values() -> None:
+def test_rollouts_through_gymnasium_equal_rollouts_of_the_package() -> None:
     nworld, steps = 4, 60
     env = lw.make("hopper", nworld=nworld, seed=0, nthread=1)
     ours = Rollout(env, steps)

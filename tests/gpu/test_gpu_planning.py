@@ -172,7 +172,7 @@ def test_a_value_function_moves_to_the_device_of_the_plans(samples: int) -> None
         assert torch.isfinite(plan(plan.state_of())).all()
 
 
-def test_small_numbers_of_samples_are_rolled_out_on_the_cpu() -> None:
+def test_rollouts_of_few_samples_run_on_the_cpu() -> None:
     assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
     assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
     assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

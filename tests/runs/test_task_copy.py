@@ -140,7 +140,7 @@ def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: py
 
 
 @pytest.mark.parametrize("moved", [False, True])
-def test_run_started_from_another_run_uses_its_copy_of_the_model(
+def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, robot, warm = trained(folder), folder / "mine" / "robot", folder / "warm"

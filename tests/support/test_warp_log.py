@@ -14,7 +14,7 @@ def printed(program: str) -> tuple[str, str]:
 
 @pytest.mark.long
 @WITHOUT_GPU
-def test_missing_driver_prints_one_line_only_for_a_gpu() -> None:
+def test_missing_driver_is_reported_only_if_a_gpu_is_requested() -> None:
     program = """
 from lyceum_warp import Row
 import lyceum_warp as lw
