@@ -1,4 +1,4 @@
-"""Run the command line: import a command's module by name, parse its options, print errors."""
+"""Run the commands of lyceum-warp, and print their errors."""
 
 import importlib
 import importlib.metadata
@@ -27,7 +27,7 @@ _COMMANDS = {
     "view": ("view", "Show a task, a policy, a planner or saved episodes in a browser."),
     "bench": ("bench", "Run an experiment or another program of bench/."),
 }
-"""The module and the help line of each command. The class has the name of the command, capitalised.
+"""The module and the help line of each command. Each module has a class with the command's capitalised name.
 
 Only the module of the given command is imported, because most modules import torch, Warp and MuJoCo.
 """
@@ -60,8 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the program ``lyceum-warp``.
 
     Returns:
-        0 on success; 1 if --require-return was not met or check found a broken rule; 2 for bad input; 130 or 143 after
-        Ctrl-C or SIGTERM.
+        The exit code: 0 on success, 2 for bad input, 130 after Ctrl-C, and 143 after SIGTERM. The code 1 means that
+        ``check`` found a broken rule, or that the return did not exceed --require-return.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(argv)
     except Interrupted as signalled:
         return 128 + signalled.number
-    except BrokenPipeError:  # the reader of a pipe may end early, as in lyceum-warp tasks | head
+    except BrokenPipeError:  # a pipe may be closed early, as in lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (ValueError, OSError, FloatingPointError, ImportError, NoVideoError) as error:

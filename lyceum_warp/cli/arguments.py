@@ -1,4 +1,4 @@
-"""Define the arguments that commands share: flags generated from options, and NAME=VALUE arguments."""
+"""Define the flags that several commands share, and parse NAME=VALUE arguments."""
 
 import contextlib
 import dataclasses
@@ -55,16 +55,16 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
-    """Base class of groups of flags. Each field of the dataclasses becomes a flag.
+    """Base class for groups of flags. Each field of the ``options`` dataclasses becomes a flag.
 
-    The field's docstring becomes the flag's help text. A subclass declares a field again if its type is a union, or if
-    it differs on the command line. Values are validated later, because the parser would print errors in a multi-line
-    box.
+    The field's docstring becomes the flag's help text. A subclass redeclares a field whose type is a union, or whose
+    flag differs from the field. Values are validated later, because the parser would print errors in a multi-line box.
 
     Args:
-        options: The dataclasses. If several have the same field, the first one counts.
+        options: The dataclasses. If several have the same field, the first one is used.
         omit: Names of fields without a flag.
-        default: The default in the help, for all flags or by field name. Flags with such a text default to None.
+        default: The default value that the help shows, for all flags or by field name. The flags themselves default to
+            None.
     """
 
     def __init_subclass__(
@@ -103,9 +103,10 @@ def given(flags: Any) -> dict[str, Any]:
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
-"""Options of an environment without a generated flag.
+"""Options of an environment for which no flag is generated.
 
-Commands declare flags for nworld, seed and the model, and ``Physics`` for the physics. The others exist only in Python.
+Commands declare the flags for nworld, seed and the model themselves. ``Physics`` declares the physics options. The
+others can be set only in Python.
 """
 
 
@@ -124,8 +125,8 @@ class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. By default, the policy is evaluated on the CPU if the run's
-    engine is auto, because a CPU is faster than a GPU for a few worlds."""
+    """cpu (the default), or a CUDA device such as cuda:0. If the run's engine is auto, the policy is evaluated on the
+    CPU, which is faster than a GPU for a few worlds."""
 
 
 class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
@@ -143,8 +144,7 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Parse a task's parameters from the values of a repeated flag, each NAME=VALUE.
 
-    If NAME is an option instead, the error names the command's flag. ``instead`` lists flags with another name than the
-    option.
+    If NAME is an option, the error names its flag. ``instead`` maps options to flags with different names.
     """
     found: dict[str, Any] = {}
     for text in texts:

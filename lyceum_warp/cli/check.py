@@ -15,8 +15,8 @@ from lyceum_warp.testing import CHECKS, check_task
 class Check:
     """Check that a task follows every rule of an environment, and print the rules and the time of each check.
 
-    The rules hold for all tasks of the package: stepping from a saved state gives the same numbers, functions write
-    only their outputs and read within bounds, a fault does not affect other worlds, and more. Check a new task on both
+    All tasks of the package follow the rules. For example, steps from a saved state give the same numbers, and a fault
+    does not affect other worlds. Functions write only their outputs, and read within bounds. Check a new task on both
     engines. The exit code is 1 if a rule is broken. In Python, use lyceum_warp.testing.check_task.
 
     $ lyceum-warp check path/to/my_task.py

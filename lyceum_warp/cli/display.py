@@ -26,7 +26,7 @@ _TABLE_ROWS = 15
 
 
 console = Console(highlight=False, width=None if sys.stdout.isatty() else 120)
-"""In a file or a pipe, it has 120 columns, so that tables are not wrapped."""
+"""Output to a file or a pipe has 120 columns, so that tables are not wrapped."""
 
 
 def say(text: str) -> None:
@@ -104,10 +104,11 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns of metrics.csv that count problems, with their labels in messages. Algorithms may lack some of them."""
+"""Columns of metrics.csv that count problems, with their labels in messages. Some algorithms do not write all of
+them."""
 
 _BAR_WIDTH = 36
-"""Characters of the progress bar, the iteration number and the times."""
+"""Width of the progress bar, the iteration number and the times, in characters."""
 
 
 def counted(number: int, what: str) -> str:
@@ -121,11 +122,11 @@ _COLUMNS = [
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
-"""Heading, column in metrics.csv, format."""
+"""Columns of the table: heading, name in metrics.csv, and format."""
 
 
 def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
-    """Make a table of columns by heading that fits the console's width.
+    """Make a table that fits the console's width, from a mapping of headings to columns.
 
     The first column's text wraps; all others contain numbers. If necessary, columns in ``omit`` are left out, in this
     order.
@@ -147,9 +148,10 @@ def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omi
 
 
 def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
-    """Make a table of at most 15 iterations of a run, without empty columns and columns that do not fit the console.
+    """Make a table of at most 15 iterations of a run, without empty columns.
 
-    Iterations that did not evaluate the mean policy are omitted if at least 4 others remain between the first and last.
+    Columns that do not fit the console are omitted. Iterations that did not evaluate the mean policy are omitted if
+    enough others remain.
     """
     known = [_known(row) for row in rows]
     between = [row for row in known[1:-1] if "mean_return" in row]
@@ -163,7 +165,7 @@ def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
             value = row.get(name, 0.0)
             cells.append(format(int(value) if form.endswith("d") else value, form) if name in row else "")
         if name == "reward_mean" and all("return_mean" in row for row in known):
-            continue  # this column is for iterations without a return
+            continue  # show rewards only if an iteration has no return
         if any(cells):
             columns[heading] = cells
     table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))

@@ -64,7 +64,7 @@ class Eval:
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states. Training with the same seed draws different ones."""
+    """Seed of the initial states. Training with the same seed draws different initial states."""
     nworld: int = 32
     """Maximum number of worlds."""
     video: bool = False
@@ -165,7 +165,7 @@ def run_worlds(
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
-    With another task, the defaults are the task's. With the engine auto and no device, the worlds run on the CPU. For
+    A different task brings its own defaults. With the engine auto and no device, the worlds run on the CPU. For
     ``trust``, see ``run_env``.
     """
     saved = Configuration.of(run)
@@ -201,7 +201,7 @@ def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: di
 
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
-    """Return the ``source`` of saved episodes. If the run's copy of the model was used, add the path of the copy."""
+    """Return the ``Trajectory.source`` of saved episodes, with the path of the model's copy if it was used."""
     made, copy = source(env), run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in made["options"]:
         made["options"]["model"] = str((run.task_folder / copy).resolve())

@@ -38,7 +38,7 @@ _WIDTH = 100
 class Tasks:
     """List the tasks of the package, their sizes and the sources of their models.
 
-    The list includes tasks whose models need an extra or MuJoCo Menagerie, and names the missing package.
+    If a task's model needs a package that is missing, the list names the package.
 
     $ lyceum-warp tasks
     $ lyceum-warp tasks gymnasium
@@ -119,7 +119,7 @@ def _cells(entry: _Entry) -> tuple[str, ...]:
 
 
 def _controls(spec: mujoco.MjSpec) -> int:
-    """Return the number of a model's controls. Compiling a model can take a second, so avoid it if possible."""
+    """Return the number of a model's controls. Compile the model only if necessary, because this can take a second."""
     if all(actuator.gaintype in _ONE_CONTROL for actuator in spec.actuators):
         return len(spec.actuators)
     return compile_model(spec, (), PhysicsOptions()).nu

@@ -32,7 +32,7 @@ _TAKEN = ("World", "Params", "Row")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class New:
-    """Write a task file for a model. It can be checked, stepped and trained immediately, but its reward is zero.
+    """Write a task file for a model. The task can be checked, stepped and trained immediately, but its reward is zero.
 
     The policy observes positions, velocities, activations and sensors, and acts through the model's actuators. A step
     lasts about 20 ms. Comments in the file explain the next steps.
@@ -44,7 +44,8 @@ class New:
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """The task's name in snake_case, for TASK.py in the working directory, or a path, path/to/task.py."""
+    """The task's name in snake_case, or a path such as path/to/task.py. A name creates TASK.py in the working
+    directory."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
     """An MJCF or URDF file, or a model in a package: gymnasium:FILE.xml, gymnasium_robotics:PATH or
     menagerie:ROBOT/FILE.xml. MuJoCo Menagerie comes from the extra "menagerie", from the package mujoco-menagerie, or
@@ -56,10 +57,10 @@ class New:
     legs made of hinges with one actuator each. The file is short, because it inherits most of its functions.
     """
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """The names of the feet, for --template velocity: sites, geoms or bodies. By default, the lowest end of each
+    """The names of the feet, for --template velocity: sites, geoms or bodies. The default is the lowest end of each
     leg."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Names of the joints to control, for --template velocity. By default, all leg joints with an actuator. Other
+    """Names of the joints to control, for --template velocity. The default is all leg joints with an actuator. Other
     joints keep their pose.
     """
 

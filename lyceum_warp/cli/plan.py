@@ -52,7 +52,7 @@ class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
-    Python also accepts a covariance."""
+    In Python, a covariance matrix is possible, too."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
@@ -108,7 +108,7 @@ class Plan:
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
-    """The number of steps from one plan to the next. Steps in between apply the next actions of the last plan."""
+    """The number of steps from one plan to the next. Steps between two plans apply further actions of the last plan."""
     seed: int = 0
     """Seed of the first episode's initial state and noise. It increases by one for each further episode."""
     real_time: bool = False
@@ -118,8 +118,8 @@ class Plan:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The folder of an NPG or PPO run of the same task. Its value of a sample's final state is added to the sample's
-    return.
+    """The folder of an NPG or PPO run of the same task. The run's value function estimates the value of each sample's
+    final state, which is added to the sample's return.
     """
     param: ParamWords = ()
     planner_param: Repeated = ()
@@ -218,10 +218,10 @@ _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
 def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
-    """Measure planning times to choose the settings that no flag gives.
+    """Choose the settings for which no flag was given, by measuring planning times.
 
-    A plan must be ready within one step of the controlled world. If no setting is fast enough, it may take as long as
-    one step of the planner's worlds.
+    A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
+    as one step of the planner's worlds.
     """
     task, flags = plant.task.task, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))

@@ -13,7 +13,7 @@ _EPISODE = 10.0
 """Duration of an episode, in seconds."""
 
 _NAMES = 8
-"""Maximum number of names of each kind of element in a comment."""
+"""Maximum number of names that a comment lists for each kind of element."""
 
 _WIDTH = 118
 """Width of a comment in characters, without the #."""

@@ -99,8 +99,8 @@ class Train:
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
-    its local rank. The number of processes changes the results only by rounding, and may differ when a run is resumed.
-    After Ctrl-C or SIGTERM, all processes finish the iteration. torchrun waits for them for 30 s, or for its
+    its local rank. A run can be resumed with a different number of processes. This number changes the results only by
+    rounding. After Ctrl-C or SIGTERM, all processes finish the iteration. torchrun waits for them for 30 s, or for its
     --shutdown-timeout.
     """
 
@@ -109,42 +109,44 @@ class Train:
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). By default, the
+    """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). The default is the
     algorithm that the task suggests: ppo for walking robots, npg for others.
     """
     iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of iterations, including those before the run was resumed. By default, as many as the task suggests,
-    or 100.
+    """Total number of iterations, including those before the run was resumed. The default is the number that the task
+    suggests, or 100.
     """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, which must be new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """Continue the run in the given folder exactly, with its settings, up to --iterations."""
+    """Resume the run in the given folder from its exact state and with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Start a new run from the policy, the value function and the normaliser of another run. The run's settings are the
-    defaults, but a different TASK has its own parameters, and a different --algorithm has its own hyperparameters.
+    """Start a new run from the policy, the value function and the normaliser of another run. That run's settings are
+    the defaults. However, a different TASK has its own parameters, and a different --algorithm has its own
+    hyperparameters.
     """
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
     target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
     """End the run once the return of the mean policy reaches this number. With --mean-every 0, the return of the
-    sampled episodes counts instead.
+    sampled episodes is used instead.
     """
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Time limit in minutes. Training ends after the iteration that exceeds it. --resume continues the run."""
+    """Time limit in minutes. Training ends after the iteration that exceeds the limit. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s, or more
-    often if that takes at most 1 % of the time.
+    """Save the policy and the complete state every INT iterations, to resume after a crash. With 0, saving takes about
+    1 % of the time, and happens at least every 30 s.
     """
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Total number of worlds of all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
-    samples / nworld steps per iteration. These are whole episodes if they fit, and otherwise segments of episodes.
+    samples / nworld steps per iteration. These steps are whole episodes if they fit, and otherwise segments of
+    episodes.
     """
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
@@ -159,9 +161,9 @@ class Train:
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
-    cheap comparisons are made: with the C engine, after training on a GPU, and with the task's default physics, after
-    training with other physics. --transfer adds each set of physics options that the task defines and, after training
-    on CPU cores, the Warp engine, whose kernels may take minutes to compile.
+    cheap comparisons are made. After training on a GPU, these include the C engine. After training with other physics,
+    they include the task's default physics. --transfer adds each set of physics options that the task defines. After
+    training on CPU cores, it also adds the Warp engine, whose kernels may take minutes to compile.
     """
     trust: Trust = False
     take_over: bool = False
@@ -200,7 +202,7 @@ class Train:
         if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         with join(self.env.device or saved.get("device", "cpu")) as team:
-            if not team.leads:  # one process prints the messages of all
+            if not team.leads:  # only one process prints messages
                 logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
             with team.together():  # check all options before the folder is created
                 configuration = self.configuration(source, team)
@@ -282,7 +284,7 @@ class Train:
     def _learner(
         self, configuration: Configuration, source: Run | None, team: Team
     ) -> tuple[Learner, Path, dict[str, Any]]:
-        """Make the learner. Return it with the run's folder and additional entries for config.json."""
+        """Make the learner, the run's folder, and additional entries for config.json."""
         if self.out is not None and team.leads:
             Run.check_free(self.out)
         policy = value = None

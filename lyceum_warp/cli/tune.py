@@ -21,9 +21,10 @@ Cell: TypeAlias = Callable[[dict[str, Any]], str]
 class Tune:
     """Measure the gains and side effects of physics options, and find the fastest that do not change a task's returns.
 
-    Each setting is compared with the unchanged task: steps per second, memory, faults, the divergence of trajectories,
-    and the returns of the same episodes under random actions and, with --run, under a policy. Every result is appended
-    to a JSON Lines file, so the same command continues a stopped search. docs/physics.md explains the table.
+    Each setting is compared with the unchanged task by steps per second, memory, faults, the divergence of
+    trajectories, and returns. The returns come from the same episodes under random actions and, with --run, under a
+    policy. Every result is appended to a JSON Lines file, so the same command continues a stopped search.
+    docs/physics.md explains the table.
 
     $ lyceum-warp tune hopper --short
     $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
@@ -38,18 +39,18 @@ class Tune:
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
     """How much the mean return may change. The 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
-    of the mean absolute return. The value any accepts every setting that causes no additional faults.
+    of the mean absolute return. "any" accepts every setting that causes no additional faults.
     """
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes for each setting. By default, as many as the confidence interval needs, for at most a
+    """Number of episodes for each setting. The default is as many as the confidence interval needs, for at most a
     minute (5 s with --short).
     """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
-    samples in the same order. --nworld is then the number of samples. --episodes is the number of standing, of moving
-    and of fallen states from which the planner plans.
+    samples in the same order. --nworld is then the number of samples. The planner plans from --episodes states of each
+    kind: standing, moving and fallen.
     """
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds. By default 256, or 4096 on a GPU. With --planning, the number of samples, by default 64."""

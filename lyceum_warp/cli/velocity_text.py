@@ -18,10 +18,10 @@ _STEP = 0.02
 """Seconds in a step."""
 
 _NEAR = 0.1
-"""A leg's end is a foot up to this height above the lowest end, as a fraction of the base's height."""
+"""Maximum height of a foot above the lowest foot, as a fraction of the base's height."""
 
 _FLAT = 0.01
-"""A sphere of a foot is part of the sole up to this height above the foot's lowest point, in metres."""
+"""Maximum height of the sole's spheres above the foot's lowest point, in metres."""
 
 _AT = 0.06
 """Maximum distance between the centre of a sole and a site that marks the foot, in metres."""
@@ -179,7 +179,7 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
     if walker.has_home != biped:
         settings.append(f"keyframe = {literal('home') if walker.has_home else None}")
     edits = ["walkers.add_feet(spec, NEW_SITES)"] if new else []
-    if (model.actuator_biastype[walker.servos] == mujoco.mjtBias.mjBIAS_NONE).any():  # a motor instead of a servo
+    if (model.actuator_biastype[walker.servos] == mujoco.mjtBias.mjBIAS_NONE).any():  # a motor, not a position servo
         edits.append("walkers.use_servos(spec, JOINTS)")
     edits.append("walkers.prepare_walker(spec, FEET)")
     head = _wrapped("FEET = [", [literal(foot.name) for foot in walker.feet], "]", 0)

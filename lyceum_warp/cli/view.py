@@ -30,21 +30,21 @@ _RUN_WORLDS = 16
 class Place(
     OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
 ):
-    """Engine and device of the displayed worlds or, if --mppi is given, of the planner's worlds."""
+    """Engine and device of the displayed worlds. With --mppi, they apply to the planner's worlds instead."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. By default, the worlds of a run with engine auto are on the CPU."""
+    """cpu, or a CUDA device such as cuda:0. If a run's engine is auto, the default is the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
-    For a task, the viewer shows its worlds, lets you push bodies with the mouse and, with --mppi, runs a planner in
-    real time. For a run, it shows the run's policy. With --follow, it shows the newest policy while the run trains.
-    Episode files, or a folder that lyceum-warp plan has written, are played back.
+    For a task, the viewer shows its worlds, and you can push bodies with the mouse. With --mppi, a planner controls the
+    task in real time. For a run, it shows the run's policy. With --follow, it shows the newest policy while the run
+    trains. Episode files, or a folder that lyceum-warp plan has written, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret. Over ssh, it also prints the
     command that forwards the port.
