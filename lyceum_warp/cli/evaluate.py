@@ -165,8 +165,8 @@ def run_worlds(
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
-    A different task brings its own defaults. With the engine auto and no device, the worlds run on the CPU. For
-    ``trust``, see ``run_env``.
+    A different task has its own defaults. With the engine auto and no device, the worlds run on the CPU. For ``trust``,
+    see ``run_env``.
     """
     saved = Configuration.of(run)
     known, own = saved.options.changed({"seed": 0}), dict(saved.params)

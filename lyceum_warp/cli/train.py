@@ -138,8 +138,8 @@ class Train:
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy and the complete state every INT iterations, to resume after a crash. With 0, saving takes about
-    1 % of the time, and happens at least every 30 s.
+    """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s. Fast
+    saves are made more often, for at most 1 % of the time.
     """
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""

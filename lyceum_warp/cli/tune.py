@@ -44,8 +44,8 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes for each setting. The default is as many as the confidence interval needs, for at most a
-    minute (5 s with --short).
+    """Number of episodes for each setting. By default, the number depends on the confidence interval, and the episodes
+    take at most a minute (5 s with --short).
     """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the

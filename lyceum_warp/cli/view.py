@@ -43,8 +43,8 @@ class View:
     """Show a task, a policy, a planner or episodes in a browser.
 
     For a task, the viewer shows its worlds, and you can push bodies with the mouse. With --mppi, a planner controls the
-    task in real time. For a run, it shows the run's policy. With --follow, it shows the newest policy while the run
-    trains. Episode files, or a folder that lyceum-warp plan has written, are played back.
+    task in real time. For a run, the viewer shows the run's policy. With --follow, it shows the newest policy while the
+    run trains. Episode files, or a folder that lyceum-warp plan has written, are played back.
 
     The viewer is a web page. The command prints its address, which contains a secret. Over ssh, it also prints the
     command that forwards the port.

@@ -59,7 +59,7 @@ class CheckedController:
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
     def steps(self, plant_steps: int) -> int:
-        """Convert plant steps to complete controller steps."""
+        """Return how many controller steps are complete after a number of plant steps."""
         return plant_steps * self._plan_steps // self._plant_steps
 
     def passed(self, before: int, now: int) -> int:
@@ -98,7 +98,7 @@ class CheckedController:
             found |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
             found |= {"engine": env.engine.name, "device": env.device.alias}
-        # give the same result as a loaded file
+        # make the types equal to those in a loaded file
         return dict(json.loads(json.dumps(found, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
@@ -115,7 +115,7 @@ class CheckedController:
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:
-    """Return how many plan steps and how many plant steps the longer time step lasts."""
+    """Return the smallest numbers of plan steps and plant steps that last equally long."""
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
         raise ValueError(
@@ -143,7 +143,7 @@ def _check_call(controller: Any) -> None:
 def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
     try:
         return inspect.signature(function)
-    except (TypeError, ValueError):  # some C functions have none
+    except (TypeError, ValueError):  # some C functions have no signature
         return None
 
 

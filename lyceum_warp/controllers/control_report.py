@@ -21,9 +21,9 @@ from lyceum_warp.support.validate import positive_number
 class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
 
-    A value is None if it does not apply, is not reported by the controller, or needs more plans. The first plan of each
-    trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times therefore exclude it;
-    see ``first_plan_ms``.
+    A value is None if it does not apply, if the controller does not report it, or if there are too few plans. The first
+    plan of each trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times
+    therefore exclude it; see ``first_plan_ms``.
     """
 
     task: str
@@ -67,7 +67,7 @@ class ControlReport:
     known_plans: int
     """Number of plans, including first plans, for which the controller reports failed samples."""
     failed_share: float | None
-    """Fraction of failed samples in these plans."""
+    """Fraction of failed samples in the plans that ``known_plans`` counts."""
     effective_samples_mean: float | None
     """Mean effective sample size of a plan: 1 if one sample has all the weight, 0 if all samples failed."""
     tick_jitter_ms: float | None

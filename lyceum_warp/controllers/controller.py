@@ -9,10 +9,10 @@ from lyceum_warp.env import Env
 
 
 class Controller(Protocol):
-    """A function that computes an action from the state and the observation of the plant, an environment of one world.
+    """A function that computes an action from the plant's state and observation.
 
-    Plain functions and ``lw.MPPI`` are controllers. To control with a policy, pass ``lambda state, obs: policy(obs)``.
-    ``PlanningController`` lists optional attributes and methods.
+    The plant is an environment of one world. Plain functions and ``lw.MPPI`` are controllers. To control with a policy,
+    pass ``lambda state, obs: policy(obs)``. ``PlanningController`` lists optional attributes and methods.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:
@@ -57,20 +57,20 @@ class PlanningController(Controller, Protocol):
 
     @property
     def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact), all finite. The first action is for the given state."""
+        """The last plan, (horizon, nact), all finite. The first action belongs to the given state."""
         ...
 
     @property
     def timestep(self) -> float:
         """Simulated seconds between two actions of the plan. By default this is the plant's time step.
 
-        It must be a whole multiple or a whole fraction of the plant's time step.
+        One of the two time steps must be an integer multiple of the other.
         """
         ...
 
     @property
     def between(self) -> Literal["hold", "linear"]:
-        """How the plant moves from one action of the plan to the next; see ``MPPIConfig.between``."""
+        """How actions are interpolated between two steps of the plan; see ``MPPIConfig.between``."""
         ...
 
     @property

@@ -62,7 +62,7 @@ def begin_episode(
     env: Env, controller: Controller, steps: int | None, seed: int | None, *, reset: bool, on_step: OnStep | None,
     on_abort: OnAbort | None,
 ) -> tuple[CheckedController, int, int]:  # fmt: skip
-    """Check the arguments that both control loops share, and reset the plant and the controller if ``reset`` is set.
+    """Check the arguments that both control loops share. If ``reset`` is set, reset the plant and the controller.
 
     Returns:
         The controller, the maximum number of steps, and the number of steps since the plant's reset.
@@ -103,7 +103,7 @@ class EpisodeCollector:
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
-        # action, plan, age, late
+        # tuples of action, plan, age, and whether the step was late
         self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
         self._outcomes: list[tuple[float, float, bool]] = []
         self._plans: list[tuple[int, float, float, float, float]] = []

@@ -40,16 +40,16 @@ def control(
         seed: Seed of the initial state and of the controller.
         reset: Whether to reset the plant and the controller first. If False, the run continues from the plant's state
             and the controller's last plan. ``replan_every`` must be the same as before.
-        on_step: Called with a ``ControlProgress`` after each step. Planning times exclude it.
+        on_step: Called with a ``ControlProgress`` after each step. Planning times exclude this call.
         on_abort: Called with the trajectory so far if an exception, such as Ctrl-C, ends the run after the first step.
-            Its ``done_reason`` is 0. The exception is then raised again.
+            The trajectory's ``done_reason`` is 0. The exception is then raised again.
 
     Returns:
         The trajectory of the episode. Its ``period`` is the plant's time step.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, or the episode is over or may never end. Or
-            an action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
+        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an
+            action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
     """
     every = whole_number("replan_every", replan_every, low=1)
     checked, limit, first = begin_episode(env, controller, steps, seed, reset=reset, on_step=on_step, on_abort=on_abort)

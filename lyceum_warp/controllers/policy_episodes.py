@@ -23,11 +23,11 @@ def policy_episodes(
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
-    The episodes equal those of ``lw.evaluate`` with the same seed and number of worlds. All worlds share a call of the
-    policy, so the times in a trajectory are those of the whole batch.
+    The episodes equal those of ``lw.evaluate`` with the same seed and number of worlds. One call of the policy acts in
+    all worlds, so the times in a trajectory are those of the whole batch.
 
     Yields:
-        The first episodes of all worlds, then their second episodes, and so on.
+        The first episode of each world, then the second episode of each world, and so on.
     """
     episodes = whole_number("episodes", episodes, low=1)
     if env.autoreset:

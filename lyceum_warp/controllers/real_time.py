@@ -53,28 +53,28 @@ def control_async(
 ) -> Trajectory:
     """Control one world, the plant, in real time: it steps at a fixed rate and does not wait for plans.
 
-    The plant steps in the calling thread. Step k of the plant is due at ``k * period``; a late step does not delay
-    later steps. The controller plans in a second thread, from the newest state; it makes at most one plan per state.
+    The plant steps in the calling thread. Step k of the plant is due at ``k * period``. A late step does not delay
+    later steps. The controller plans in a second thread, from the newest state. It makes at most one plan per state.
 
-    Each step applies the newest finished plan's action for this time; after the end of the plan, its last action is
-    held. The plant waits for the first plan, so the first action has age 0. Later actions are at least one step old,
-    and exactly one step old if every plan takes less than a period.
+    Each step applies the action that the newest finished plan has for this time. After the end of the plan, its last
+    action is held. The plant waits for the first plan, so the first action has age 0. Later actions are at least one
+    step old, and exactly one step old if every plan takes less than a period.
 
     With ``predict``, a copy of the plant predicts the state after the current step, and the controller plans from this
-    state. The copy runs no events of the task, such as pushes, and draws other random numbers than the plant. The first
-    action of a plan that takes less than a period is then applied to the state for which it was planned; without
+    state. The copy runs no events of the task, such as pushes, and draws other random numbers than the plant. If
+    planning takes less than a period, the plan's first action is applied in the state for which it was planned. Without
     ``predict``, this action comes too late. If the copy's episode ends in the predicted step, the controller plans from
     the measured state.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
-    graph while another thread launches kernels. For the same reason, ``on_step`` must not call functions that evaluate
-    given states, such as ``env.get_reward(before, action, after)``, because these also capture graphs.
+    graph while another thread launches kernels. For the same reason, ``on_step`` must not call functions of given
+    states, such as ``env.get_reward(before, action, after)``, which capture graphs.
 
     During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
-    on time, put the plant on the CPU, and leave one CPU core free by a smaller ``nthread`` of the planner's
-    environment. A plant on the planner's GPU would share a CUDA stream with the planner, so each step would wait for
-    the planner's launched kernels.
+    on time, put it on the CPU. Leave one CPU core free: reduce ``nthread`` of the planner's environment. A plant on the
+    planner's GPU would share a CUDA stream with the planner, so each step would wait for the planner's launched
+    kernels.
 
     At the end of the episode, the loop waits for the unfinished plan, and the trajectory includes this plan. If an
     exception, such as Ctrl-C, ends the run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the
@@ -92,7 +92,7 @@ def control_async(
             and the controller's last plan.
         on_step: Called with a ``ControlProgress`` after each step, in the calling thread. Slow calls delay the plant.
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
-            the first step. Its ``done_reason`` is 0. The exception is then raised again.
+            the first step. The trajectory's ``done_reason`` is 0. The exception is then raised again.
         predict: Whether to plan from predicted states.
         clock: Replacement for the wall clock, for example to do other work while the plant waits.
 
@@ -254,7 +254,7 @@ class PlannerThread:
         self._thread.start()
 
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
-        """Pass a measured state to the thread, and the action that the plant applies in this state.
+        """Pass the thread a measured state, and the action that the plant applies in this state.
 
         The thread plans next from the newest state. The action is None if the plant waits for the plan. The caller must
         not change the tensors.
@@ -280,8 +280,8 @@ class PlannerThread:
         """End the thread after its current plan.
 
         Args:
-            patience: Maximum time to wait for the thread, in seconds; None for no limit. A thread that takes longer
-                ends later: after its current plan, or when the program exits.
+            patience: Maximum time to wait for the thread, in seconds; None for no limit. A slower thread ends after its
+                current plan, or when the program exits.
         """
         self._states.put(None)
         self._thread.join(patience)
@@ -342,8 +342,8 @@ _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 def _interrupt_unfinished() -> None:
     """End planner threads when the program exits, because Python would otherwise free memory that they still use.
 
-    Python raises SystemExit in each thread when the running call of the engine returns, at the latest after one
-    planning iteration.
+    Python raises SystemExit in each thread when the running call of the engine returns. This takes at most one planning
+    iteration.
     """
     for thread in list(_unfinished):
         if thread.is_alive() and thread.ident is not None:

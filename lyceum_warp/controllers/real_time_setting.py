@@ -12,7 +12,7 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 
 SHARE = 0.8
-"""To meet a deadline, a setting's planning time (99 % quantile) may be at most this fraction of it."""
+"""Maximum planning time (99 % quantile) of a setting that meets a deadline, as a fraction of the deadline."""
 
 _SECONDS = 0.4  # a measurement lasts this long, but at least _STEPS steps
 _STEPS = 12

@@ -49,20 +49,20 @@ def episode_env(
     The environment has the first episode's parameters, model and physics options. ``env.set_state`` accepts the states
     of all episodes.
 
-    An episode's file names the file of its task, and making the environment runs that file as Python code. Without
-    ``task``, a task file therefore runs only if this user or root owns the file and its folder, and no other user can
-    write to them.
+    An episode's file contains the path of a task file. Making the environment runs this task file as Python code.
+    Without ``task``, the task file therefore runs only if this user or root owns the file and its folder, and no other
+    user can write to them.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, which must have the name of the episodes' task. It is required for a task from a notebook, after
-            its file has moved, or if other users can write to the file.
+        task: The task, which must have the name of the episodes' task. It is required if the task comes from a
+            notebook, if its file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task is not found, is a different one, does not fit the states, or has a file that other users
-            can write.
+        ValueError: The task is not found, is a different one, or does not fit the states, or other users can write to
+            its file.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
@@ -144,7 +144,7 @@ def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None
 
 
 def _foreign(file: Path) -> str:
-    """Return a reason why a file may have foreign code, such as "it can be written by other users", or ""."""
+    """Return why other users may have changed a file, such as "it can be written by other users", or ""."""
     for place, name in ((file, "it"), (file.parent, f"its folder {file.parent}")):
         status = place.stat()
         if status.st_uid not in (os.getuid(), 0):

@@ -67,7 +67,7 @@ class Trajectory:
     """Time at which each action was applied, (steps,) float64, in seconds."""
     ages: torch.Tensor
     """Age of each action when it was applied, (steps,) float64, in seconds. The age is the wall time since the plant
-    was in the plan's initial state. In a synchronous run, a plan's first action is as old as the planning time."""
+    was in the plan's initial state. In a synchronous run, the age of a plan's first action is the planning time."""
     late: torch.Tensor
     """Whether each step started late because the previous step took too long, (steps,) bool."""
     plan_of: torch.Tensor
@@ -112,9 +112,9 @@ class Trajectory:
     action_names: Sequence[str]
     """Names of the action columns."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """The arguments of ``lw.make`` from which ``episode_env`` makes the plant again. ``task`` is a name or
-    "file:class", or None for a task from a notebook or script. ``params`` lists the names of the given parameters, and
-    ``options`` has the options."""
+    """The arguments of ``lw.make`` with which ``episode_env`` recreates the plant. ``task`` is a name or "file:class",
+    or None for a task from a notebook or script. ``params`` lists the names of the given parameters, and ``options``
+    has the options."""
 
     @property
     def steps(self) -> int:
@@ -161,9 +161,9 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor is an array with the attribute's
-        name. The string ``info``, an array without dimensions, is a JSON object with the other attributes and
-        ``format``, which is 1. After ``start, stop = info["state_parts"]["qpos"]``, for example, the positions are
-        ``states[:, start:stop]``.
+        name. The 0-d array ``info`` is a string with a JSON object. It has the other attributes, and ``format``, which
+        is 1. For example, ``info["state_parts"]["qpos"]`` holds the first column of the positions in ``states``, and
+        the column after the last.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
@@ -244,7 +244,7 @@ _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "a
 
 
 def source(env: Env) -> dict[str, Any]:
-    """Collect the arguments that make an environment again; see ``Trajectory.source``."""
+    """Collect the arguments that recreate an environment; see ``Trajectory.source``."""
     task = env.task.task
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)

@@ -10,7 +10,7 @@ from lyceum_warp.runs.folder import Run
 
 
 class Follower:
-    """Gives a policy the weights of a run's newest policy, whenever it is called.
+    """Updates a policy's weights from a run's newest policy, at each call.
 
     Args:
         run: The run.

@@ -30,7 +30,7 @@ MAX_POINTS, MAX_MESSAGES = 20_000, 200
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """What stays the same during a session."""
+    """The constant data of a session."""
 
     title: str
     model: bytes
@@ -75,7 +75,7 @@ class SetGhosts:
     grid: bool = False
     """Whether to draw the other worlds side by side."""
     episodes: int = 0
-    """The number of other episodes to draw, at the same step."""
+    """The number of other episodes to draw. Each is drawn at the displayed step."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory."""
     plan: bool = True
@@ -108,7 +108,7 @@ class Status:
     command: tuple[float, float, float] | None = None
     """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
     driven: bool = False
-    """Whether the user, not the task, chooses the command."""
+    """Whether the command comes from the user instead of the task."""
     planner: tuple[tuple[str, float], ...] = ()
     params: tuple[tuple[str, float], ...] = ()
     seekable: tuple[int, int] = (0, 0)
@@ -124,7 +124,7 @@ class Frame:
     state: np.ndarray
     """The state for ``mujoco.mj_setState`` with ``mjSTATE_INTEGRATION``, float64."""
     model_fields: dict[str, np.ndarray]
-    """The values of the model fields that may differ between worlds, flat, by name."""
+    """The flattened values, by name, of the model fields that may differ between worlds."""
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
@@ -132,9 +132,10 @@ class Frame:
     best: int | None = None
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """(points, 2 + curves): the simulated time in seconds, 1 at the end of an episode, and a value for each curve."""
+    """(points, 2 + curves): the simulated time in seconds, whether an episode ended (0 or 1), and a value for each
+    curve."""
     messages: tuple[str, ...] = ()
-    """Why episodes ended, faults, and why commands were refused."""
+    """Messages about ended episodes, faults and refused commands."""
     files: tuple[str, ...] = ()
     """Absolute paths of new videos, pages and pictures to offer for download."""
 
@@ -224,7 +225,7 @@ class Perturb:
     forces: np.ndarray
     """Forces (N) and torques (Nm) in world coordinates, (nbody, 6) float64."""
     qpos: np.ndarray | None = None
-    """(nq,) float64. It takes effect only while paused."""
+    """(nq,) float64. Positions change only while the session is paused."""
     mocap_pos: np.ndarray | None = None
     """(nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
@@ -236,7 +237,8 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None lets the task choose again."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None lets the task choose its commands
+    again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,7 +267,7 @@ class TakePicture:
 
 @dataclasses.dataclass(frozen=True)
 class Close:
-    """End the session. Closing the page does not end it, because the page can be opened again."""
+    """End the session. Closing the page does not end the session, because the page can be opened again."""
 
 
 Command: TypeAlias = (

@@ -84,16 +84,16 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
 </script>"""
 """The HTML of a notebook's output.
 
-Studio shares memory between threads. In an embedded page, only Chromium-based browsers allow this. They send the
-viewer's cookie only if the page has the notebook's host name.
+Studio shares memory between threads. In an embedded page, only Chromium-based browsers allow this. These browsers send
+the viewer's cookie only if the page has the notebook's host name.
 """
 
 
 class BackgroundView:
     """A view that steps its worlds in a thread. ``lw.view`` returns it if ``block`` is False.
 
-    In a notebook, the output of the cell is the page and a link to it. In Firefox and Safari, and in a notebook served
-    by another machine, it is only the link.
+    In a notebook, the output of the cell is the page and a link to it. In Firefox, in Safari, and in a notebook served
+    by another machine, the output is only the link.
     """
 
     def __init__(self, session: Session, window: Window) -> None:

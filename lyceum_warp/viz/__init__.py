@@ -5,4 +5,4 @@ EXTRA = "pip install 'lyceum-warp[viz]'"
 
 
 class NoVideoError(RuntimeError):
-    """Raised if the machine cannot render, or if a package for videos is missing. The message gives the fix."""
+    """Raised if the machine cannot render, or if a package for videos is missing. The message says how to fix it."""

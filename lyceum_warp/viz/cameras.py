@@ -35,8 +35,8 @@ class FreeCamera:
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
 """A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for a video's default.
 
-The default is the model's first tracking camera. Without one, it is the first camera that is fixed to the world, or
-else a camera that follows the first body.
+The default is the model's first tracking camera. A model without a tracking camera gets its first camera that is fixed
+to the world. A model without either gets a camera that follows the first body.
 """
 
 FREE = "free"

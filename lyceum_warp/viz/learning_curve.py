@@ -11,7 +11,7 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 
 
 def learning_curve(run: str | Path | Run) -> Path:
-    """Draw a run's returns, evaluation metric and own metrics against samples, as ``curve.png`` in the run's folder.
+    """Plot a run's returns and metrics against the number of samples, as ``curve.png`` in the run's folder.
 
     If no episode has a return, the plot shows the mean reward per step instead.
 

@@ -1,7 +1,7 @@
 """Write an episode as one HTML file: a scene that can be played and turned in any browser, without a server or network.
 
 The file holds the triangles of the visible geoms in body coordinates, and the bodies' poses in each frame. The script
-in ``page.html`` draws them with WebGL. The only texture is the floor's squares.
+in ``page.html`` draws them with WebGL. The floor's squares are the only texture.
 """
 
 import base64
@@ -35,8 +35,8 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     Args:
         env: The environment of the states.
         states: The states of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced when the page is complete.
-        camera: The initial camera, as in ``write_video``. The reader can turn it.
+        out: The file. An existing file is replaced when the page is complete.
+        camera: The initial camera, as in ``write_video``. The user can turn the view.
 
     Raises:
         ValueError: The states do not have the environment's shape, or the model has no such camera.

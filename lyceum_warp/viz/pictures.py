@@ -32,5 +32,5 @@ class WorldPictures(DrawingProcess):
         return pictures
 
     def close(self) -> None:
-        """End the subprocess. A later call starts a new one."""
+        """End the subprocess. The next rendering starts a new subprocess."""
         self._stop()

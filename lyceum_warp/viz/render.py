@@ -29,16 +29,16 @@ VIDEO, PICTURE = "video.mp4", "picture.raw"
 
 
 class Shot(TypedDict):
-    """What to draw in one or several successive frames."""
+    """The content of one or several successive frames."""
 
     state: np.ndarray
     """The integration state (``mjSTATE_INTEGRATION``)."""
     model_fields: dict[str, np.ndarray]
-    """Values of the same model fields in every shot, by name."""
+    """Values of model fields by name. Every shot has the same fields."""
     ghosts: list[tuple[np.ndarray, tuple[float, ...] | None, tuple[float, float]]]
     """Further states, each with a colour (None for the model's colours) and a shift in x and y."""
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
-    """Points, (points, 3), colour and width in pixels."""
+    """Lines, each as points (points, 3), a colour and a width in pixels."""
     frames: int
 
 

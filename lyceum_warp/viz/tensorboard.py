@@ -17,7 +17,7 @@ _GROUPS = {
     "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
     "step_metrics/": "Episode_Metrics",
 }  # fmt: skip
-"""The group of a curve, by the prefix of its column in metrics.csv. mjlab also uses Episode_Metrics for means per
+"""Maps the prefix of a column in metrics.csv to the curve's group. mjlab also uses Episode_Metrics for means per
 step."""
 
 _TAGS = {
@@ -33,18 +33,18 @@ _TAGS = {
     "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
     "explained_variance": "value/explained_variance",
 }  # fmt: skip
-"""The name of a curve, by its column in metrics.csv."""
+"""Maps a column of metrics.csv to the curve's name."""
 
 
 class TensorBoard:
     """Writes a run's iterations to files for TensorBoard. The horizontal axis counts iterations from 0.
 
-    Every number of an iteration becomes a curve. A curve that rsl_rl or mjlab also writes has the same name, unit and
-    axis as there, so that runs can be overlaid. These curves are in the groups Train/, Loss/, Policy/, Perf/,
-    Episode_Metrics/ and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the
-    groups return/, episode/, mean_policy/, policy/, value/, time/ and metrics/.
+    Every number of an iteration becomes a curve. Curves that rsl_rl or mjlab also write have the same names, units and
+    axes, so that runs can be overlaid. These curves are in the groups Train/, Loss/, Policy/, Perf/, Episode_Metrics/
+    and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/,
+    episode/, mean_policy/, policy/, value/, time/ and metrics/.
 
-    Curves that the folder already has are continued. Their values from the first new iteration on are replaced.
+    Existing curves in the folder are continued. Their values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -54,8 +54,8 @@ class TensorBoard:
     Args:
         folder: The folder, which need not exist. Pass it, or one above it, to ``tensorboard --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the mean number of episodes, in all worlds, that the
-            function NAME ends in one step.
+            time limit in seconds. Episode_Termination/NAME is the mean number of episodes per step, over all worlds,
+            that the function NAME ends.
 
     Raises:
         ImportError: The package tensorboard is not installed.
@@ -75,7 +75,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Numbers that are not finite are omitted, such as the return if no episode has ended."""
+        """Add an iteration. Non-finite numbers are omitted, such as the return if no episode has ended."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []

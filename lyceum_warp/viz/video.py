@@ -46,10 +46,11 @@ def write_video(
     Args:
         env: The environment of the states.
         states: The states of one world, one row per step, (steps, state_space.size).
-        out: The file. It is replaced when the video is complete.
+        out: The file. An existing file is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
-            MuJoCo's default free camera. The default is the model's first tracking camera. Without one, it is the first
-            camera that is fixed to the world, or else a camera that follows the first body.
+            MuJoCo's default free camera. The default is the model's first tracking camera. A model without a tracking
+            camera gets its first camera that is fixed to the world. A model without either gets a camera that follows
+            the first body.
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
         progress: A function that is called after each frame with the number of frames so far and the total number. The
@@ -89,7 +90,7 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 
 
 class Recorder:
-    """Makes a video of shots that arrive one by one, or a picture of one shot, for example for the viewer.
+    """Makes a video of shots that arrive one by one, or a picture of one shot.
 
     Shots wait in a queue until a subprocess of low priority draws them. If the queue is full, further shots are
     dropped, and the last shot in the queue is displayed longer. The file is written when the video is complete.
@@ -118,7 +119,7 @@ class Recorder:
         self._changed = threading.Condition()  # its lock also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
-        # instead of Thread.join: in Python 3.11, it marks the thread as stopped if a signal interrupts it
+        # Thread.join of Python 3.11 would mark the thread as stopped if a signal interrupts the call
         self._done = threading.Event()
         threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
 
@@ -157,7 +158,7 @@ class Recorder:
         return self.out
 
     def cancel(self) -> None:
-        """Cancel the video, and write no file, unless the video is complete."""
+        """Cancel the video without writing a file, unless the video is complete."""
         if not self.finished:
             self._cancelled = True
             self._shots.clear()

@@ -35,7 +35,7 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
-"""Seconds of delay that the worlds catch up; longer delays are ignored."""
+"""The longest delay that the worlds catch up, in seconds. They ignore longer delays."""
 _IDLE = 0.5
 """Seconds between two frames of a paused view without commands."""
 _CHECK = 0.5
@@ -181,7 +181,7 @@ class Session:
     def obey(self, command: Command) -> None:
         """Carry out a command, and show an error to the user.
 
-        A command that needs the plant's state stops a plant that runs in real time.
+        If a command needs the state of a plant that runs in real time, the plant stops.
         """
         push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
         if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):

@@ -135,7 +135,7 @@ class WorldControl:
 
 
 class ControlRun:
-    """A controller in one control loop. It has the controller's attributes and signature."""
+    """Wraps a controller for one control loop, with the same attributes and signature."""
 
     def __init__(self, control: WorldControl, number: int) -> None:
         self._control, self._number = control, number

@@ -19,7 +19,7 @@ PLANT_HISTORY_BYTES = 16 * 2**20
 HISTORY_STEPS = 2000
 """Maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # most curve points between two frames; later points overwrite the oldest
+_CURVE_ROWS = 512  # maximum number of curve points per frame; further points overwrite the oldest
 
 
 class Past:
@@ -73,7 +73,8 @@ class Rows:
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
     end: tuple[float, ...] | None
-    """The displayed world's last episode since the previous frame: bits of ``Done``, return, length, success."""
+    """The displayed world's last episode that ended since the previous frame: bits of ``Done``, return, length,
+    success."""
     fault: tuple[float, ...] | None
     """The last fault since the previous frame: bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
@@ -85,7 +86,7 @@ class Live:
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
-        self.made = self._reported = 0  # steps, in all and until the last frame
+        self.made = self._reported = 0  # number of steps, in total and until the last frame
         self.world = 0
         self.pushed: int | None = None
         device, n = env.obs.device, env.nworld
@@ -95,7 +96,7 @@ class Live:
         self._fault = torch.zeros(4, dtype=torch.float64, device=device)
         self._ended, self._reward = torch.zeros(n, dtype=torch.bool, device=device), torch.zeros_like(env.reward)
         self._curves = torch.zeros(_CURVE_ROWS, 4 + len(env.metrics), dtype=torch.float64, device=device)
-        self._points = 0  # since the last frame
+        self._points = 0  # number of curve points since the last frame
         self._state = env.get_state()
         # values before the current step
         self._length, self._over = env.episode_step.clone(), env.done.clone()
@@ -157,7 +158,7 @@ class Live:
         env = self.env
         self.made += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
-        if not env.autoreset:  # ``done`` then stays set after the episode, and the return must not grow
+        if not env.autoreset:  # without resets, ``done`` stays set after the episode, and the return must not grow
             ended.logical_and_(~self._over)
             reward.masked_fill_(self._over, 0.0)
         self.returns.add_(reward)

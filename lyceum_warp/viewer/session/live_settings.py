@@ -27,7 +27,7 @@ def task_numbers(env: Env) -> Numbers:
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
-    """Make a planner with a new value of a setting. A planner's CUDA graphs contain the old one."""
+    """Make a planner with a new value of a setting, because an existing planner's CUDA graphs contain the old value."""
     kind = type(getattr(planner.config, name))
     env = planner.env
     options = {key: given for key, given in env.options.given().items() if key not in _OF_THE_PLANNER}

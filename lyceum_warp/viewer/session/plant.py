@@ -12,7 +12,7 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """Seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # seconds before a step in which no other work may start
+_RESERVE = 0.0015  # no other work may start in this time before a step, in seconds
 _WARM_UP = 3  # the first calls may capture CUDA graphs, so no other work runs during them
 
 

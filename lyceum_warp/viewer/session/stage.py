@@ -150,7 +150,7 @@ class Stage:
         self.frames.add_point(self.playback)
 
     def end_old_push(self) -> None:
-        """End a push that came back with a restored state, unless the user still pushes."""
+        """End a push that a restored state contains, unless the user still pushes."""
         live = self.live
         if live.pushed is not None and not self.dragging and not live.past.ahead:
             live.end_push()
@@ -199,7 +199,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world. The user's push and driving end in the previous world."""
+        """Show another world. In the previous world, end the user's push and command."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:

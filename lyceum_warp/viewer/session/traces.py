@@ -28,7 +28,8 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, in
     """Choose the point of a robot whose path is drawn. Return its field in MjData, such as "site_xpos", and its index.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
-    for an arm is the last body in the longest chain of actuated bodies: its first site, or its centre of mass.
+    for an arm is on the last body in the longest chain of actuated bodies. It is the body's first site, or else its
+    centre of mass.
     """
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
@@ -143,7 +144,7 @@ class TraceThread:
         """Roll out a new plan when the thread is free, and return the last traces.
 
         Raises:
-            Exception: A rollout failed. There are no further rollouts.
+            Exception: A rollout failed. No further rollouts are made.
         """
         self._waiting = self._waiting if view is None else view
         if self._running is not None and self._running.done():

@@ -21,7 +21,7 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # of lines, pixels
-_MOST_WAITING = 4 * FPS  # maximum number of waiting poses; the rendering subprocess starts slowly
+_MOST_WAITING = 4 * FPS  # maximum number of queued poses, because the rendering subprocess starts slowly
 _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
@@ -68,7 +68,7 @@ class VideoTaker:
         return Path(f"{title}-{datetime.datetime.now():%Y%m%d-%H%M%S-%f}{ending}")
 
     def add(self, frame: Frame) -> None:
-        """Add a frame as often as needed for the video to reach the present time."""
+        """Repeat a frame until the video reaches the present time."""
         video = self._running
         if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
             return

@@ -35,8 +35,8 @@ class NoWindowError(OSError):
 class Window:
     """Shows frames in a window process, and collects the user's commands.
 
-    The window process does not import the caller's program, so the caller needs no ``__main__`` guard. It ends when
-    this process ends, even by SIGKILL. Ctrl-C does not reach it.
+    The window process does not import the caller's program, so the caller needs no ``__main__`` guard. The window
+    process ends with this process, even after SIGKILL. Ctrl-C does not reach the window process.
 
     Raises:
         ValueError: The port is out of range or in use, or the address is not an address of this machine.
@@ -46,7 +46,7 @@ class Window:
     def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._pending: Frame | None = None
         self._taken = True
-        self._changed = threading.Condition()  # its lock also guards both
+        self._changed = threading.Condition()  # its lock also guards _pending and _taken
         self._ended = False
         self._commands: deque[Command] = deque()
         self._threads: list[threading.Thread] = []
@@ -89,7 +89,7 @@ class Window:
     def show(self, frame: Frame) -> None:
         """Send a frame without waiting for the window.
 
-        A frame that has not been sent yet is skipped. Its curve points and messages move to the new frame.
+        An older frame that was not sent yet is skipped. Its curve points and messages move to the new frame.
         """
         with self._changed:
             self._pending = protocol.latest(self._pending, frame)

@@ -13,12 +13,12 @@ from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """Simulated seconds per second."""
 MANY_STEPS = 50
-"""The number of steps that an arrow key with Shift makes."""
+"""The number of steps that Shift with an arrow key makes."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Keys whose names in the panel and in studio differ."""
+"""Names of keys in studio, by the panel's names."""
 
 
 class Actions:
@@ -37,7 +37,7 @@ class Actions:
 
     @property
     def status(self) -> Status:
-        """The session's status. There is none before the first frame."""
+        """The session's status, which is unknown before the first frame."""
         assert self.frame is not None
         return self.frame.status
 

@@ -20,10 +20,10 @@ from lyceum_warp.viewer.window.sockets import private_socket
 
 
 class WindowEnd:
-    """The window's end of the connection to the session.
+    """The window process's connection to the session.
 
-    One thread receives frames, and the drawing thread takes them. The session sends a frame after the last one was
-    taken.
+    One thread receives frames, and the drawing thread gets them from ``take``. The session sends a frame only after the
+    window has taken the previous one.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -55,7 +55,7 @@ class WindowEnd:
 
 
 def main(descriptor: int) -> None:
-    """Draw until the session or the user ends the window. ``descriptor`` is the connection to the session."""
+    """Draw until the session or the user closes the window. ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
     os.nice(5)  # the session's planner may need every core
     connection = Connection(descriptor)
@@ -88,7 +88,7 @@ def run(opening: Opening, end: WindowEnd) -> None:
             end.receive()
             screen.close()
             time.sleep(3.0)
-            os._exit(1)  # studio did not end
+            os._exit(1)  # end the process even if studio hangs
 
         threading.Thread(target=follow, daemon=True).start()
         screen.show_model(model)

@@ -11,7 +11,7 @@ processes. The proxy forwards a request only if
 
 Browsers send a cookie to all ports of a host, including the servers of other users on the loopback address. The cookie
 is therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests
-addresses from the root of the host. A script from the proxy prefixes these addresses with the path.
+addresses from the root of the host. A script from the proxy prefixes these addresses with the random path.
 
 aiohttp parses requests, and limits their headers to 128 lines of 8 KiB. The proxy runs in a thread.
 """
@@ -42,7 +42,7 @@ HEAD_SECONDS = 10.0
 WRITE_SECONDS = 60.0
 """Timeout in seconds for a client that does not read."""
 UNCHECKED = 128
-"""Maximum number of connections without the secret. Further connections close the oldest ones."""
+"""Maximum number of connections without the secret. Each further connection closes the oldest one."""
 MESSAGE_BYTES = 2**20
 """Maximum size of a WebSocket message from a browser, in bytes."""
 QUIET_SECONDS = 2.0
@@ -54,11 +54,11 @@ PROTECTION = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Embedder-Policy": "require-corp",  # browsers require this for SharedArrayBuffer
-    "Document-Isolation-Policy": "isolate-and-require-corp",  # the same in notebooks, for Chromium
+    "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
 }
 """These headers stop other sites from embedding the page or getting its address.
 
-Pages of this machine that know the token, such as notebooks, may embed it.
+Pages of this machine that know the token, such as notebooks, may embed the page.
 """
 SCRIPT = """<script>
 (() => {

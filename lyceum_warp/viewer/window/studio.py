@@ -28,7 +28,7 @@ Plugin: Any = plugin.ViewerPlugin
 """The base class of plugins. After ``Started``, ``self.viewer`` is the viewer."""
 
 handler: Any = messages.handler
-"""Decorator for a plugin's method, which handles messages of the type in its annotation."""
+"""Decorator for a plugin's method that handles messages. The method's annotation gives the type of the messages."""
 
 Started: Any = plugin.ViewerInitEvent
 Update: Any = messages.UpdateEvent
@@ -65,7 +65,7 @@ class Screen:
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raises an error if studio did not take the given socket. It would then listen on all addresses."""
+    """Raises an error if studio did not take the given socket. Otherwise studio might listen on all addresses."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken

@@ -392,7 +392,7 @@ class Curves:
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reduce the last ``seconds`` to at most ``points`` rows: the minimum, mean and maximum of successive rows."""
+        """Reduce the last ``seconds`` to at most ``points`` rows, with the minima, means and maxima of curves."""
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows
