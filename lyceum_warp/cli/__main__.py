@@ -1,4 +1,4 @@
-"""Run the command line: python -m lyceum_warp.cli."""
+"""Run the commands of lyceum-warp with python -m lyceum_warp.cli."""
 
 import sys
 

@@ -70,7 +70,7 @@ class OptionFlags:
     def __init_subclass__(
         cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
     ) -> None:
-        if not options:  # a subclass of a group, which only omits flags from the help
+        if not options:  # this subclass only omits flags from the help
             return
         own = dict(vars(cls).get("__annotations__", {}))
         flags: dict[str, Any] = {}
@@ -84,7 +84,7 @@ class OptionFlags:
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the default is None, but the user cannot write None
+                if value is None and flag is hints[name]:  # the default is None, but the user may not pass None
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -95,7 +95,7 @@ class OptionFlags:
 
 
 def given(flags: Any) -> dict[str, Any]:
-    """Return the values of all flags that differ from their defaults, by name."""
+    """Return the values that differ from the defaults, by the names of their flags."""
     found = given_values(flags)
     if "solver" in found:
         found["solver"] = dict(map(parameter, found["solver"]))
@@ -163,7 +163,7 @@ def _flag_names(command: Any) -> list[str]:
 
 
 def parameter(text: str) -> tuple[str, Any]:
-    """Parse NAME=VALUE or NAME=0.7,inf: a task parameter or a solver limit."""
+    """Parse a task parameter or a solver limit, such as NAME=VALUE or NAME=0.7,inf."""
     name, value = (part.strip() for part in text.partition("=")[::2])
     parts = [part for part in value.strip("[]()").split(",") if part.strip()]
     if not name or not parts:

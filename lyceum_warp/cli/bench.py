@@ -18,9 +18,9 @@ FOLDER = Path(__file__).resolve().parents[2] / "bench"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Run an experiment or another program in bench/, in a checkout. Without a name, list the experiments.
+    """Run an experiment or another program in the folder bench/ of a checkout. Without a name, list the experiments.
 
-    All arguments after the name are passed to the program. It explains them with --help.
+    All arguments after the name are passed to the program. With --help, the program explains its arguments.
 
     $ lyceum-warp bench
     $ lyceum-warp bench throughput --short
@@ -29,7 +29,7 @@ class Bench:
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "overview"
-    """A program in bench/, without .py."""
+    """The name of a program in bench/, without .py."""
 
     def run(self, *arguments: str) -> int:
         if not (FOLDER / "experiment.py").exists():

@@ -33,7 +33,8 @@ class Check:
     seed: int = 0
     """Seed of the worlds and of the random actions."""
     rule: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME")] = ()
-    """The name of a rule to check, as the report prints it. It may be repeated. By default, all rules are checked."""
+    """The name of a rule to check, as the report prints it. The flag may be repeated. By default, all rules are
+    checked."""
     param: ParamWords = ()
     env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=Placement

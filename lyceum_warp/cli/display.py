@@ -104,8 +104,8 @@ class Display(training.Display):
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}
-"""Columns of metrics.csv that count problems, with their labels in messages. Some algorithms do not write all of
-them."""
+"""Columns of metrics.csv that count problems, with their labels in messages. Some algorithms do not write all of these
+columns."""
 
 _BAR_WIDTH = 36
 """Width of the progress bar, the iteration number and the times, in characters."""
@@ -180,7 +180,7 @@ def _known(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
-    """Call a function that writes a file, and return the path. If it fails, return "none" and the reason.
+    """Call a function that writes a file, and return the path. If the function fails, return "none" and the reason.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """

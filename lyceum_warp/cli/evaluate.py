@@ -76,7 +76,7 @@ class Eval:
     one.
     """
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
-    """A new or empty folder for the episodes, one file each, such as episode-000.npz."""
+    """A new or empty folder for the episodes. Each episode is one file, such as episode-000.npz."""
     trust: Trust = False
     env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
         default_factory=EnvFlags

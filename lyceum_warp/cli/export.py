@@ -17,7 +17,7 @@ from lyceum_warp.runs.folder import Run, load
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Export:
-    """Write a run's policy, including its observation normaliser, to a file that runs without lyceum_warp.
+    """Write a run's policy, including its observation normaliser, to a file that can be used without lyceum_warp.
 
     An .onnx file has the input "obs", (n, observations) float32 for any n, and the output "action", the mean actions.
     The file's metadata describe the robot: parts of observations, joints, gains, control interval and more. ONNX needs

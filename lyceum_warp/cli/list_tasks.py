@@ -84,7 +84,7 @@ class _Entry:
 
 
 def _entry(name: str) -> _Entry:
-    """Make the entry of a task without its sizes, which require the model."""
+    """Make a task's entry without the sizes, because these require the model."""
     entry = _Entry(name)
     try:
         task = entry.task = find_task(name)

@@ -16,7 +16,7 @@ _CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:
     """Parse the options of a command, and return an instance of its class.
 
-    --help describes only the options in the class's attribute ``USUAL``, if it has one.
+    If the class has an attribute ``USUAL``, --help describes only the options in it.
     """
     if {"-h", "--help"} & set(words):
         _print_help(command, prog)

@@ -82,12 +82,12 @@ class Plan:
     come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds.
 
     With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
-    chooses the largest number of samples that meets the deadline on this machine. If no number meets it, the command
-    tries a shorter horizon, and then other physics that the task defines. Values that you give are never changed.
+    chooses the largest number of samples that meets the deadline. If no number meets it, the command tries a shorter
+    horizon, and then other physics that the task defines. Values that you give are never changed.
 
-    The command writes config.json, report.json, plan.png, a video of the first episode (video.mp4), and one file per
-    episode (episode-000.npz, for numpy) into a folder. After Ctrl-C, the interrupted episode is saved, too, but is not
-    part of the report.
+    The command writes config.json, report.json and plan.png into a folder. It also writes video.mp4 of the first
+    episode, and a numpy file such as episode-000.npz for each episode. After Ctrl-C, the interrupted episode is saved,
+    too, but is not part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -110,7 +110,7 @@ class Plan:
     replan_every: int = 1
     """The number of steps from one plan to the next. Steps between two plans apply further actions of the last plan."""
     seed: int = 0
-    """Seed of the first episode's initial state and noise. It increases by one for each further episode."""
+    """Seed of the first episode's initial state and noise. The seed increases by one for each further episode."""
     real_time: bool = False
     """Step the world in real time while the planner plans, instead of waiting for each plan."""
     predict: bool = False
@@ -255,7 +255,7 @@ def _fill(words: tuple[str, ...]) -> Any:
     try:
         numbers = [float(word) for word in words]
     except ValueError:
-        return " ".join(words)  # MPPIConfig refuses unknown words
+        return " ".join(words)  # MPPIConfig raises an error for unknown words
     return numbers[0] if len(numbers) == 1 else numbers
 
 

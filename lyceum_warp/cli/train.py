@@ -99,7 +99,7 @@ class Train:
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
-    its local rank. A run can be resumed with a different number of processes. This number changes the results only by
+    its local rank. A run can be resumed with a different number of processes. The number changes the results only by
     rounding. After Ctrl-C or SIGTERM, all processes finish the iteration. torchrun waits for them for 30 s, or for its
     --shutdown-timeout.
     """
@@ -144,7 +144,7 @@ class Train:
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Total number of worlds of all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
+    """Total number of worlds in all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
     samples / nworld steps per iteration. These steps are whole episodes if they fit, and otherwise segments of
     episodes.
     """
@@ -156,14 +156,14 @@ class Train:
     video: bool = True
     """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0 writes
-    none."""
+    """Number of iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0
+    writes no videos."""
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
-    cheap comparisons are made. After training on a GPU, these include the C engine. After training with other physics,
-    they include the task's default physics. --transfer adds each set of physics options that the task defines. After
-    training on CPU cores, it also adds the Warp engine, whose kernels may take minutes to compile.
+    cheap comparisons are made. After training on a GPU, these use the C engine. After training with other physics, they
+    use the task's default physics. --transfer adds each set of physics options that the task defines. After training on
+    CPU cores, it also adds the Warp engine, whose kernels may take minutes to compile.
     """
     trust: Trust = False
     take_over: bool = False

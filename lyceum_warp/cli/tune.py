@@ -34,7 +34,8 @@ class Tune:
 
     task: TaskWord
     run_folder: Annotated[Path | None, tyro.conf.arg(name="run", metavar="RUN")] = None
-    """The folder of a run of the task. Its policy also plays the episodes, and its task parameters are the defaults."""
+    """The folder of a run of the task. The run's policy also plays the episodes, and the run's task parameters are the
+    defaults."""
     which: str = "last"
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
@@ -49,8 +50,8 @@ class Tune:
     """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
-    samples in the same order. --nworld is then the number of samples. The planner plans from --episodes states of each
-    kind: standing, moving and fallen.
+    samples in the same order. --nworld is then the number of samples. The planner plans from --episodes standing
+    states, and from as many moving and fallen states.
     """
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds. By default 256, or 4096 on a GPU. With --planning, the number of samples, by default 64."""

@@ -23,7 +23,7 @@ class ControlReport:
 
     A value is None if it does not apply, if the controller does not report it, or if there are too few plans. The first
     plan of each trajectory is slow, because it loads kernels and captures graphs. Statistics of planning times
-    therefore exclude it; see ``first_plan_ms``.
+    therefore exclude the first plan; see ``first_plan_ms``.
     """
 
     task: str
@@ -120,7 +120,7 @@ class ControlReport:
         return path
 
     def rows(self) -> list[tuple[str, str]]:
-        """Format the report as pairs of a label and a number with its unit ("-" if missing)."""
+        """Format the report as pairs: a label, and a number with its unit, or "-"."""
         rows = [
             ("episodes", f"{self.episodes} of {self.task} ({self.steps} steps, {self.mode})"),
             ("return", _text(self.return_mean, ".4g") + _text(self.return_std, ".2g", " ± {}", "")),

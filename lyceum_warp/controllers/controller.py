@@ -41,9 +41,9 @@ class PlanningController(Controller, Protocol):
         Args:
             state: See ``Controller``.
             obs: See ``Controller``.
-            shift: Number of controller steps (see ``timestep``) since the initial state of the last plan. It is 0 for
-                the first plan after a reset. With ``reset=False``, the loops assume that the previous run made a plan
-                whenever one was due. Loops pass ``shift`` only to a controller with an argument of this name.
+            shift: Number of controller steps (see ``timestep``) since the initial state of the last plan. The number is
+                0 for the first plan after a reset. With ``reset=False``, the loops assume that the previous run made a
+                plan whenever one was due. Loops pass ``shift`` only to a controller with an argument of this name.
 
         Returns:
             The first action of the plan, (nu,). If the controller has an attribute ``actions``, the loops read the
@@ -95,5 +95,5 @@ class PlanningController(Controller, Protocol):
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. It must not be the plant, because planning changes the state."""
+        """Environment that simulates the plans. The plant must not be used here, because planning changes the state."""
         ...

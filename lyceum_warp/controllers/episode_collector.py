@@ -50,7 +50,7 @@ class TimedPlan:
     begun: float  # start time, in seconds on the run's clock
     seconds: float
     actions: torch.Tensor  # (horizon, nact)
-    ahead: int = 0  # the initial state was predicted by this number of steps
+    ahead: int = 0  # number of steps from the measured state to the predicted initial state
 
     @property
     def seen(self) -> int:

@@ -33,7 +33,7 @@ def control(
 
     Args:
         env: The plant, an environment of one world made with ``autoreset=False``.
-        controller: The controller; see ``lw.Controller``. It makes a plan in each call. It must not step ``env``.
+        controller: The controller; see ``lw.Controller``. Each call makes a plan. The controller must not step ``env``.
         steps: Maximum number of steps; the episode may end earlier.
         replan_every: Number of steps between two plans. The other steps apply further actions of the last plan, so the
             controller needs an attribute ``actions``.

@@ -54,11 +54,11 @@ def control_async(
     """Control one world, the plant, in real time: it steps at a fixed rate and does not wait for plans.
 
     The plant steps in the calling thread. Step k of the plant is due at ``k * period``. A late step does not delay
-    later steps. The controller plans in a second thread, from the newest state. It makes at most one plan per state.
+    later steps. The controller plans in a second thread, from the newest state, at most once per state.
 
     Each step applies the action that the newest finished plan has for this time. After the end of the plan, its last
     action is held. The plant waits for the first plan, so the first action has age 0. Later actions are at least one
-    step old, and exactly one step old if every plan takes less than a period.
+    step old. If every plan takes less than a period, they are exactly one step old.
 
     With ``predict``, a copy of the plant predicts the state after the current step, and the controller plans from this
     state. The copy runs no events of the task, such as pushes, and draws other random numbers than the plant. If
@@ -73,8 +73,7 @@ def control_async(
 
     During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
     on time, put it on the CPU. Leave one CPU core free: reduce ``nthread`` of the planner's environment. A plant on the
-    planner's GPU would share a CUDA stream with the planner, so each step would wait for the planner's launched
-    kernels.
+    planner's GPU would share a CUDA stream with the planner, so each step would wait for the planner's kernels.
 
     At the end of the episode, the loop waits for the unfinished plan, and the trajectory includes this plan. If an
     exception, such as Ctrl-C, ends the run, the loop waits at most 0.2 seconds for the unfinished plan. Do not use the
@@ -82,7 +81,7 @@ def control_async(
 
     Args:
         env: The plant, an environment of one world made with ``autoreset=False``.
-        controller: The controller, called in the second thread; see ``lw.Controller``. It must simulate its plans in a
+        controller: The controller, called in the second thread; see ``lw.Controller``. The plans must be simulated in a
             separate environment.
         period: Wall time between steps, in seconds; by default the plant's time step, so that the plant runs in real
             time.
@@ -162,7 +161,7 @@ def run_plant(
     limit: int,
     on_step: OnStep | None,
 ) -> float:
-    """Step the plant at its fixed rate until the episode ends; return the time of the last period's end, in seconds."""
+    """Step the plant at its fixed rate until the episode ends. Return the end of the last period, in seconds."""
     start, period = episode.start, episode.period
     for k in range(limit):
         due = start + k * period
@@ -214,7 +213,7 @@ class Predictor:
             action: The action applied in this state, (nact,).
         """
         env, start = self._env, state[None].clone()
-        start[:, self._key] = (start[:, self._key] + 1) % 2**32  # the streams of different keys are independent
+        start[:, self._key] = (start[:, self._key] + 1) % 2**32  # different keys give independent random numbers
         env.set_state(start)
         env.action[0] = action
         for call in self._transition:
@@ -342,8 +341,8 @@ _unfinished: "weakref.WeakSet[threading.Thread]" = weakref.WeakSet()
 def _interrupt_unfinished() -> None:
     """End planner threads when the program exits, because Python would otherwise free memory that they still use.
 
-    Python raises SystemExit in each thread when the running call of the engine returns. This takes at most one planning
-    iteration.
+    Python raises SystemExit in each thread when the running call of the engine returns. The call takes at most one
+    planning iteration.
     """
     for thread in list(_unfinished):
         if thread.is_alive() and thread.ident is not None:

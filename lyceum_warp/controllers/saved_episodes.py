@@ -15,11 +15,11 @@ from lyceum_warp.task import Task
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
-    """Load episodes of the same task and the same layout of states.
+    """Load episodes that have the same task and the same state layout.
 
     Args:
-        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. A
-            folder stands for its ``.npz`` files in alphabetical order.
+        paths: Files written by ``Trajectory.save``, ``lyceum-warp plan`` or ``lyceum-warp eval --episodes-to``. From a
+            folder, all ``.npz`` files are loaded in alphabetical order.
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
@@ -50,12 +50,12 @@ def episode_env(
     of all episodes.
 
     An episode's file contains the path of a task file. Making the environment runs this task file as Python code.
-    Without ``task``, the task file therefore runs only if this user or root owns the file and its folder, and no other
-    user can write to them.
+    Without ``task``, this user or root must therefore own the file and its folder, and no other user may have write
+    access.
 
     Args:
         episodes: The episodes, as ``load_episodes`` returns them.
-        task: The task, which must have the name of the episodes' task. It is required if the task comes from a
+        task: The task, which must have the name of the episodes' task. The task is required if it comes from a
             notebook, if its file has moved, or if other users can write to the file.
         changes: Additional options and parameters of ``lw.make``.
 

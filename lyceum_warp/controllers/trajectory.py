@@ -45,8 +45,8 @@ class Trajectory:
     In step k, the plant moves from state k to state k + 1 under action k. To replay the episode bit for bit on the same
     engine, set the first state and step with each action.
 
-    Times are seconds of wall time. The clock starts before the first plan in a synchronous run, and after it in an
-    asynchronous run.
+    Except for ``timestep``, times are wall times in seconds. The clock starts before the first plan in a synchronous
+    run, and after the first plan in an asynchronous run.
     """
 
     states: torch.Tensor
@@ -161,9 +161,8 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor is an array with the attribute's
-        name. The 0-d array ``info`` is a string with a JSON object. It has the other attributes, and ``format``, which
-        is 1. For example, ``info["state_parts"]["qpos"]`` holds the first column of the positions in ``states``, and
-        the column after the last.
+        name. The 0-d array ``info`` is a string with a JSON object. The object has the other attributes, and
+        ``format``, which is 1. For example, the positions are ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}

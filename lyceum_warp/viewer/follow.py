@@ -1,6 +1,6 @@
 """Follow a training run: load the weights of its newest policy.
 
-The viewer only reads the run's files. It may run on another machine that shares the folder.
+The viewer only reads the run's files, and may run on another machine that shares the folder.
 """
 
 import torch

@@ -29,7 +29,8 @@ def view(
 
     For example, ``lw.view(env, controllers={"policy": policy, "mppi": plan})`` adds two controllers to switch between,
     and ``lw.view(env, episodes=[trajectory, "episode-000.npz"])`` adds episodes to play back. Without a
-    controller, all actions are 0. The panel and its keys choose the mode, the world, the speed, ghosts and the camera.
+    controller, all actions are 0. With the panel and its keys, the user chooses the mode, the world, the speed, ghosts
+    and the camera.
 
     The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
     controller of one world acts in a copy of the displayed world. The copy runs in real time, as in

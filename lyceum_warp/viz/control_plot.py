@@ -14,8 +14,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
     """Draw episodes of a controller as PNG.
 
     The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
-    ages of the applied actions against the wall clock, and a histogram of the planning times. Dashed lines show the
-    deadline.
+    ages of actions against wall time, and a histogram of the planning times. Dashed lines show the deadline.
 
     Args:
         episodes: Episodes of the same task, at least one. The first one's control period is the deadline.

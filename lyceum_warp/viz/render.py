@@ -3,7 +3,7 @@
 ``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
 ``size``, ``fps``, ``camera`` and ``background``, a ``Shot`` for each picture, and None. EOF without None means that the
 parent process has died. The folder holds the model, ``model.mjb``. The program writes ``video.mp4``, or each picture
-into ``picture.raw`` if ``fps`` is None. It prints "ready" once it can draw, and "frame" after each picture.
+into ``picture.raw`` if ``fps`` is None. The program prints "ready" once it can draw, and "frame" after each picture.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
 therefore starts a process for each library that it tries. Exit code 3 means that the machine cannot draw with this

@@ -10,7 +10,7 @@ LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
 
 def new_figure(purpose: str, width: float, height: float) -> Any:
-    """Make a figure without pyplot. It needs no display, and shares no state with the user's figures."""
+    """Make a figure without pyplot. The figure needs no display, and shares no state with the user's figures."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -30,7 +30,7 @@ def finish_axes(all_axes: Iterable[Any]) -> None:
 
 
 def save_png(figure: Any, out: str | Path) -> Path:
-    """Write a figure to a PNG file, create its folder, and return the path."""
+    """Write a figure to a PNG file in a new or existing folder, and return the path."""
     path = Path(out)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, format="png")

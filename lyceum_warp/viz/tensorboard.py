@@ -44,7 +44,7 @@ class TensorBoard:
     and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/,
     episode/, mean_policy/, policy/, value/, time/ and metrics/.
 
-    Existing curves in the folder are continued. Their values from the first new iteration on are replaced.
+    Existing curves in the folder are continued. Old values from the first new iteration on are replaced.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:
@@ -52,7 +52,7 @@ class TensorBoard:
         ...         board(it)
 
     Args:
-        folder: The folder, which need not exist. Pass it, or one above it, to ``tensorboard --logdir``.
+        folder: The folder, which need not exist. Pass this folder, or a parent folder, to ``tensorboard --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
             time limit in seconds. Episode_Termination/NAME is the mean number of episodes per step, over all worlds,
             that the function NAME ends.
@@ -100,7 +100,7 @@ class TensorBoard:
         self._file.flush()
 
     def _open(self, step: int) -> None:
-        """Open a file without torch's and TensorBoard's writers. Their thread would hide the error of a full disk."""
+        """Open a file without torch's writer, whose thread would hide the error of a full disk."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
         from torch.utils.tensorboard import RecordWriter
 
@@ -132,7 +132,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
-    """Compute the samples per second without the time of evaluations."""
+    """Compute the samples per second, excluding the time of evaluations."""
     times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
     seconds = sum(filter(None, times.values()))
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}

@@ -112,7 +112,7 @@ class Recorder:
         self.added = 0
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
-        """The number of frames whose own shot was dropped."""
+        """The number of frames that show an earlier shot, because their own shot was dropped."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()

@@ -35,7 +35,7 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
-"""The longest delay that the worlds catch up, in seconds. They ignore longer delays."""
+"""The longest delay that the worlds catch up, in seconds."""
 _IDLE = 0.5
 """Seconds between two frames of a paused view without commands."""
 _CHECK = 0.5
@@ -161,13 +161,13 @@ class Session:
             raise ControllerError(control.name, error) from error
         finally:
             self._in_run = False
-            control.new_run()  # calls from this control loop now fail
+            control.new_run()  # further calls from this control loop fail
         self._next_step = time.perf_counter()
 
     def _stepped(self, progress: ControlProgress) -> None:
         self.stage.live.stepped()
         self.stage.steps += 1
-        # the plant's waits call `_work`, but a late or fast plant never waits
+        # `_work` runs while the plant waits, but a late or fast plant never waits
         if time.perf_counter() - self._last_work > 1 / _FPS:
             self._work()
 

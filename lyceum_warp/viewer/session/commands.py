@@ -70,7 +70,7 @@ def obey(stage: Stage, command: protocol.Command) -> None:
 
 
 def _set_mode(stage: Stage, command: protocol.SetMode) -> None:
-    """Change the mode, the controller or the episode. A world continues from the state of the last playback."""
+    """Change the mode, the controller or the episode. After a playback, continue the world from its displayed state."""
     mode, controller = command.mode, command.controller
     if command.episode is not None:
         stage.playback.choose(command.episode)

@@ -84,7 +84,7 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state with the forces of the user's push. Controllers see zeros there."""
+        """The part of the state with the forces of the user's push. Controllers see zeros in this part."""
 
     def new_run(self) -> "ControlRun":
         """Return the controller for a new control loop. Calls from earlier control loops then fail."""
@@ -106,7 +106,7 @@ class WorldControl:
         Raises:
             ControllerError: The controller raised an exception, or a newer control loop has begun.
         """
-        with self._busy:  # an interrupted control loop may still be in a call
+        with self._busy:  # a call from an interrupted control loop may still be running
             if run != self._run:
                 raise ControllerError(self.name, RuntimeError("its control loop has ended"))
             if (hidden := self.hidden) is not None:

@@ -1,6 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-On a GPU, only frames wait for the device.
+On a GPU, frames wait for the device, but steps do not.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ _CURVE_ROWS = 512  # maximum number of curve points per frame; further points ov
 class Past:
     """A ring buffer with the states of all worlds before each recent step.
 
-    It stays empty if the memory is too small for two states of all worlds.
+    The buffer stays empty if the memory is too small for two states of all worlds.
     """
 
     def __init__(self, env: Env, limit: int) -> None:
@@ -120,7 +120,7 @@ class Live:
         """Make a step, or redo an undone step.
 
         Args:
-            act: Writes the actions of all worlds into ``env.action``. It is not called to redo a step.
+            act: Writes the actions of all worlds into ``env.action``. Redone steps do not call this function.
         """
         if self.past.ahead:
             self._move(1)

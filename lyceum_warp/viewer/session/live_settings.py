@@ -1,4 +1,4 @@
-"""Read and change numbers while a session runs: a planner's settings and a task's parameters."""
+"""Read and change a planner's settings and a task's parameters while a session runs."""
 
 import dataclasses
 from typing import Any

@@ -1,4 +1,4 @@
-"""Make the plant, a copy of the displayed world, and the clock of its control loop."""
+"""Copy the displayed world to make the plant, and make the clock of its control loop."""
 
 import threading
 import time
@@ -13,11 +13,11 @@ POLL = 0.005
 """Seconds between two polls of the window's commands."""
 
 _RESERVE = 0.0015  # no other work may start in this time before a step, in seconds
-_WARM_UP = 3  # the first calls may capture CUDA graphs, so no other work runs during them
+_WARM_UP = 3  # number of first calls during which no other work runs, because they may capture CUDA graphs
 
 
 class InterruptedByCommand(BaseException):
-    """Stops the plant because a command of the user needs its state."""
+    """Raised to stop the plant, because a command needs its state."""
 
 
 def make_plant(main: Live) -> Live:

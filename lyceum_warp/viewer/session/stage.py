@@ -214,7 +214,7 @@ class Stage:
             self.reset_controller()
 
     def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
-        """Set the displayed world's state, and continue its episode from there, even if it had ended."""
+        """Set the displayed world's state, and continue its episode from there, even if the episode had ended."""
         state = state.clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)

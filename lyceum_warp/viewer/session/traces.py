@@ -28,8 +28,8 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, in
     """Choose the point of a robot whose path is drawn. Return its field in MjData, such as "site_xpos", and its index.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
-    for an arm is on the last body in the longest chain of actuated bodies. It is the body's first site, or else its
-    centre of mass.
+    for an arm is the first site of the last body in the longest chain of actuated bodies. If this body has no site, the
+    default is its centre of mass.
     """
     if name is not None:
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):

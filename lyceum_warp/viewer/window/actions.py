@@ -18,7 +18,7 @@ MANY_STEPS = 50
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
 KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Names of keys in studio, by the panel's names."""
+"""Maps the panel's names of keys to ImGui's names."""
 
 
 class Actions:

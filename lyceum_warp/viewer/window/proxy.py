@@ -1,6 +1,6 @@
 """Serve studio's page through a reverse proxy with access control.
 
-Studio's own server has no password. It listens on a private socket (``sockets.py``), which refuses other
+Studio's own server has no password. This server listens on a private socket (``sockets.py``), which refuses other
 processes. The proxy forwards a request only if
 
 - the ``Host`` header is an address or a name of this machine (against DNS rebinding);
@@ -112,8 +112,8 @@ SCRIPT = """<script>
 </script>"""
 """The script that the proxy inserts into studio's page.
 
-It prefixes requested addresses with the secret path. It gives control to the visible tab, shows links to new files, and
-keeps the theme and the title.
+The script prefixes requested addresses with the secret path. It also gives control to the visible tab, shows links to
+new files, and keeps the theme and the title.
 """
 
 _PATH = re.compile(r"(/[A-Za-z0-9_~!$&'()*+,;=:@\[\]-][A-Za-z0-9._~!$&'()*+,;=:@\[\]-]*)+|/")
@@ -188,7 +188,7 @@ class Proxy:
 
         Args:
             upstream: The host and the port of studio's server.
-            on_quiet: Called in the proxy's thread after the page in control was closed or hidden.
+            on_quiet: Called in the proxy's thread after the page that had control was closed or hidden.
         """
         self._upstream, self._on_quiet = "http://{}:{}".format(*upstream), on_quiet
         ready = threading.Event()
@@ -265,7 +265,7 @@ class Proxy:
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # allow links from any page, and frames in pages of this host name; both still need the token
+        # allow links from any page, and frames in pages of this host name, because both need the token
         site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
         linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
         if foreign or (_is_cross_site(request) and not linked):
@@ -310,7 +310,7 @@ class Proxy:
         return f"/{below}{question}{query}"
 
     async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Forward the type, length, caching and body of studio's response, or send a file for download."""
+        """Forward the body and a few headers of studio's response, or send a file for download."""
         if target.startswith("/saved/"):
             if (file := self._files.get(target.removeprefix("/saved/"))) is None or not os.path.isfile(file):
                 raise web.HTTPNotFound(text="no such file\n")

@@ -36,11 +36,11 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # room for two more worlds: the displayed one, and the ghost that exceeds the limit
+        # room for the displayed world, and for one ghost above the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(self, frame: Frame, groups: np.ndarray) -> list[mujoco.MjvGeom]:
-        """Make the geoms of a frame. They are valid until the next frame.
+        """Make the geoms of a frame. The geoms are valid until the next frame.
 
         Args:
             frame: The frame.

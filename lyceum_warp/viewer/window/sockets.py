@@ -20,7 +20,7 @@ class _PrivateSocket(socket.socket):
         connection, address = super().accept()
         if not _is_own(connection):
             connection.close()
-            raise ConnectionAbortedError("another process tried to connect")  # a type of error that event loops ignore
+            raise ConnectionAbortedError("another process tried to connect")  # event loops ignore this type of error
         return connection, address
 
 

@@ -1,6 +1,6 @@
 """Wrap mujoco.studio in one module, because its interface may still change.
 
-Studio draws a scene and a panel in a browser, and handles keys and the mouse. Its own stepping, history and model
+Studio draws a scene and a panel in a browser, and handles keys and the mouse. Studio's stepping, history and model
 loading are not used, because the simulation is in another process.
 """
 
@@ -25,7 +25,7 @@ MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
 """Maximum number of geoms that a browser draws in addition to the model's."""
 
 Plugin: Any = plugin.ViewerPlugin
-"""The base class of plugins. After ``Started``, ``self.viewer`` is the viewer."""
+"""The base class of plugins. A plugin can use ``self.viewer`` after the event ``Started``."""
 
 handler: Any = messages.handler
 """Decorator for a plugin's method that handles messages. The method's annotation gives the type of the messages."""
