@@ -82,8 +82,8 @@ class Plan:
     come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds.
 
     With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
-    chooses the largest number of samples that meets the deadline. If no number meets it, the command tries a shorter
-    horizon, and then other physics that the task defines. Values that you give are never changed.
+    chooses the largest number of samples that meets the deadline. If no number meets the deadline, the command tries a
+    shorter horizon, and then other physics that the task defines. Values that you give are never changed.
 
     The command writes config.json, report.json and plan.png into a folder. It also writes video.mp4 of the first
     episode, and a numpy file such as episode-000.npz for each episode. After Ctrl-C, the interrupted episode is saved,

@@ -62,7 +62,7 @@ class Hyperparameters(
     options=[config for _, config in ALGORITHMS.values()],
     default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
 ):
-    """Hyperparameters. For each flag, the help lists the algorithms that have it, with their defaults."""
+    """Hyperparameters. For each flag, the help lists the algorithms that have the flag, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""

@@ -39,7 +39,7 @@ class Scene:
     controllers: tuple[str, ...]
     episodes: tuple[str, ...]
     curves: tuple[str, ...]
-    """"reward", "eval" and the task's metrics."""
+    """The names of the curves: "reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
     """The largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s) that the user can command."""
 
@@ -49,7 +49,7 @@ class Ghost:
     """An additional state to draw, for example of another world."""
 
     state: np.ndarray
-    """As in ``Frame``."""
+    """The state, in the format of ``Frame.state``."""
     colour: tuple[float, float, float, float] | None
     """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
@@ -92,16 +92,16 @@ class Status:
     world: int
     step: int
     steps: int
-    """The length of the episode in playback, or the task's horizon."""
+    """The number of steps of the playback's episode, or the task's horizon."""
     time: float
     """Simulated seconds since the start of the episode."""
     paused: bool
     speed: float
     """Simulated seconds per second."""
     measured_speed: float
-    """NaN while paused."""
+    """The measured simulated seconds per second, or NaN while paused."""
     plan_ms: float
-    """The duration of the controller's last call in milliseconds. NaN before the first call."""
+    """The duration of the controller's last call, in milliseconds, or NaN before the first call."""
     backwards: bool
     video: str | None
     ghosts: SetGhosts = SetGhosts()
@@ -114,7 +114,7 @@ class Status:
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
-    """Additional lines of the panel, as names and values."""
+    """Additional lines of the panel. Each is a name with a value."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,8 +132,8 @@ class Frame:
     best: int | None = None
     arrows: tuple[Arrow, ...] = ()
     samples: np.ndarray | None = None
-    """(points, 2 + curves): the simulated time in seconds, whether an episode ended (0 or 1), and a value for each
-    curve."""
+    """The points of all curves, (points, 2 + curves): the simulated time in seconds, whether an episode ended (0 or 1),
+    and a value for each curve."""
     messages: tuple[str, ...] = ()
     """Messages about ended episodes, faults and refused commands."""
     files: tuple[str, ...] = ()
@@ -225,11 +225,11 @@ class Perturb:
     forces: np.ndarray
     """Forces (N) and torques (Nm) in world coordinates, (nbody, 6) float64."""
     qpos: np.ndarray | None = None
-    """(nq,) float64. Positions change only while the session is paused."""
+    """New positions, (nq,) float64, which are ignored unless the session is paused."""
     mocap_pos: np.ndarray | None = None
-    """(nmocap, 3) float64, in metres."""
+    """New positions of mocap bodies, (nmocap, 3) float64, in metres."""
     mocap_quat: np.ndarray | None = None
-    """(nmocap, 4) float64: w, x, y, z."""
+    """New orientations of mocap bodies, (nmocap, 4) float64: w, x, y, z."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from lyceum_warp.viz.video import Progress, write_video
 log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
-"""A progress callback, called with (description, unit, units done so far, units in total)."""
+"""A progress callback, called with a description, a unit, the units done so far, and the total number of units."""
 
 
 def policy_video(

@@ -54,7 +54,7 @@ def write_video(
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
         progress: A function that is called after each frame with the number of frames so far and the total number. The
-            default prints to stderr: a progress bar on a terminal, otherwise lines.
+            default prints a progress bar to stderr, or lines if stderr is not a terminal.
 
     Raises:
         ValueError: The states do not have the environment's shape, the model has no such camera, the size is odd, or
@@ -116,7 +116,7 @@ class Recorder:
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
-        self._changed = threading.Condition()  # its lock also guards the queue
+        self._changed = threading.Condition()  # the lock of _changed also guards the queue
         self._ended = self._cancelled = False
         self._error: NoVideoError | OSError | None = None
         # Thread.join of Python 3.11 would mark the thread as stopped if a signal interrupts the call

@@ -33,13 +33,13 @@ class PlanView:
     """A copy of a plan and of some of its samples on the CPU."""
 
     state: torch.Tensor
-    """(state_space.size,) float64."""
+    """The initial state of the plan, (state_space.size,) float64."""
     actions: torch.Tensor
-    """(horizon, nact)."""
+    """The actions of the plan, (horizon, nact)."""
     samples: torch.Tensor
-    """(horizon, samples, nact)."""
+    """The actions of the samples, (horizon, samples, nact)."""
     best: int | None
-    """The sample with the largest return."""
+    """The index of the sample with the largest return."""
 
 
 class PolicyControl:

@@ -20,7 +20,7 @@ _COLOURS = (
     (0.30, 0.80, 0.80),
 )  # fmt: skip
 _PAST, _FUTURE, _PLAN = (0.90, 0.25, 0.20), (0.25, 0.40, 0.95), (0.25, 0.90, 0.45)
-_OPACITY, _FADE = 0.35, 0.95  # _FADE: ratio of the opacities of successive states
+_OPACITY, _FADE = 0.35, 0.95  # _FADE is the ratio of opacities of successive ghosts
 
 
 class FrameMaker:

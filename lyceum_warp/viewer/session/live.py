@@ -78,7 +78,7 @@ class Rows:
     fault: tuple[float, ...] | None
     """The last fault since the previous frame: bits of ``Done``, the world, and the number of faults so far."""
     points: np.ndarray
-    """(points, 2 + curves) float64."""
+    """The new points of all curves, (points, 2 + curves) float64."""
 
 
 class Live:

@@ -21,13 +21,13 @@ class Episode:
 
     name: str
     states: np.ndarray
-    """(steps + 1, state_space.size) float64."""
+    """The states, (steps + 1, state_space.size) float64."""
     rewards: np.ndarray
-    """(steps,), NaN if unknown."""
+    """The reward of each step, (steps,), or NaN if unknown."""
     evals: np.ndarray
-    """(steps,), NaN if unknown."""
+    """The evaluation metric after each step, (steps,), or NaN if unknown."""
     end: str = ""
-    """Why the episode ended, or ""."""
+    """The reason why the episode ended, or ""."""
 
     @property
     def steps(self) -> int:

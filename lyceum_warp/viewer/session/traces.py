@@ -74,12 +74,12 @@ class Traces:
     """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """(samples + 1, points, 3), in metres; the plan comes last."""
+    """The paths, (samples + 1, points, 3), in metres. The last path is the plan's."""
     best: int | None
     final: np.ndarray
     """The state at the end of the plan."""
     made: float
-    """Time of the rollout, from ``time.perf_counter``."""
+    """The time of the rollout on the clock ``time.perf_counter``."""
 
 
 class TraceRollouts:

@@ -46,7 +46,7 @@ class Window:
     def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int | None = None) -> None:
         self._pending: Frame | None = None
         self._taken = True
-        self._changed = threading.Condition()  # its lock also guards _pending and _taken
+        self._changed = threading.Condition()  # the lock of _changed also guards _pending and _taken
         self._ended = False
         self._commands: deque[Command] = deque()
         self._threads: list[threading.Thread] = []
@@ -111,7 +111,7 @@ class Window:
     def close(self) -> None:
         """End the window process."""
         self._end()
-        with contextlib.suppress(OSError):  # the shutdown wakes both threads and the window process
+        with contextlib.suppress(OSError):  # this wakes both threads and the window process
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         try:

@@ -382,10 +382,10 @@ class Curves:
 
     def __init__(self, number: int) -> None:
         self.rows = np.empty((0, 2 + number))
-        """(points, 2 + number): the time in seconds, whether an episode ended, and a value per curve."""
+        """The points, (points, 2 + number): the time in seconds, whether an episode ended, and a value per curve."""
 
     def add(self, rows: np.ndarray) -> None:
-        """Append points. If time decreases, for example after steps back, points of later times are dropped."""
+        """Append points. If time decreases, for example after steps back, drop the points of later times."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
                 kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
