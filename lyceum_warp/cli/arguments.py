@@ -125,8 +125,8 @@ class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
     device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. If the run's engine is auto, the policy is evaluated on the
-    CPU, which is faster than a GPU for a few worlds."""
+    """cpu (the default), or a CUDA device such as cuda:0. If the run's engine is auto, the default is the CPU,
+    which is faster than a GPU for a few worlds."""
 
 
 class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):

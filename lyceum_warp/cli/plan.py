@@ -52,7 +52,7 @@ class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
-    In Python, a covariance matrix is possible, too."""
+    The Python API also accepts a covariance matrix."""
     smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None

@@ -123,8 +123,8 @@ class Train:
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Resume the run in the given folder from its exact state and with its settings, up to --iterations."""
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
-    """Start a new run from the policy, the value function and the normaliser of another run. That run's settings are
-    the defaults. However, a different TASK has its own parameters, and a different --algorithm has its own
+    """Start a new run from the policy, the value function and the normaliser of another run. The other run's settings
+    are the defaults. However, a different TASK has its own parameters, and a different --algorithm has its own
     hyperparameters.
     """
     which: str = "last"
@@ -138,8 +138,8 @@ class Train:
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s. Fast
-    saves are made more often, for at most 1 % of the time.
+    """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s. If
+    saving is fast, it happens more often, and takes at most 1 % of the time.
     """
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
@@ -161,9 +161,10 @@ class Train:
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
-    cheap comparisons are made. After training on a GPU, these use the C engine. After training with other physics, they
-    use the task's default physics. --transfer adds each set of physics options that the task defines. After training on
-    CPU cores, it also adds the Warp engine, whose kernels may take minutes to compile.
+    cheap comparisons are made. After training on a GPU, the comparison uses the C engine. After training with other
+    physics, the comparison uses the task's default physics. --transfer adds each set of physics options that the task
+    defines. After training on CPU cores, --transfer also adds the Warp engine, whose kernels may take minutes to
+    compile.
     """
     trust: Trust = False
     take_over: bool = False

@@ -30,7 +30,7 @@ _RUN_WORLDS = 16
 class Place(
     OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
 ):
-    """Engine and device of the displayed worlds. With --mppi, they apply to the planner's worlds instead."""
+    """Engine and device of the displayed worlds. With --mppi, the planner's worlds use them instead."""
 
     engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
     """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""

@@ -95,5 +95,5 @@ class PlanningController(Controller, Protocol):
 
     @property
     def env(self) -> Env:
-        """Environment that simulates the plans. The plant must not be used here, because planning changes the state."""
+        """Environment that simulates the plans. Do not use the plant here, because planning changes the state."""
         ...

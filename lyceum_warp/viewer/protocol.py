@@ -75,7 +75,7 @@ class SetGhosts:
     grid: bool = False
     """Whether to draw the other worlds side by side."""
     episodes: int = 0
-    """The number of other episodes to draw. Each is drawn at the displayed step."""
+    """The number of other episodes to draw. Other episodes are drawn at the displayed step."""
     burst: int = 0
     """The number of past (red) and future (blue) states to draw along the trajectory."""
     plan: bool = True

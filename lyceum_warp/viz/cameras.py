@@ -36,7 +36,7 @@ CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
 """A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for a video's default.
 
 The default is the model's first tracking camera. A model without a tracking camera gets its first camera that is fixed
-to the world. A model without either gets a camera that follows the first body.
+to the world. If no camera is fixed to the world, a new camera follows the first body.
 """
 
 FREE = "free"

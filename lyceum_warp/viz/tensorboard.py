@@ -44,7 +44,7 @@ class TensorBoard:
     and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/,
     episode/, mean_policy/, policy/, value/, time/ and metrics/.
 
-    Existing curves in the folder are continued. Old values from the first new iteration on are replaced.
+    Existing curves in the folder are continued. Values from the first new iteration on are overwritten.
 
     Example:
         >>> with TensorBoard("runs/mine") as board:

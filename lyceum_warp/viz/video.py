@@ -49,8 +49,8 @@ def write_video(
         out: The file. An existing file is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
             MuJoCo's default free camera. The default is the model's first tracking camera. A model without a tracking
-            camera gets its first camera that is fixed to the world. A model without either gets a camera that follows
-            the first body.
+            camera gets its first camera that is fixed to the world. If no camera is fixed to the world, a new camera
+            follows the first body.
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
         progress: A function that is called after each frame with the number of frames so far and the total number. The

@@ -1,4 +1,4 @@
-"""Copy the displayed world to make the plant, and make the clock of its control loop."""
+"""Make the plant as a copy of the displayed world, and make the clock of the control loop."""
 
 import threading
 import time
@@ -12,7 +12,7 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """Seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # no other work may start in this time before a step, in seconds
+_RESERVE = 0.0015  # minimum time between the start of other work and a step, in seconds
 _WARM_UP = 3  # number of first calls during which no other work runs, because they may capture CUDA graphs
 
 

@@ -100,7 +100,7 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
             line = mujoco.MjvGeom()
             kind, rgba = mujoco.mjtGeom.mjGEOM_LINE, np.array(colour, dtype=np.float32)
             mujoco.mjv_initGeom(line, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
-            line.emission = 1.0  # lines glow, to be visible without light
+            line.emission = 1.0  # make the lines visible without light
             mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
     return lines
