@@ -1,4 +1,7 @@
-"""Define tasks for planner tests. Their reward is the action times a fair coin (-1 or 1)."""
+"""Define tasks for planner tests.
+
+The reward of a step is its action times 1 or -1, as a fair coin decides.
+"""
 
 import warp as wp
 from rail_task import rail
@@ -49,7 +52,7 @@ def copied(s: Coin, action: Row[float], p: CoinParams, ctrl: Row[float]):
 
 
 class TossedAfter(lw.Task):
-    """Tosses the coin after the action, so all actions are equally good."""
+    """Toss the coin after the action, so that all actions are equally good."""
 
     model = staticmethod(lambda: rail(limits='ctrllimited="true" ctrlrange="-1 1"'))
     obs = {"coin": 1}

@@ -8,7 +8,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
 def perturbed(module: nn.Module) -> nn.Module:
-    """Perturb the weights: otherwise some derivatives are zero."""
+    """Add random numbers to the weights, because initial weights give some derivatives of zero."""
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -25,7 +25,7 @@ def policy_of(activation: str, hidden: tuple[int, ...] = (8, 6), **options: obje
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6), (3, 16, 4)])
-def test_hand_written_derivatives_equal_autograd(activation: str, hidden: tuple[int, ...]) -> None:
+def test_hand_written_derivatives_equal_those_of_autograd(activation: str, hidden: tuple[int, ...]) -> None:
     policy = policy_of(activation, hidden)
     dense = DensePolicy.of(policy)
     assert dense is not None
@@ -63,7 +63,7 @@ def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
     value = perturbed(lw.ValueFunction(5, (7, 3), time_orders=2, normalize=True))
     value.observe(obs)
     steps, obs = torch.arange(12.0).view(4, 3), torch.randn(4, 3, 5, generator=generator)
-    # the returns are about 200, and float32 rounds them
+    # returns of about 200 have large rounding errors in float32
     torch.testing.assert_close(DenseValue.of(value)(obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
 
 

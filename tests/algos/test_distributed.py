@@ -68,20 +68,17 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
         for name, tensor in wanted[part].items():
             torch.testing.assert_close(state[part][name], tensor, **close)
     torch.testing.assert_close(state["returns"], wanted["returns"], **close, equal_nan=True)
-    if tolerance < 1e-3:  # rounding may let a foot touch the ground a step earlier
+    if tolerance < 1e-3:  # rounding errors may change the step at which a foot touches the ground
         torch.testing.assert_close(state["env"], wanted["env"], **close)
 
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""These settings cover unfinished episodes, normalisation, an adaptive learning rate and an evaluation.
-
-The number of samples is not a multiple of the number of mini-batches.
-"""
+"""Settings with unfinished episodes, normalisation, an adaptive learning rate and an evaluation."""
 SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
        "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
        "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""These settings cover a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
+"""Settings with a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
 
 
 @pytest.mark.quick("npg")
@@ -94,7 +91,6 @@ SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates",
 def test_two_processes_make_the_same_update_as_one_process(
     settings: list[str], tolerance: float, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """This process is rank 0 on the first of two machines. A single process then continues both runs."""
     two, one = tmp_path / "two", tmp_path / "one"
     arguments = ["train", "hopper", *settings, *QUIET, "--iterations", "1", "--out"]
     with pytest.MonkeyPatch.context() as patched:
@@ -119,8 +115,7 @@ def test_two_processes_make_the_same_update_as_one_process(
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 @pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
-def test_gpu_two_processes_make_the_same_update_as_one_process(algorithm: str, tmp_path: Path) -> None:
-    """The graphs of the value fit and of PPO's epochs contain NCCL calls."""
+def test_two_gpu_processes_make_the_same_update_as_one_process(algorithm: str, tmp_path: Path) -> None:
     two, one = tmp_path / "two", tmp_path / "one"
     options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]
     arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
@@ -132,7 +127,7 @@ def test_gpu_two_processes_make_the_same_update_as_one_process(algorithm: str, t
 
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_gpu_two_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
+def test_two_gpu_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
     run = tmp_path / "run"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "100000", "--out", str(run)]
     process = torchrun(*arguments, options=["--standalone", "--nproc-per-node=2"])
@@ -177,8 +172,7 @@ sys.exit(main())
 
 
 @pytest.mark.long
-def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
-    """A signal during training ends all processes after the iteration. A signal before training leaves no files."""
+def test_all_processes_end_if_one_of_them_is_interrupted(tmp_path: Path) -> None:
     program, run = tmp_path / "interrupted.py", tmp_path / "learning"
     program.write_text(INTERRUPTED)
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations", "100000", "--out"]
@@ -197,7 +191,6 @@ def test_processes_end_together_when_one_is_interrupted(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_error_in_one_process_ends_all_processes(tmp_path: Path) -> None:
-    """The error is an existing run folder, which only rank 0 checks. Two processes then resume that run."""
     launch = ["--standalone", "--nproc-per-node=2"]
     run, other = tmp_path / "run", tmp_path / "other"
     arguments = ["train", "hopper", *OPTIONS, *QUIET, "--iterations"]

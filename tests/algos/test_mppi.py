@@ -52,7 +52,6 @@ def reached(seed: int) -> tuple[lw.Env, torch.Tensor]:
 
 
 def falling_hopper(plant: lw.Env) -> torch.Tensor:
-    """The step at which the hopper falls depends on its actions."""
     plant.reset()
     state, parts = plant.get_state(), plant.state_space.parts
     state[:, parts["qpos"].start + 2], state[:, parts["qvel"].start + 2] = 0.15, 3.0
@@ -89,7 +88,6 @@ CASES: dict[str, dict[str, Any]] = {
     "cubic_cem": POINT | dict(update="cem", noise=0.4, knots=3, elites=4, min_noise=0.05, fill="repeat"),
 }
 ON_WARP = ("reach", "stop", "value", "covariance", "model", "cem_smoothed", "linear", "cubic_cem")
-"""These cases run each kernel once on the Warp engine."""
 
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES), "cubic_cem-warp")
@@ -103,7 +101,6 @@ def check_against(engine: str, task: str, iterations: int = 1, **settings: Any) 
         settings["model"] = settings["model"]()
     plan = MPPI(task, engine=engine, seed=5, iterations=iterations, **settings)
     plain = Plain(task, engine=engine, count=len(plan.knot_actions), **settings)
-    # random numbers depend on the seed and the number of draws, so a second planner can draw the same noise
     knots = {name: settings[name] for name in ("knots", "spline") if name in settings}
     twin = MPPI(task, seed=5, samples=plan.samples, horizon=plan.horizon, iterations=1, **knots)
     plant = lw.make(task, engine=engine, seed=3, autoreset=False)
@@ -136,7 +133,8 @@ def check_against(engine: str, task: str, iterations: int = 1, **settings: Any) 
         assert summary["mean_return"] == pytest.approx(plain.returns.mean(), rel=1e-4)
         assert summary["effective_samples"] == pytest.approx(1 / (plain.weights**2).sum(), rel=1e-2)
         assert summary["failed_samples"] == 0
-        plain.knots = plan.knot_actions.double().numpy()  # a low temperature would amplify rounding errors
+        # with a low temperature, rounding errors would grow from plan to plan
+        plain.knots = plan.knot_actions.double().numpy()
         if plan.adapted_noise is not None:
             plain.deviation = plan.adapted_noise.double().numpy()
         plant.step(action[None])
@@ -240,7 +238,7 @@ def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
-        # with these motors, only small actions keep MuJoCo's accelerations and Warp's velocities below 1e10
+        # with these motors, large actions cause accelerations (MuJoCo) or velocities (Warp) above 1e10
         settings |= dict(noise=1.0, limit=1e9, model=rail({"mujoco": 1e10, "warp": 2.5e12}[engine]))
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
@@ -335,7 +333,6 @@ def test_plans_shift_by_the_elapsed_steps(fill: Any) -> None:
 @pytest.mark.parametrize("spline", ["zero", "linear", "cubic"])
 @pytest.mark.parametrize("knots", [1, 3, 5, 8, 12])
 def test_shifted_plan_with_knots_keeps_its_actions(knots: int, spline: Any) -> None:
-    """The shift may be smaller than the distance between two knots."""
     plan = MPPI("point_mass", horizon=12, samples=4, knots=knots, spline=spline, fill="repeat", noise=0.3, seed=1)
     plan(plan.state_of())
     for shift in (0, 1, 1, 1, 2, 7, 1):
@@ -375,8 +372,8 @@ def test_equal_value_functions_in_torch_and_warp_give_equal_plans(engine: str) -
 def test_value_function_receives_the_step_at_the_end_of_the_plan(engine: str) -> None:
     value = lw.ValueFunction(6, (16,), scale=50.0, time_orders=2, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        torch.nn.init.xavier_uniform_(value.network[-1].weight)  # a new value function predicts 0
-        value.network[0].weight[:, 6:] *= 300  # large weights, so that ten steps change the value
+        torch.nn.init.xavier_uniform_(value.network[-1].weight)  # the initial weights are zero
+        value.network[0].weight[:, 6:] *= 300  # make the value change within ten steps
     settings = POINT | dict(engine=engine, noise=0.5)
     plan = MPPI(value=value, **settings)
 
@@ -425,7 +422,10 @@ def test_plans_with_and_without_graphs_are_equal(words: dict[str, Any], engine: 
 
 
 def drive(task: str, steps: int, seed: int, **settings: Any) -> tuple[lw.Env, np.ndarray, np.ndarray]:
-    """Control a plant until its episode ends or succeeds; return it with its rewards and evaluations."""
+    """Control a plant until its episode ends or succeeds.
+
+    Return the plant, its rewards and its evaluations.
+    """
     plan = MPPI(task, seed=seed, **settings)
     plant = lw.make(task, autoreset=False, seed=seed)
     rewards, evals = [], []
@@ -453,17 +453,13 @@ def test_cartpole_swings_up_and_stays_up() -> None:
 
 @pytest.mark.long
 def test_hopper_hops_without_falling() -> None:
-    """With other tasks' planner settings, the robot falls after about 100 steps."""
     plant, rewards, evals = drive("hopper", 130, 1)
     assert len(evals) == 130 and not plant.terminated.item()
     assert evals[-1] > 0.1 and rewards.sum() > 140, (evals[-1], rewards.sum())
 
 
 def test_planner_cannot_exploit_noise_drawn_after_the_action() -> None:
-    """A reward is the product of action and coin.
-
-    If they are independent, the variance of the return is the sum of the squared actions.
-    """
+    """If actions do not depend on the coin, the variance of the return is the sum of the squared actions."""
     plan = MPPI(TossedAfter, engine="mujoco", horizon=4, noise=2.0, smoothing=(1, 0, 0))
     plant, runs = lw.make(TossedAfter, autoreset=False), 8
     total = squares = 0.0
@@ -494,7 +490,7 @@ def test_random_events_differ_between_samples_and_iterations(task: type[lw.Task]
     plan = MPPI(task, engine=engine, horizon=3, samples=200, iterations=2, seed=4, value=value)
     state = plan.state_of()
     plan(state), plan(state)
-    found = torch.stack(coins[-4:]).double()  # an earlier call checked the value function
+    found = torch.stack(coins[-4:]).double()
     assert set(found.unique().tolist()) == {-1.0, 1.0}
     assert found.mean(1).abs().max() < 4 / 200**0.5
     correlation = np.corrcoef(found.numpy()) - np.eye(4)

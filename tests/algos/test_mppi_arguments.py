@@ -148,7 +148,6 @@ def test_invalid_planner_arguments_raise_a_one_line_error(words: dict[str, Any],
 
 
 def test_planning_params_are_ignored_if_there_is_a_value_function() -> None:
-    """The value function was fitted to rewards without ``planning.params``."""
     plan = MPPI("hopper", horizon=2, samples=2, value=lambda obs: obs[:, 0])
     assert plan.env.task.params["healthy_reward"] == 1.0 and plan.env.task.params["forward_reward_weight"] == 1.0
     assert plan.env.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and plan.settings["noise"] == 0.1
@@ -186,7 +185,7 @@ def test_omitted_settings_get_the_defaults_of_the_update() -> None:
         return config.include_plan, config.elites, config.min_noise
 
     assert chosen() == chosen(update="mppi") == chosen(update="predictive_sampling") == (True, None, None)
-    assert chosen(samples=1)[0] is False  # a single sample would be the plan itself
+    assert chosen(samples=1)[0] is False
     assert chosen(update="cem", samples=50) == (False, 5, (0.05,) * 7)
     assert [chosen(update="cem", samples=n)[1] for n in (1, 2, 19, 40)] == [1, 2, 2, 4]
 
@@ -207,7 +206,7 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
         ("reach", dict(samples=79), ("mujoco", "cpu")),
         ("reach", dict(samples=20, models=4), ("warp", "cuda:0")),
         ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
-        # on a GPU, the noslip solver makes the hand slow
+        # the noslip solver is slow on a GPU
         ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
         ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
     ],

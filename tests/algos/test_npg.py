@@ -36,7 +36,7 @@ def test_policy_step_has_a_kl_divergence_of_half_delta(env: lw.Env) -> None:
 @pytest.mark.parametrize("rollout", ["episodes", "segments"])
 def test_run_is_reproducible_and_resumes_bit_for_bit(env: lw.Env, rollout: str) -> None:
     config = dataclasses.replace(SMALL, rollout=rollout, time_orders=2, normalize=True)
-    if rollout == "segments":  # iterations are shorter than an episode, and worlds restart between them
+    if rollout == "segments":
         config = dataclasses.replace(config, samples=16 * 5, min_restarts=1.5)
 
     def numbers(it: NPGIteration) -> dict[str, object]:
@@ -76,7 +76,7 @@ def learned(env: lw.Env, iterations: int, change: Callable[[torch.Tensor, int], 
 
 def test_learning_does_not_depend_on_the_scale_of_rewards(env: lw.Env) -> None:
     plain = learned(env, 5, lambda *_: None)
-    for exponent in (-14, 14):  # a power of two does not change the rounding
+    for exponent in (-14, 14):  # multiplying by a power of two causes no rounding errors
         scaled = learned(env, 5, lambda reward, _, by=2.0**exponent: reward.mul_(by))  # type: ignore[misc]
         for name in ("return_mean", "explained_variance", "kl", "step_norm"):
             values = [getattr(it, name) for it in scaled]
@@ -114,7 +114,6 @@ def test_a_step_that_exceeds_the_kl_limit_is_shortened(env: lw.Env) -> None:
 
 
 def test_kl_limit_includes_the_change_of_observation_statistics() -> None:
-    """Observations jump in iteration 4. The KL divergence between sampling policies stays below its limit."""
     env = lw.make("hopper", nworld=16, seed=1, nthread=1)
     config = lw.NPGConfig(samples=1600, hidden=(16,), value_hidden=(16,), mean_every=0, log_std=-2.0)
     npg = lw.NPG(env, config=config, seed=0)
@@ -141,7 +140,6 @@ def test_kl_limit_includes_the_change_of_observation_statistics() -> None:
 
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_value_function_follows_a_change_in_the_scale_of_returns(factor: float) -> None:
-    """After the change, all returns lie outside the old range."""
     value = lw.ValueFunction(3)
     returns = 50.0 + 10.0 * torch.randn(1000, generator=torch.Generator().manual_seed(0))
     value.rescale(returns, first=True)
@@ -167,7 +165,7 @@ def test_value_function_uses_the_observation_group_critic_if_it_exists() -> None
 def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     env.rand_reset(0)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=16 * 5, mean_every=0))
-    assert npg.segments  # NPG selects segments, because 5 steps are shorter than an episode of 12
+    assert npg.segments
     lengths, steps = [], []
     for _ in range(6):
         lengths.append(next(npg).length_mean)
@@ -175,14 +173,13 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
     joined = torch.cat(steps)
     assert torch.equal(joined, (joined[0] + torch.arange(30.0)[:, None]) % 12)
     assert len(joined[0].unique()) > 5
-    # an episode does not count if its first steps were not sampled
+    # episodes count only if their first steps were sampled
     assert math.isnan(lengths[0])
     assert lengths[-1] == 12.0
 
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
 def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
-    """With evenly spread time limits, 40 * 5 / 128 = 1.6 worlds would begin an episode in 5 steps."""
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)
@@ -197,7 +194,6 @@ def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, 
 
 
 def test_point_mass_learns_to_reach_the_target() -> None:
-    """A short run with the paper's settings for this task."""
     env = lw.make("point_mass", nworld=16)
     config = lw.NPGConfig(
         samples=16 * 256, gamma=0.97, lam=0.95, delta=0.02, hidden=(16, 16), value_hidden=(32, 32), mean_every=0
@@ -326,7 +322,7 @@ def test_value_function_is_restored_after_a_non_finite_update(task_file: TaskFil
 
 
 def on_gpu(**changes: object) -> lw.NPG:
-    """Run 2 iterations of NPG on Hopper on a GPU, so that everything is compiled and captured."""
+    """Run two iterations of NPG on Hopper on a GPU, to compile all kernels and capture all graphs."""
     env = lw.make("hopper", nworld=64, device="cuda")
     config = lw.NPGConfig(samples=64 * 16, rollout="segments", mean_every=0, value_batch=100, **changes)
     npg = lw.NPG(env, config=config, seed=1)
@@ -337,7 +333,6 @@ def on_gpu(**changes: object) -> lw.NPG:
 
 @pytest.mark.gpu
 def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All synchronizing calls except one raise an error."""
     npg = on_gpu(normalize=True, min_restarts=2.0)
     copies = []
 
@@ -359,7 +354,6 @@ def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.gpu
 def test_gpu_learner_continues_after_loading_a_state() -> None:
-    """The graph of the value fit contains addresses of Adam's moments, so it is captured again after loading."""
     npg = on_gpu()
     saved = npg.state_dict()
     first = next(npg)
@@ -371,13 +365,12 @@ def test_gpu_learner_continues_after_loading_a_state() -> None:
 
 
 def test_optimized_iterations_equal_iterations_with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The plain version uses autograd, all rounds of the line search, and a value fit after the policy's step."""
     threads, learned = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
         for plain in (False, True):
             env = lw.make("hopper", nworld=8, seed=0, nthread=1)
-            # a KL limit of 1 shortens many steps
+            # with a KL limit of 1, the line search shortens many steps
             npg = lw.NPG(env, config=lw.NPGConfig(samples=800, mean_every=0, kl_limit=1.0), seed=0)
             if plain:
                 monkeypatch.setattr(DensePolicy, "of", lambda *args: None)

@@ -39,6 +39,6 @@ def test_lists_and_numbers_of_other_types_are_converted() -> None:
     assert (type(config.samples), type(config.gamma)) == (int, float)
 
 
-def test_default_number_of_samples_is_that_of_the_paper_or_16_steps() -> None:
+def test_samples_default_to_the_larger_of_10000_and_16_steps_per_world() -> None:
     assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
     assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5

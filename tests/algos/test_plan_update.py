@@ -12,7 +12,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """Takes the mean of the best samples, and does not change the noise."""
+    """Plan the mean of the best samples, and leave the noise unchanged."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -23,7 +23,7 @@ class EliteMean(lw.PlanUpdate):
 
 
 class TorchCEM(EliteMean):
-    """CEM written in torch from its formulas."""
+    """Implement CEM in torch."""
 
     adapts_noise = True
 
@@ -42,7 +42,7 @@ class TorchCEM(EliteMean):
 
 
 class HalfWay(EliteMean):
-    """Moves the plan halfway to the mean of the best samples."""
+    """Move the plan halfway to the mean of the best samples."""
 
     def fit(self, samples: lw.PlanSamples) -> None:
         samples.plan.lerp_(samples.nominal, 0.5)
@@ -56,7 +56,7 @@ def weigh_first(returns: wp.array2d[float], weights: wp.array2d[float], summary:
 
 
 class First(lw.PlanUpdate):
-    """Chooses the first sample in a Warp kernel."""
+    """Choose the first sample in a Warp kernel."""
 
     capturable = True
 
@@ -95,7 +95,7 @@ def test_cem_written_in_torch_gives_the_same_plans_as_the_class_cem(more: dict[s
 
 
 @pytest.mark.parametrize("knots", [None, 3])
-def test_plan_update_may_change_the_plan_in_its_method_fit(knots: int | None) -> None:
+def test_method_fit_of_an_update_may_change_the_plan(knots: int | None) -> None:
     half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
     state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
     torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan starts from zero actions
@@ -118,7 +118,7 @@ def test_plan_of_a_user_written_update_does_not_change_if_all_samples_fail() -> 
     assert (plan.actions == 0.25).all() and plan.summary["failed_samples"] == 12
 
 
-def test_planners_with_one_update_object_do_not_share_buffers() -> None:
+def test_planners_with_the_same_update_object_do_not_share_buffers() -> None:
     update = CrossEntropy(3, 0.05, (1.0, 0.0, 0.0))
     compare(*(lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2)))
     assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
@@ -131,7 +131,7 @@ def test_planner_settings_contain_the_attributes_of_a_user_written_update() -> N
 
 
 class Returning(EliteMean):
-    """Returns the weights instead of writing them."""
+    """Return the weights instead of writing them."""
 
     def weigh(self, samples: lw.PlanSamples) -> Any:
         return torch.softmax(samples.returns, 1)

@@ -41,7 +41,7 @@ class Unused(Net):
 
 
 class Counting(Net):
-    """Its output depends on the number of previous calls."""
+    """A network whose output depends on the number of previous calls."""
 
     def forward(self, obs: torch.Tensor) -> object:
         self.calls = getattr(self, "calls", 0.0) + 1.0

@@ -33,7 +33,6 @@ def weights(ppo: lw.PPO) -> dict[str, torch.Tensor]:
 
 
 def test_ppo_learns_for_a_fixed_seed() -> None:
-    """The mean policy's return is at most about 250; the first policies' returns are negative."""
     config = lw.PPOConfig(hidden=(32, 32), value_hidden=(32, 32), mean_every=40)
     ppo = lw.PPO(lw.make("point_mass", nworld=32), config=config)
     rows = [next(ppo) for _ in range(40)]
@@ -68,7 +67,6 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 
 
 def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: SharedEnv) -> None:
-    """Every episode has 10 steps. Episodes that start at a random step do not count."""
     ppo = made(shared_env(Metered, nworld=4, horizon=10, far=1e3))
     found: list[float] = []
     for _ in range(3):

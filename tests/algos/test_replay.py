@@ -38,7 +38,6 @@ def filled(env: lw.Env, steps: int, *, capacity: int = 45, bad: int = -1) -> tup
 @pytest.mark.parametrize("n_step", [1, 3, 20])
 @pytest.mark.parametrize("steps", [7, 40])
 def test_n_step_returns_across_episode_ends_equal_a_plain_sum(steps: int, n_step: int, env: lw.Env) -> None:
-    """40 steps overwrite the oldest ones. Episodes end by termination, the time limit and a fault."""
     replay, plain = filled(env, steps, bad=5)
     kept, gamma, ends = plain[-15:], 0.9, set()
     assert len(replay) == 3 * len(kept)

@@ -36,7 +36,7 @@ def test_rollout_buffer_stores_inputs_and_results_of_each_step(graphs: bool) -> 
     torch.testing.assert_close(rollout.episode_metrics["effort"][5], rollout.action.square().sum(-1)[4:].sum(0))
 
 
-def test_first_only_counts_one_episode_per_world() -> None:
+def test_option_first_only_counts_one_episode_per_world() -> None:
     env = lw.make("hopper", nworld=8)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     noise = torch.randn(200, 8, 3, generator=torch.Generator().manual_seed(0))

@@ -17,7 +17,7 @@ NAMES = ("done", "episode_return", "episode_length", "reward", "eval", "success"
 def rollout() -> lw.Rollout:
     env = lw.make(Metered, nworld=6)
     rollout = lw.Rollout(env, 150)
-    rollout.running_return[0] = math.nan  # an episode does not count if its first steps were not sampled
+    rollout.running_return[0] = math.nan  # episodes count only if their first steps were sampled
     generator = torch.Generator().manual_seed(1)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size, log_std=0.0, generator=generator)
     rollout.collect(policy, torch.randn(rollout.action.shape, generator=torch.Generator().manual_seed(0)))
@@ -26,7 +26,7 @@ def rollout() -> lw.Rollout:
 
 
 def statistics(rollout: lw.Rollout, *shares: slice) -> dict[str, Any]:
-    """Gather the statistics of processes with the given shares of a rollout's worlds."""
+    """Gather the statistics of several processes. Each process has a slice of the worlds."""
     rows: list[torch.Tensor] = []
 
     def gather(row: torch.Tensor) -> torch.Tensor:
@@ -44,7 +44,6 @@ def statistics(rollout: lw.Rollout, *shares: slice) -> dict[str, Any]:
 
 
 def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) -> None:
-    """The statistics of a rollout equal the pooled statistics of two subsets of its worlds."""
     ended = rollout.done & ~rollout.episode_return.isnan()
     assert 6 < ended.sum() < rollout.done.sum()
     returns = rollout.episode_return[ended].double()
@@ -68,7 +67,7 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
 
 def test_step_statistics_cover_all_samples(rollout: lw.Rollout) -> None:
     steps = {name: values.mean().item() for name, values in rollout.metrics.items()}
-    for count in (rollout.env.nworld, 1):  # one process for all worlds, and one process per world
+    for count in (rollout.env.nworld, 1):  # a single process, then one process for each world
         found = statistics(rollout, *(slice(k, k + count) for k in range(0, rollout.env.nworld, count)))
         assert found["step_metrics"] == pytest.approx(steps, rel=1e-5)
         assert found["faults"] == 3 and found["reward_mean"] == pytest.approx(rollout.reward.mean().item())

@@ -34,10 +34,6 @@ def numbers(it: SACIteration) -> dict[str, Any]:
 
 
 def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
-    """With random actions, the pole falls after about 5 steps.
-
-    After these updates, it falls after 45 to 75 steps (measured for other seeds).
-    """
     config = lw.SACConfig(
         hidden=(32, 32), value_hidden=(32, 32), num_steps=50, warmup=300, updates=4, batch=128, n_step=3,
         learning_rate=1e-3, temperature=0.1, tau=0.02, gamma=0.97, mean_every=4, mean_episodes=4,
@@ -51,7 +47,7 @@ def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
 
 
 class Plain(torch.nn.Module):
-    """One of the twin critics, in plain torch and float64."""
+    """Compute one of the twin critics in torch and float64."""
 
     def __init__(self, twin: lw.TwinCritic, k: int) -> None:
         super().__init__()
@@ -71,7 +67,7 @@ class Plain(torch.nn.Module):
 
 
 def quantile_huber(quantiles: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Dabney et al., 2018, equation 10, one quantile and one target at a time."""
+    """Compute equation 10 of Dabney et al. (2018) in loops over quantiles and targets."""
     (rows, n), losses = quantiles.shape, []
     for row in range(rows):
         for i in range(n):
@@ -123,14 +119,13 @@ def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: 
             values = torch.cat(both, dim=-1).sort().values[:, :-2]
         value = values - (alpha * log_prob)[:, None]
         target = batch.reward.double()[:, None] + batch.discount.double()[:, None] * value
-    unit = 2.0 * (batch.action.double() + 1.0) / 2.0 - 1.0  # actions of this task are between -1 and 1
+    unit = 2.0 * (batch.action.double() + 1.0) / 2.0 - 1.0  # the bounds of the actions are -1 and 1
     predicted = [critic(batch.obs["critic"].double(), unit) for critic in critics]
     if config.quantiles == 1:
         loss = sum((values - target).square().mean() for values in predicted)
     else:
         loss = sum(quantile_huber(values, target) for values in predicted)
     step = torch.optim.Adam([p for critic in critics for p in critic.parameters()], lr=config.learning_rate)
-    # moments of Adam before the update
     for k, critic in enumerate(critics):
         for own, p in zip(critic.parameters(), sac.value.network.parameters(), strict=True):
             saved = sac.critic_step.optimizer.state[p]
@@ -197,7 +192,6 @@ def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], en
 
 
 def test_resumed_run_uses_the_replay_buffer_in_its_folder(tmp_path: Path) -> None:
-    """The buffer holds 20 steps of 4 worlds, and an iteration has 12 steps."""
     runs = []
     for name, parts in (("whole", (6,)), ("parts", (1, 3, 6))):
         for i, iterations in enumerate(parts):

@@ -25,7 +25,7 @@ def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
 
 
 def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> float:
-    """Return the mean absolute difference between mirrored actions and actions for mirrored observations."""
+    """Return how far a policy is from equivariance, as a mean absolute difference of actions."""
     mirror = PolicyMirror(reflections(env))
     obs = torch.randn(500, env.obs_space.size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -33,7 +33,7 @@ def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> fl
 
 
 def test_symmetric_policy_is_equivariant_before_and_after_loading(env: lw.Env, tmp_path: Path) -> None:
-    """The policy is symmetric although the normaliser's statistics are not."""
+    """The normaliser's statistics are not symmetric, but the policy is."""
     ppo = learner(env, "exact")
     run = lw.train(ppo, tmp_path / "run", iterations=2)
     policy = lw.load(run)
@@ -45,7 +45,6 @@ def test_symmetric_policy_is_equivariant_before_and_after_loading(env: lw.Env, t
     obs = torch.randn(9, 6)
     (action,) = runtime.InferenceSession(str(file)).run(["action"], {"obs": obs.numpy()})
     np.testing.assert_allclose(action, policy(obs), rtol=1e-5, atol=1e-6)
-    # NPG and another run of PPO keep the policy symmetric
     npg = lw.NPG(env, lw.load(run), config=lw.NPGConfig(samples=512, value_hidden=(8,), mean_every=0))
     next(npg)
     assert asymmetry(npg.policy, env) == 0.0
@@ -92,7 +91,6 @@ def test_a_symmetric_run_resumes_bit_for_bit(tmp_path: Path) -> None:
 
 
 def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
-    """Policy and value function are zero, hence symmetric. Mirrored samples add the gradient's mirror image."""
     ppo = learner(env, "augment", hidden=(), value_hidden=(), normalize=False)
     with torch.no_grad():
         for network in (ppo.policy.network, ppo.value.network):
@@ -104,7 +102,7 @@ def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
     weight = ppo.policy.network[0].weight.grad
     signs = torch.tensor([1.0, -1.0])
     rows, columns = signs, signs.repeat(3)
-    assert weight.abs().min() < 1e-6 * weight.abs().max()  # entries that mix x and y cancel
+    assert weight.abs().min() < 1e-6 * weight.abs().max()  # the gradient of weights between x and y cancels
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 
@@ -125,7 +123,8 @@ def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env,
     policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
-        assert max(before, asymmetry(policy.act, env)) < 1e-6  # scaling actions to their bounds adds rounding errors
+        # converting actions to their bounds causes rounding errors
+        assert max(before, asymmetry(policy.act, env)) < 1e-6
         assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
     else:
         assert asymmetry(policy.act, env) < before

@@ -1,4 +1,4 @@
-"""Run two functions in parallel, each on one of torch's two threads."""
+"""Run two functions in parallel, with one torch thread each."""
 
 import threading
 from collections.abc import Iterator

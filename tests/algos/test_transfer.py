@@ -26,7 +26,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())
-    # results vary more between initial states than between engines, so only paired episodes show the agreement
+    # without paired episodes, differences between initial states would hide the agreement
     assert returns.verdict == lengths.verdict == "same" and own.lengths.std() > 1.0
     assert returns.high - returns.low < 0.2 * own.returns.std().item()
     assert shown[-1][0] <= shown[-1][1] == 400 and torch.equal(env.get_state(), before)
@@ -39,7 +39,7 @@ def test_each_set_of_physics_options_is_compared_with_exact_physics() -> None:
     found = lw.transfer(env, still, 8, warp=False)
     ((exact, coarse),) = [(pair.first, pair.second) for pair in found.comparisons]
     assert (exact, coarse) == ("exact physics", "coarse physics")
-    assert found.comparisons[0].verdict == "different"  # in coarse physics, the robot falls in half as many steps
+    assert found.comparisons[0].verdict == "different"  # with coarse physics, the robot falls after half as many steps
     own = lw.make(Coarse, horizon=200, frame_skip=2)
     assert task_physics(own)[1] == "own" and task_physics(lw.make(Coarse, frame_skip=8))[1] == "coarse"
     pairs = [pair.second for pair in lw.transfer(own, still, 2, warp=False, physics=False).comparisons]

@@ -11,7 +11,6 @@ from lyceum_warp.algos.value_fit import ValueFit
 
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu"])
 def test_value_fit_with_hand_written_gradients_equals_a_fit_with_autograd(activation: Any) -> None:
-    """The second fit continues with the first fit's optimizer moments."""
     generator = torch.Generator().manual_seed(2)
     data = [torch.randn(50, 6, generator=generator) for _ in range(2)]  # the last mini-batch is smaller than the others
     fits = []
@@ -48,7 +47,6 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 
 @pytest.mark.gpu
 def test_gpu_captured_value_fit_equals_plain_launches() -> None:
-    """The first fit captures a graph. The second fit replays it on other samples."""
     samples, batch = 1000, 96
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]

@@ -70,7 +70,10 @@ def round_target(domain: str, physics: Any) -> None:
 
 
 def stored(domain: str, task: str) -> dict[str, Any]:
-    """Return a task's arrays: (starts, segments, size), or (resets, size) for initial states."""
+    """Return a task's arrays.
+
+    Episodes have the shape (starts, segments, size), and initial states (resets, size).
+    """
     env = suite.load(domain, task, task_kwargs={"random": 0})
     physics, spec = env.physics, env.action_spec()
     rng = np.random.default_rng(0)

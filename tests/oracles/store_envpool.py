@@ -29,7 +29,7 @@ def flat(observation: dict[str, Any]) -> np.ndarray:
 
 
 def stored(task: str) -> dict[str, Any]:
-    """Return every fifteenth step of a task's worlds; each random action lasts fifteen steps."""
+    """Return every fifteenth step of a task's worlds. Each random action lasts fifteen steps."""
     name = "".join(word.capitalize() for word in task.split("_"))
     env = envpool.make(f"{name}-v1", env_type="gymnasium", num_envs=WORLDS, num_threads=1, seed=1)
     rng, rows = np.random.default_rng(0), {"observation": [], "action": [], "next_observation": [], "reward": []}

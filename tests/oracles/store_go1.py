@@ -67,7 +67,7 @@ def actuators(model: mujoco.MjModel) -> list[int]:
 
 
 def trajectories(model: mujoco.MjModel) -> dict[str, Any]:
-    """Two trajectories start in the default pose, and two start tumbling."""
+    """Simulate four trajectories: two start in the default pose, and two start tumbling."""
     rng = np.random.default_rng(0)
     home, order = model.key_qpos[0], actuators(model)
     qpos, controls = np.zeros((TRAJECTORIES, SUBSTEPS + 1, 19)), np.zeros((TRAJECTORIES, SUBSTEPS, 12))
@@ -109,7 +109,7 @@ def judged_states(env: ManagerBasedRlEnv) -> dict[str, Any]:
         if step % EVERY:
             continue
         kept = {name: value.clone() for name, value in vars(feet._air_time_state).items()}, swing.peak_heights.clone()
-        # update timers and contacts, which are one substep old after the step
+        # the step leaves timers and contacts one substep old
         feet.update(env.physics_dt)
         swing.peak_heights[:] = 0.15 * torch.rand_like(swing.peak_heights)
         origins = env.scene.env_origins

@@ -29,7 +29,6 @@ def test_model_has_the_masses_joints_and_motor_of_dm_control(shared_env: SharedE
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_cartpole_has_the_reward_and_observation_of_dm_control(shared_env: SharedEnv, sparse: bool) -> None:
-    """Some states are far from the goal, and some actions exceed the control range."""
     options = {"nworld": NWORLD, "autoreset": False, "sparse": sparse}
     ours, theirs = (shared_env(name, **options) for name in ("cartpole", SUITE["cartpole"]))
     rng, rewards = np.random.default_rng(0), []

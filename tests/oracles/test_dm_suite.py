@@ -22,7 +22,7 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of observations that the last substep computes. They are not functions of the state."""
+"""Parts of the observation that cannot be computed from the state, only by a substep."""
 RESETS = 512
 quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 
@@ -111,7 +111,7 @@ def test_model_equals_the_model_of_dm_control(shared_env: SharedEnv, task: str) 
             np.testing.assert_allclose(named[0][name], named[1][name], rtol=1e-9, atol=1e-12, err_msg=f"{field} {name}")
     for field in ("dof_armature", "dof_frictionloss", "dof_M0", "qpos0", "qpos_spring"):
         np.testing.assert_allclose(getattr(ours, field), getattr(theirs, field), rtol=1e-9, atol=1e-12, err_msg=field)
-    # additional keyframes serve to probe the sizes of MuJoCo Warp's buffers
+    # this package adds keyframes for estimating the sizes of MuJoCo Warp's buffers
     np.testing.assert_allclose(ours.key_qpos[: theirs.nkey], theirs.key_qpos, rtol=1e-9, atol=1e-12)
     damping = theirs.dof_damping.copy()
     if task == "dm/finger_spin":  # dm_control sets this field at each reset
@@ -119,7 +119,7 @@ def test_model_equals_the_model_of_dm_control(shared_env: SharedEnv, task: str) 
     np.testing.assert_allclose(ours.dof_damping, damping)
     for field in ("timestep", "integrator", "cone", "gravity", "density", "viscosity"):
         assert np.array_equal(getattr(ours.opt, field), getattr(theirs.opt, field)), field
-    # sensors are disabled for tasks that do not read them
+    # this package disables sensors that a task does not read
     without_sensors = ours.opt.disableflags & ~int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
     assert without_sensors == theirs.opt.disableflags
 
@@ -172,7 +172,6 @@ def check_positions(env: lw.Env, wanted: np.ndarray, name: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("task", TASKS)
 def test_forty_steps_give_the_final_states_of_dm_control(shared_env: SharedEnv, task: str) -> None:
-    """The segments contain all steps of five episodes."""
     env = segments(shared_env, task)
     for _ in range(40):
         env.step()
@@ -182,7 +181,6 @@ def test_forty_steps_give_the_final_states_of_dm_control(shared_env: SharedEnv, 
 @quick
 @pytest.mark.parametrize("task", TASKS)
 def test_initial_states_have_the_distribution_of_dm_control(shared_env: SharedEnv, task: str) -> None:
-    """The two-sample Kolmogorov-Smirnov test compares each number of the initial state."""
     theirs = stored(task)
     env = lw.make(task, nworld=RESETS)
     env.rand_reset(seed=1)
@@ -215,7 +213,6 @@ def test_reward_of_acrobot_depends_on_the_energy_if_energy_weight_is_set(shared_
 
 
 def test_balance_effort_of_acrobot_is_the_effort_of_optimal_feedback(shared_env: SharedEnv) -> None:
-    """The optimal feedback is that of the linearized task."""
     env = shared_env("dm/acrobot_swingup", nworld=1, autoreset=False)
     effort, dt = np.asarray(env.task.params["balance_effort"]).reshape(4, 4), env.timestep
     state = env.get_state()

@@ -22,14 +22,14 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = package_task_names()
-# small models that together have most features
+# these small models have most features between them
 quick = pytest.mark.quick(
     "cartpole_swingup", "go1_velocity", "hopper", "reach", "soft_ball",
 )  # fmt: skip
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
-"""Parts of observations that depend on constraint forces, which are exact only to the solver's tolerance."""
+"""Parts of the observation that depend on constraint forces. The solver computes them only to its tolerance."""
 
 
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
@@ -39,9 +39,9 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""With these parameters, some episodes end under random field values.
+"""Parameters with which some episodes end.
 
-Some solver limits are raised, because the engines agree up to rounding only if the solver converges.
+Higher solver limits let the solver converge. Otherwise the engines would not agree up to rounding.
 """
 
 
@@ -58,12 +58,12 @@ class Bounds:
     qvel_p95: float
 
 
-# Each bound is three to four times the difference that was measured with mujoco and mujoco_warp 4.0.0 on the CPU, over
+# Each bound is three to four times a difference measured on the CPU with mujoco and mujoco_warp 4.0.0. The states are
 # 320 states of random rollouts. A float32 position of about 1 has a precision of 6e-8.
 ONE_STEP = {  #                         measured: median and 95 % quantile of qpos, then of qvel
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
-    # in the worst 5 % of the states, the pen lies on the boxes of the palm
+    # in the worst 5 % of the states, the pen touches the boxes of the palm
     "adroit_pen": Bounds(1.5e-7, 4e-6, 5e-6, 2e-3),  # 4.1e-8, 1.2e-6; 1.4e-6, 5.8e-4
     "aloha_lift": Bounds(2e-7, 2e-7, 1.5e-6, 4e-6),  # 5.2e-8, 5.9e-8; 4.3e-7, 9.2e-7
     "adroit_relocate": Bounds(2e-7, 4.5e-7, 8e-5, 2.5e-4),  # 5.1e-8, 1.2e-7; 2.0e-5, 6.2e-5
@@ -81,7 +81,7 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
-    # contacts of arms and fingers are rare; MuJoCo Warp finds fewer contact points between two boxes
+    # arms and fingers rarely touch; MuJoCo Warp finds fewer contact points between two boxes
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
@@ -96,7 +96,7 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "pusher": Bounds(1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
     "reach": Bounds(5e-7, 2e-6, 5e-5, 2e-4),  # 1.5e-7, 5.8e-7; 1.5e-5, 5.8e-5
     "reacher": Bounds(1.2e-7, 5e-7, 7e-7, 2e-6),  # 3.5e-8, 1.6e-7; 2.0e-7, 6.5e-7
-    # only MuJoCo Warp merges flex contacts less than 1 mm apart, so strong squeezes differ
+    # MuJoCo Warp, unlike MuJoCo, merges flex contacts less than 1 mm apart
     "soft_ball": Bounds(3e-8, 3e-3, 2.5e-6, 6e-1),  # 8.5e-9, 8.8e-4; 6.8e-7, 1.8e-1
     "swimmer": Bounds(8e-8, 2e-7, 6e-7, 3e-6),  # 2.4e-8, 5.7e-8; 2.0e-7, 9.0e-7
     "walker2d": Bounds(1.2e-7, 2e-7, 2e-5, 8e-5),  # 3.7e-8, 5.8e-8; 6.2e-6, 2.4e-5
@@ -118,7 +118,6 @@ SUITE_ONE_STEP = {
     "swimmer": Bounds(9e-7, 3e-6, 4e-4, 1.5e-3),  # with 15 links: 2.5e-7, 8.5e-7; 1.2e-4, 4.3e-4
     "walker": Bounds(2e-7, 4e-7, 9e-6, 4e-5),  # 5.9e-8, 1.1e-7; 2.6e-6, 1.1e-5
 }
-"""Bounds for the tasks of dm_control's suite, by domain."""
 ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module in SUITE.items()}
 
 
@@ -130,7 +129,7 @@ class Engines:
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """States along a random rollout, (NWORLD, size) each, rounded to float32, so that both engines represent them."""
+    """States of a random rollout, (NWORLD, size) each. They are float32 numbers, so both engines represent them."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
         return random_action(self.c, rng, 1.3)
@@ -192,7 +191,7 @@ def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
     """Compare numbers with a tolerance of 1e-5, and flags exactly.
 
-    Force parts may differ by 1e-3 of their maximum, or by 0.01 N if a task clips them.
+    Parts in ``force_parts`` have a tolerance of 1e-3 of their maximum, or of 0.01 N if a task clips them.
     """
     forces = torch.zeros(ours["obs"].shape[1], dtype=torch.bool)
     for part in (force_parts or {}).values():
@@ -207,7 +206,7 @@ def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | No
 
 
 def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) -> Outcome:
-    """Return the results of the task's functions for given field values, without physics."""
+    """Evaluate the task's functions on given field values, without physics."""
     kept = []
     for batch, values in ((env.worlds.before, before), (env.worlds.after, after)):
         for name, value in values.items():
@@ -226,7 +225,6 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
 
 @quick
 def test_observation_and_action_spaces_are_the_same_on_both_engines(engines: Engines) -> None:
-    """The state of one engine can be set on the other engine."""
     assert engines.c.state_space == engines.warp.state_space
     assert engines.c.obs_space == engines.warp.obs_space
     assert engines.c.timestep == engines.warp.timestep
@@ -234,12 +232,11 @@ def test_observation_and_action_spaces_are_the_same_on_both_engines(engines: Eng
 
 @quick
 def test_equal_field_values_give_equal_results_on_both_engines(engines: Engines) -> None:
-    """The field values are random, and close to values in simulated states."""
     rng = torch.Generator().manual_seed(0)
     numpy_rng = np.random.default_rng(1)
     fallen = 0
     for state in engines.states[:4]:
-        for env in (engines.c, engines.warp):  # observation noise depends on the states' counters
+        for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
         after = engines.c.worlds.after
         fields: Outcome = {name: torch_view(getattr(after, name)).clone() for name in engines.c.task.types}
@@ -260,14 +257,12 @@ def test_equal_field_values_give_equal_results_on_both_engines(engines: Engines)
 
 @quick
 def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(engines: Engines) -> None:
-    """Each engine computes all other fields from positions and velocities."""
     parts = {name: part for name, part in engines.c.obs_space.parts.items() if name in FORCE_PARTS}
     largest = 0.0
     for state in engines.states:
         results = []
         for env in (engines.c, engines.warp):
             env.set_state(state.to(env.action.device))
-            # the state contains fields of the last substep, so the reset phases recompute them
             for phase in env.worlds.reset_phases(randomly=False):
                 if phase.name not in ("restart", "settle"):
                     phase.run()
@@ -279,7 +274,6 @@ def test_equal_positions_and_velocities_give_equal_observations_on_both_engines(
 
 @quick
 def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> None:
-    """Both engines start from equal states. ONE_STEP contains the bounds."""
     assert engines.task in ONE_STEP, f"add bounds of {engines.task} to ONE_STEP; pytest -rP shows the differences"
     rng = np.random.default_rng(3)
     errors: dict[str, list[torch.Tensor]] = {"qpos": [], "qvel": []}
@@ -309,7 +303,6 @@ def test_engines_differ_only_by_rounding_after_one_substep(engines: Engines) -> 
 def test_engines_agree_over_fifty_steps_with_inputs_and_randomized_models(
     task: type[lw.Task], params: dict[str, float], device: str
 ) -> None:
-    """Masses, frictions and gravity are random, ``control`` writes inputs, and fifty steps take 150 substeps."""
     c = lw.make(task, nworld=8, seed=1, **params)
     warp = lw.make(task, nworld=8, seed=1, engine="warp", device=device, **params)
     start, rng, worst, far = positions_of(c), np.random.default_rng(0), 0.0, 0.0

@@ -70,7 +70,7 @@ QPOS: Mapping[str, Callable[[Parts], np.ndarray]] = {
     "acrobot": acrobot, "cartpole": cartpole, "cheetah": without_x, "finger": finger, "hopper": without_x,
     "pendulum": pendulum, "walker": walker,
 }  # fmt: skip
-"""Functions that compute positions from observations. Other domains use the part "position"."""
+"""Functions that compute positions from observations. All other domains observe their positions."""
 
 
 def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
@@ -86,7 +86,7 @@ def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:
         fields["mocap_pos"][:, ::2] = torch.from_numpy(parts["target_position"] + hinge[::2])
     if "to_target" in parts:
         fields["mocap_pos"].zero_()
-        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]  # the target is at the origin
+        finger = -env.get_obs(state)[:, env.obs_space.parts["to_target"]]
         fields["mocap_pos"][:, :2] = finger + torch.from_numpy(parts["to_target"])
     env.set_state(state)
 
@@ -100,7 +100,7 @@ def test_a_step_has_envpools_observations_and_rewards(shared_env: SharedEnv, tas
     env = shared_env(task, nworld=len(before), autoreset=False)
     set_states(env, domain, before)
     touch = env.obs_space.parts.get("touch", slice(0))
-    columns = np.delete(np.arange(env.obs_space.size), touch)  # the touch sensors belong to the last substep
+    columns = np.delete(np.arange(env.obs_space.size), touch)  # touch sensors keep the values of the last substep
     np.testing.assert_allclose(env.get_obs()[:, columns], before[:, columns], rtol=1e-6, atol=1e-6)
     env.action.copy_(torch.from_numpy(action))
     if domain == "finger":  # MuJoCo 3.6 computes contacts with solimp[0] = 0 differently

@@ -42,15 +42,15 @@ def has(task: str, function: str) -> bool:
     return function in find_task(task).scope
 
 
-# for tasks with contact forces, Gymnasium's class has the mixin SensorStage
+# for these tasks, Gymnasium's class gets the mixin SensorStage
 WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """A mixin for Gymnasium environments: the Newton solver, and contact forces of the last substep.
+    """Give Gymnasium environments the Newton solver and contact forces of the last substep.
 
-    Gymnasium computes ``cfrc_ext`` again after the last substep. With the mixin, MuJoCo computes it in the sensor
-    stage, as in lyceum_warp.
+    Gymnasium computes ``cfrc_ext`` again after the last substep. This class computes it in the sensor stage, as
+    lyceum_warp does.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -72,7 +72,7 @@ def unchanged(task: str) -> type[mujoco_env.MujocoEnv]:
 
 @functools.cache
 def oracle(task: str) -> type[mujoco_env.MujocoEnv]:
-    """Return Gymnasium's class, with the mixin if the task observes contact forces."""
+    """Return Gymnasium's class, with SensorStage as a base if the task observes contact forces."""
     base = unchanged(task)
     return type(base.__name__, (SensorStage, base), {}) if task in WITH_FORCES else base
 
@@ -127,7 +127,7 @@ class Pair:
         self.held = self.action()
 
     def put(self, change: Callable[[mujoco.MjData], None] = lambda data: None) -> None:
-        """Reset Gymnasium's environment, apply a change, and put both environments into this float32 state."""
+        """Reset Gymnasium's environment, change its data, and copy its state to our environment."""
         data = self.theirs.data
         mujoco.mj_resetData(self.theirs.model, data)
         self.theirs.reset_model()
@@ -140,9 +140,9 @@ class Pair:
         state = self.ours.get_state()
         parts = self.ours.state_space.split(state[0])
         for name in parts.keys() - {"step", "key", "episode", "done_reason", "metrics"}:
-            # lagged fields come from the previous forward pass
+            # fields from the previous forward pass are part of the state
             parts[name].copy_(torch.from_numpy(np.ravel(getattr(data, name))))
-        parts["done_reason"].zero_()  # the state in which both start is not terminal
+        parts["done_reason"].zero_()
         self.ours.set_state(state)
 
     def action(self) -> np.ndarray:
@@ -150,7 +150,7 @@ class Pair:
         return np.float32(self.middle + 1.33 * self.reach * self.rng.uniform(-1.0, 1.0, self.middle.shape))
 
     def step(self) -> Step:
-        if self.rng.random() < 0.7:  # with probability 0.3, repeat the last action, so that the robot moves further
+        if self.rng.random() < 0.7:  # repeat the last action with probability 0.3, so that the robot moves further
             self.held = self.action()
         self.ours.step(torch.from_numpy(self.held[None]))
         obs, reward, terminated, truncated, info = self.theirs.step(self.held.astype(np.float64))
@@ -202,7 +202,6 @@ def test_every_gymnasium_id_of_a_task_is_registered() -> None:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
-    """Some actions exceed the control range."""
     pair = Pair(make_ours(task), make_theirs(task))
     assert pair.ours.timestep == pytest.approx(pair.theirs.dt, rel=1e-12)
     assert pair.ours.obs.shape == (1, *pair.theirs.observation_space.shape)
@@ -223,7 +222,7 @@ def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """Return the expected metric (a distance, height or position) if Gymnasium's info contains it."""
+    """Return the evaluation that Gymnasium's info implies (a distance, height or position), or None."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:
@@ -248,7 +247,6 @@ def test_evaluation_metric_of_a_pendulum_is_its_angle_or_height(
 
 
 def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
-    """Under random actions, the pole falls too early for the cart to reach the end."""
     pair = Pair(make_ours("inverted_double_pendulum"), make_theirs("inverted_double_pendulum"))
 
     def drive_to_the_end(data: mujoco.MjData) -> None:
@@ -265,7 +263,7 @@ def test_force_at_the_end_of_the_rail_equals_that_of_gymnasium() -> None:
 
 
 def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
-    """The cylinder starts beside the hand, because random actions hardly ever reach it."""
+    """Place the cylinder beside the hand, because random actions hardly ever reach it."""
     pair = Pair(make_ours("pusher"), make_theirs("pusher"))
     model, (low, high) = pair.theirs.model, pair.theirs.model.jnt_range[:7].T
 
@@ -282,13 +280,12 @@ def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
         start = pair.theirs.data.qpos[7:9].copy()
         check([pair.step() for _ in range(10)])
         moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
-    assert min(moved) > 5e-4  # distance in m; an untouched cylinder does not move
+    assert min(moved) > 5e-4  # in m; an untouched cylinder does not move
 
 
 @pytest.mark.quick("ant")
 @pytest.mark.parametrize("task", WITH_FORCES)
 def test_unchanged_gymnasium_class_differs_only_in_contact_forces(task: str) -> None:
-    """With the Newton solver and without contact costs, everything except the contact forces agrees."""
     weights = {name: 0.0 for name in keywords(task) if name in ("contact_cost_weight", "impact_cost_weight")}
     assert weights
     theirs: Any = unchanged(task)(**weights)
@@ -300,7 +297,7 @@ def test_unchanged_gymnasium_class_differs_only_in_contact_forces(task: str) -> 
     for step in steps:
         assert relative_error(np.delete(step.obs, forces), np.delete(step.gym_obs, forces)) <= 1e-5
         assert step.reward_error <= 1e-4
-    # if this assertion fails because contact forces agree, remove the note in tasks/humanoid.py
+    # if contact forces agree and this fails, remove the note in tasks/humanoid.py
     assert max(relative_error(step.obs[forces], step.gym_obs[forces]) for step in steps) > 1e-3
 
 
@@ -311,7 +308,6 @@ RANGES = [(task, name) for task in HEALTHY for name in inspect.signature(unchang
 
 @pytest.mark.parametrize(("task", "bounded"), [*((task, None) for task in HEALTHY), *RANGES])
 def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) -> None:
-    """Random states lie on both sides of the bounds. A case checks all bounds, or a single range."""
     wide = {name: (-1e6, 1e6) for other, name in RANGES if other == task and bounded not in (None, name)}
     if bounded is not None and math.isinf(max(keywords(task)[bounded])):
         wide[bounded] = (keywords(task)[bounded][0], 2.0)
@@ -320,7 +316,7 @@ def test_terminal_states_are_those_of_gymnasium(task: str, bounded: str | None) 
 
 
 def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
-    """Compare the terminations of random states; return the share of terminal states."""
+    """Compare the terminations of random states. Return the share of terminal states."""
     rng = np.random.default_rng(0)
     state = ours.get_state()
     parts = ours.state_space.split(state)
@@ -338,7 +334,6 @@ def share_of_ill_states(ours: lw.Env, theirs: Any, spread: float) -> float:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_first_observation_equals_that_of_gymnasium_in_the_same_state(task: str) -> None:
-    """The test compares both the random and the fixed reset."""
     ours, theirs = make_ours(task, nworld=16), make_theirs(task)
     for start in (ours.rand_reset, ours.reset):
         start()
@@ -363,7 +358,6 @@ RESETS = [
 @pytest.mark.quick("1.0")
 @pytest.mark.parametrize(("task", "times"), RESETS)
 def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: float) -> None:
-    """The noise scale is Gymnasium's, and three times as large."""
     option = {} if times == 1.0 else {"reset_noise_scale": keywords(task)["reset_noise_scale"] * times}
     theirs, ours = make_theirs(task, **option), make_ours(task, nworld=250, **option)
     theirs.reset(seed=0)
@@ -382,7 +376,7 @@ def test_random_resets_have_the_distribution_of_gymnasium(task: str, times: floa
 def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     """Compare the distributions of two (n, k) samples, for each coordinate and each pair of coordinates.
 
-    Fewer than one in 10,000 pairs of equally distributed samples exceeds these thresholds. The seeds are fixed.
+    If the distributions are equal, fewer than one in 10,000 pairs of samples exceeds these thresholds.
     """
     n = len(a)
     assert a.shape == b.shape and np.isfinite(b).all()
@@ -390,7 +384,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
     fixed = spread < 1e-9
     np.testing.assert_allclose(b[:, fixed], a[:, fixed], atol=1e-6)
     a, b = ((x - middle)[:, ~fixed] / spread[~fixed] for x in (a, b))
-    # the kurtosis determines the error of a standard deviation
+    # the error of a standard deviation depends on the kurtosis
     kurtosis = np.mean(a**4, axis=0)
     assert np.abs(b.mean(axis=0)).max() < 5.0 * math.sqrt(2.0 / n)
     assert (np.abs(b.std(axis=0) - 1.0) < 5.0 * np.sqrt((kurtosis - 1.0) / (2.0 * n))).all()
@@ -405,7 +399,7 @@ def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
 
 
 IGNORED = {("humanoid_standup", "uph_cost_weight")}
-"""Gymnasium 1.4 documents these parameters but ignores them."""
+"""Parameters that Gymnasium 1.4 documents but ignores."""
 
 
 @functools.cache
@@ -429,7 +423,7 @@ PARAMETERS = [
     (task, name, variants(default))
     for task in TASKS
     for name, default in keywords(task).items()
-    # the tests of distributions and of terminal states cover these parameters
+    # other tests cover these parameters
     if name != "reset_noise_scale" and (task, name) not in RANGES
 ]
 
@@ -472,13 +466,12 @@ def test_every_gymnasium_parameter_exists_with_the_same_default(task: str) -> No
 
 VALUES = [(task, name, value) for task, name, values in PARAMETERS for value in values]
 DIFFERENT = [task for task in TASKS if task != "walker2d" and not task.startswith("humanoid")]
-"""Tasks except those with parameters similar to the hopper's or the ant's."""
+"""All tasks except those whose parameters resemble the hopper's or the ant's."""
 
 
 @pytest.mark.quick(*(f"{task}-{name}-{first}" for task, name, (first, *_) in PARAMETERS if task in DIFFERENT))
 @pytest.mark.parametrize(("task", "name", "value"), VALUES, ids=["-".join(map(str, case)) for case in VALUES])
 def test_parameter_has_the_same_effect_as_in_gymnasium(task: str, name: str, value: Any) -> None:
-    """Compare results and the size of the observation."""
     default, changed = default_numbers(task), numbers(task, **{name: value})
     ours, theirs = make_ours(task, autoreset=True, **{name: value}), make_theirs(task, **{name: value})
     pair = Pair(ours, theirs)
@@ -513,7 +506,7 @@ def halve_timestep(root: ET.Element) -> None:
 @pytest.mark.quick("ant", "hopper")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_changed_model_file_has_the_same_effect_as_in_gymnasium(task: str, tmp_path: Path) -> None:
-    """The option ``model`` accepts a modified copy, as Gymnasium's ``xml_file`` does."""
+    """Pass a modified copy as ``model``, and as Gymnasium's ``xml_file``."""
     tree = ET.parse(make_theirs(task).fullpath)
     halve_timestep(tree.getroot())
     for motor in tree.getroot().iterfind("actuator/*"):

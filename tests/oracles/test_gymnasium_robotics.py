@@ -30,7 +30,7 @@ IDS = {
     for name in lw.task_names()
     if (task := find_task(name)).__module__.startswith("lyceum_warp.tasks.")
 }
-"""Ids of Gymnasium environments by task."""
+"""Map each task to the id of its Gymnasium environment."""
 
 ENTRIES = {
     name: str(spec.entry_point)
@@ -50,7 +50,10 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Return Gymnasium-Robotics' class with the task's changes to the model, and without duplicate contact pairs."""
+    """Return Gymnasium-Robotics' class, but with the task's model.
+
+    The model contains no contact pair twice.
+    """
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -73,15 +76,15 @@ class Pair:
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Copies of fields of the model, made before random resets change them."""
+        """Copies of model fields. Random resets change the fields themselves."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
-        """Number of steps in which Gymnasium-Robotics reported that the goal was achieved."""
+        """Number of steps in which Gymnasium-Robotics reported success."""
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # the controls are float32 here and float64 in Gymnasium-Robotics; the difference would grow over many steps
+        # these controls are float32, so Gymnasium-Robotics must not use its own float64 controls
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
@@ -115,7 +118,10 @@ class Pair:
         self.ours.set_state(state)
 
     def _move(self, body: str, pos: np.ndarray, quat: np.ndarray) -> None:
-        """Place a mocap body. Gymnasium-Robotics may have a mocap body, a fixed body or a site with this name."""
+        """Place a mocap body.
+
+        Gymnasium-Robotics may have a mocap body, a fixed body or a site with this name.
+        """
         model, data = self.theirs.model, self.theirs.data
         if (id := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, body)) < 0:
             model.site(body).pos[:] = pos
@@ -153,11 +159,11 @@ class Special:
     """A state that random actions do not reach."""
 
     reward: float
-    """Reward of Gymnasium-Robotics' next step, within 0.1."""
+    """Reward of the next step in Gymnasium-Robotics, with a tolerance of 0.1."""
     joints: dict[str, float]
-    """Positions of joints by their names."""
+    """Map names of joints to positions."""
     moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
-    """Poses of mocap bodies by their names."""
+    """Map names of mocap bodies to poses."""
 
     def fields(self, env: lw.Env) -> dict[str, np.ndarray]:
         parts = env.state_space.split(env.get_state()[0])
@@ -171,13 +177,13 @@ class Special:
 
 
 def pen(reward: float, angle: float, up: float) -> Special:
-    """Return a state with the pen at a height above the palm and at an angle to the target."""
+    """Return a state with a given height of the pen and a given angle to the target."""
     turn = (np.pi / 2 - angle) / 2
     return Special(reward, {"OBJTx": -up}, {"target": (0.2, 0.2, 0.2, np.cos(turn), 0.0, np.sin(turn), 0.0)})
 
 
 def ball(reward: float, up: float, aside: float) -> Special:
-    """Return a state with the ball at a height and a lateral distance. The target is 0.2 m above the table."""
+    """Return a state with a given height and lateral distance of the ball. The target is 0.2 m above the table."""
     joints = {"OBJTx": aside, "OBJTy": 0.0, "OBJTz": up - 0.035}
     return Special(reward, joints, {"target": (0.0, 0.0, 0.2, 1.0, 0.0, 0.0, 0.0)})
 
@@ -194,7 +200,7 @@ SPECIAL = {
     "adroit_pen": [pen(61.0, 0.1, 0.0), pen(10.9, 0.38, 0.0), pen(0.8, 0.1, 0.2), pen(-5.6, 2.0, -0.2)],
     "adroit_relocate": [ball(0.0, 0.035, 0.15), ball(0.8, 0.2, 0.15), ball(10.9, 0.2, 0.08), ball(30.9, 0.2, 0.01)],
 }
-"""States with reward bonuses or success, by task."""
+"""Map each task to states in which it succeeds or gives a reward bonus."""
 
 
 @pytest.fixture(params=TASKS)
@@ -207,7 +213,7 @@ MakePair = Callable[..., Pair]
 
 @pytest.fixture
 def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, **params)``, which pairs a world with the original environment ``theirs``."""
+    """Return ``make_pair(theirs, **params)``, which pairs a world with an original environment."""
 
     def make(theirs: Any = None, **params: Any) -> Pair:
         ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
@@ -218,7 +224,6 @@ def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
 
 @pytest.mark.quick("adroit_pen")
 def test_results_under_random_actions_equal_gymnasium_robotics(make_pair: MakePair) -> None:
-    """Run five episodes of 200 steps. A quarter of the actions are out of range."""
     pair = make_pair()
     for _ in range(5):
         pair.reset()
@@ -234,7 +239,6 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
 
 
 def test_unchanged_gymnasium_robotics_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    """The unchanged model has contacts that the package's model lacks, and counts some contacts twice."""
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
@@ -289,7 +293,7 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""Kinds of elements, with the MuJoCo types for looking up their names."""
+"""Map each kind of element to the MuJoCo type under which its name is found."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:
@@ -305,7 +309,6 @@ def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, 
 
 
 def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv, task: str) -> None:
-    """The order of sensor sites, duplicate pairs, and bodies that a reset moves may differ."""
     ours, theirs = shared_env(task, autoreset=False, horizon=0, nthread=1).model, registered(task).model
     moved = mocap_bodies(ours)
     others = {(field, name) for field, name in differences(ours, theirs) if name not in moved}
@@ -321,7 +324,6 @@ def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv,
 
 
 def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePair, task: str) -> None:
-    """Positions equal those of Gymnasium-Robotics' model before any reset."""
     pair = make_pair(registered(task))
     pair.ours.reset()
     pair.put()
@@ -333,7 +335,6 @@ def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePai
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_have_the_distribution_of_gymnasium_robotics(task: str) -> None:
-    """Kolmogorov-Smirnov tests compare the numbers of the first observations."""
     n, m = 400, 1000
     env, original = lw.make(task, engine="mujoco", nworld=m, nthread=1), registered(task)
     ours = env.obs.numpy().astype(np.float64)

@@ -42,7 +42,6 @@ def test_model_has_the_options_of_mjlab(shared_env: SharedEnv, name: str) -> Non
 
 @pytest.mark.parametrize("i", range(4))
 def test_trajectories_of_the_model_equal_those_of_mjlab(shared_env: SharedEnv, i: int) -> None:
-    """Run 200 substeps of a standing and of a tumbling robot. Both robots collide with themselves."""
     model = shared_env("go1_velocity").model
     data, wanted = mujoco.MjData(model), STORED["trajectory/qpos"][i]
     data.qpos, data.qvel = wanted[0], STORED["trajectory/qvel0"][i]
@@ -110,7 +109,7 @@ def test_stored_states_contain_every_kind_of_command_and_contact() -> None:
 def test_reward_terms_equal_those_of_mjlab(env: lw.Env, term: str) -> None:
     after = mjlabs_states(env, heading=False)
     before = after.clone()
-    if term == "soft_landing":  # mjlab's forces are current, and this package's forces are one substep old
+    if term == "soft_landing":  # mjlab's forces are current, but this package's forces are one substep old
         times = env.state_space.split(after)["contact_time"]
         times += 0.005 * (times > 0)
     weight = float(STORED[f"weight/{term}"])

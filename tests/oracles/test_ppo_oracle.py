@@ -17,7 +17,7 @@ STEPS, N = 12, 8
 
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
-    """Use float64: Adam in float32 would amplify rounding errors of tiny gradients to full steps."""
+    """Use float64, because Adam would turn float32 rounding errors of tiny gradients into full steps."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)
@@ -67,11 +67,11 @@ def test_an_update_gives_the_same_parameters_as_rsl_rl(
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
     ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
-    for module in (ppo.policy, ppo.value):  # gradients are small if the last layers are near zero
+    for module in (ppo.policy, ppo.value):  # last layers near zero would give small gradients
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)
-    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles only these tensors
+    used = config.minibatches * ppo.minibatches.batch  # rsl_rl shuffles only the samples that it uses
     order = torch.randperm(used, generator=torch.Generator().manual_seed(0))
     order = torch.cat([order, torch.arange(used, STEPS * N)])
     monkeypatch.setattr(torch, "randperm", lambda count, **_: order[:count])
