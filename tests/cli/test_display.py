@@ -22,7 +22,7 @@ def npg() -> lw.NPG:
 
 @pytest.fixture(scope="module")
 def first(npg: lw.NPG) -> lw.Iteration:
-    """No episode ends in this iteration."""
+    """Return an iteration in which no episode ends."""
     return next(npg)
 
 

@@ -124,7 +124,6 @@ def test_broken_task_is_listed_with_its_error(
 
 @pytest.mark.long
 def test_a_closed_pipe_ends_the_list_quietly() -> None:
-    """The reader closes the pipe before the first line."""
     command = f"{sys.executable} -m lyceum_warp.cli tasks hopper | true"
     done = subprocess.run(command, shell=True, capture_output=True, text=True)
     assert done.stderr == ""

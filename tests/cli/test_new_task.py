@@ -32,7 +32,7 @@ RICH = text(
     + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
     '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
 )
-# all checks except slow ones that do not depend on the model
+# the omitted checks are slow, and do not depend on the model
 QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
 
@@ -95,7 +95,7 @@ def test_new_task_for_any_model_passes_check_task(model: str, engine: str, folde
 
 
 def package_models() -> list[Path]:
-    """Return the models of gymnasium, dm_control and MuJoCo Warp that have actuators and all their files."""
+    """Return the model files of gymnasium, dm_control and MuJoCo Warp that contain actuators."""
     folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
     found: list[Path] = []
     for package, within in folders.items():

@@ -43,9 +43,9 @@ SLED = """
   </actuator>
 </mujoco>
 """
-"""A robot with two legs and a tail. Its feet are boxes in bodies without joints.
+"""A robot with two legs and a tail.
 
-The actuators and the joints have different orders.
+Its feet are boxes in bodies without joints. Actuators and joints have different orders.
 """
 
 
@@ -98,7 +98,6 @@ def test_ppo_trains_a_new_velocity_task_for_an_iteration(folder: Path, tmp_path:
 
 
 def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """New sites are at the centres of the soles. An existing site is reused, and other joints keep their pose."""
     assert new("sled_walk", "--model", "sled.xml") == 0
     assert capsys.readouterr().out.startswith("sled_walk.py: feet foot_1, toe; joints left_hip, right_hip; check")
     env = lw.make("sled_walk.py", nworld=1, **{"push_seconds": (1e6, 1e6), "sliding_friction": (1.0, 1.0)})

@@ -38,7 +38,7 @@ def test_command_plan_starts_no_episode_after_the_time_limit(
 
 
 def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "[" / "bold]x"  # not markup of rich
+    out = tmp_path / "[" / "bold]x"  # rich must not take this name for markup
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
     shown = capsys.readouterr().out
     assert f"files in {out}" in shown
@@ -53,7 +53,7 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     assert report["episodes"] == 2 and report["steps"] == 80
     with np.load(out / "episode-001.npz", allow_pickle=False) as file:
         assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
-    # the same controller, called from Python, gives the same episode
+    # calling the same controller from Python gives the same episode
     env = lw.make("point_mass", autoreset=False, horizon=40)
     planner = lw.MPPI("point_mass", horizon=10, samples=8, temperature=0.01, noise=0.3)
     again = lw.control(env, planner, seed=4)
@@ -98,11 +98,14 @@ def test_flag_real_time_runs_the_plant_asynchronously_in_real_time(
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
-    assert 0.5 < report["real_time_factor"] < 1.01  # the 40 steps take 20 ms each, and a busy machine may be slower
+    assert 0.5 < report["real_time_factor"] < 1.01  # 40 steps of 20 ms take longer on a busy machine
 
 
 def measured_by(microseconds: float) -> Any:
-    """Replace ``planning_time`` by a time proportional to samples and horizon."""
+    """Return a function that replaces ``planning_time``.
+
+    Its result is proportional to samples and horizon.
+    """
     return lambda plant, planner: 1e-6 * microseconds * planner.samples * planner.horizon
 
 
@@ -169,7 +172,6 @@ def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytes
 
 
 def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_envs: list[lw.Env]) -> None:
-    """The task's attribute ``planning`` sets the integrator of the planner's worlds."""
     out = tmp_path / "run"
     options = ["--solver", "iterations=5", "--solver", "noslip_iterations=0", "--deterministic"]
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "2", *options, task="hopper") == 0

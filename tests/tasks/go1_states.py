@@ -1,4 +1,4 @@
-"""Read states of go1_velocity, and compute its feet with MuJoCo's own kinematics."""
+"""Read states of go1_velocity, and compute the poses of its feet with MuJoCo."""
 
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ STILL: dict[str, Any] = {**NOISELESS, "command_seconds": NEVER, "push_seconds": 
 
 
 class State:
-    """All worlds' states in float64, and the heights and contacts of feet from MuJoCo's kinematics."""
+    """Read the states of all worlds, and compute heights and contacts of the feet with MuJoCo."""
 
     def __init__(self, env: lw.Env) -> None:
         parts = env.state_space.split(env.get_state())
@@ -55,7 +55,7 @@ class State:
 
 
 def random_steps(env: lw.Env, steps: int, size: float = 1.0) -> list[torch.Tensor]:
-    """Return actions that are correlated over time, each (nworld, 12)."""
+    """Return random actions that are correlated over time. Each has the shape (nworld, 12)."""
     generator, found = torch.Generator().manual_seed(1), [torch.zeros(env.nworld, 12)]
     for _ in range(steps):
         found.append(0.8 * found[-1] + 0.6 * size * torch.randn(env.nworld, 12, generator=generator))

@@ -1,4 +1,4 @@
-"""Script a lift: find joint positions for waypoints, and move a robot's servos to them."""
+"""Script a lift with joint positions for waypoints and servos that move to them."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ import lyceum_warp as lw
 def joints_at(
     model: mujoco.MjModel, qpos: np.ndarray, site: str, place: np.ndarray, axes: np.ndarray, joints: Sequence[str]
 ) -> np.ndarray:
-    """Return joint positions (nq,) that give a site a position and axes (as columns)."""
+    """Find joint positions (nq,) at which a site has the given position and axes."""
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
     dofs = [int(model.joint(name).dofadr[0]) for name in joints]

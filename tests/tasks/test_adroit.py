@@ -31,7 +31,6 @@ def test_sum_of_the_metrics_equals_the_reward(shared_env: SharedEnv, task: str) 
 
 
 def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: SharedEnv, task: str) -> None:
-    """With the settings for planners, the reward rises as the palm approaches. In the original tasks, it falls."""
     env, turned = (shared_env(task, nworld=4, nthread=1, palm_weight=weight) for weight in (0.1, -0.1))
     assert lw.MPPI(task, horizon=2, samples=2, nthread=1).env.task.params["palm_weight"] == -1.0
     for each in (env, turned):
@@ -45,7 +44,6 @@ def test_palm_weight_determines_the_sign_of_the_first_reward_term(shared_env: Sh
 
 
 def test_task_succeeds_if_a_distance_is_below_its_threshold(task: str) -> None:
-    """Each threshold is above the distance in some worlds only."""
     env = lw.make(task, engine="mujoco", nworld=4, nthread=1)
     steps(env)
     assert not env.success.any()

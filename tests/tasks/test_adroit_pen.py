@@ -15,7 +15,6 @@ def formula(obs: np.ndarray, near: float, goal: float, reach: np.ndarray | float
 
 
 def test_every_threshold_changes_rewards_or_terminations() -> None:
-    """``goal_distance`` differs between worlds."""
     n = 400
     rng = np.random.default_rng(0)
     reach = rng.uniform(0.02, 0.2, n)
@@ -29,7 +28,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
     parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
     env.set_state(state)
     assert not env.reward.any()
-    # set_state restores the lagged fields, so new positions have an effect only after a step
+    # positions change the reward after the next step, because set_state restores fields of the previous substep
     counts, terms = np.zeros(n), set()
     for _ in range(6):
         env.step(torch.zeros(n, 24))
@@ -47,7 +46,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
 
 def test_a_smaller_target_range_gives_smaller_angles() -> None:
     env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
-    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of both angles' cosines
+    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of the cosines of two angles
     assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
     assert 0.7 < upright.min() < 0.95
 

@@ -1,4 +1,4 @@
-"""test_panda_lift.py checks the reward terms of aloha_lift."""
+"""Test aloha_lift, except its reward terms, which test_panda_lift.py checks."""
 
 import mujoco
 import numpy as np
@@ -26,7 +26,6 @@ def test_simple_shapes_replace_colliding_meshes_without_changing_masses(shared_e
 
 @pytest.mark.parametrize("physics", ["exact", "fast"])
 def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv, physics: str) -> None:
-    """The grippers move to the handles, close and rise. The task succeeds with a reward of nearly 6.5."""
     env = shared_env("aloha_lift", nworld=3, autoreset=False, physics=physics)
     model, start = env.model, positions(env)[0]
     waypoints = np.zeros((3, 3, 14))
@@ -38,7 +37,7 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv, ph
             handle = data.site(f"lift/{side}_handle").xpos
             inwards = data.body("partnet_100015/").xpos - handle
             inwards = np.array([*inwards[:2], 0.0]) / np.linalg.norm(inwards[:2])
-            # the gripper points downwards by 52 degrees, with one finger above the other
+            # the gripper points 52 degrees downwards, with one finger above the other
             x, y = 0.61 * inwards - [0.0, 0.0, 0.79], 0.79 * inwards + [0.0, 0.0, 0.61]
             axes = np.stack([x, y, np.cross(x, y)], axis=1)
             names = [f"{side}\\{joint}" for joint in JOINTS]
@@ -57,7 +56,6 @@ def test_a_scripted_grasp_lifts_the_pot_in_every_world(shared_env: SharedEnv, ph
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_change_the_position_and_yaw_of_the_pot() -> None:
-    """The yaw is a random angle around 90 degrees, so both handles stay within reach."""
     place = (0.05, 0.01, 0.1)
     env = lw.make("aloha_lift", engine="mujoco", nworld=1000, place=place)
     env.rand_reset(0)

@@ -26,7 +26,7 @@ def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarr
 
 
 def reward(place: dict[str, np.ndarray]) -> np.ndarray:
-    """Return Lyceum's reward, with a corrected goal distance in its second stage."""
+    """Return Lyceum's reward. Lyceum's second stage used another goal distance."""
     ball = place["ball"]
     palm = np.minimum(np.linalg.norm(place["palm"] - ball, axis=1), 0.5) / 0.5
     goal = np.minimum(np.linalg.norm(GOAL - ball, axis=1), 0.5) / 0.5
@@ -56,7 +56,6 @@ def test_arm_starts_above_the_ball_and_stands_still_with_zero_actions(shared_env
 
 
 def test_observation_and_reward_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """The ball is in the hand, at the hand's edge, or far away."""
     env = shared_env("arm_hand_pickup", nworld=64, autoreset=False)
     rng = np.random.default_rng(0)
     state = env.get_state()
@@ -95,7 +94,6 @@ def test_task_succeeds_after_a_fifth_of_a_second_at_the_goal(shared_env: SharedE
 
 
 def test_scripted_hand_picks_up_the_ball_and_holds_it_at_the_goal(shared_env: SharedEnv) -> None:
-    """The hand descends and closes. Inverse kinematics then moves it to the goal."""
     model = shared_env("arm_hand_pickup").model
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)

@@ -12,7 +12,7 @@ NWORLD = 256
 
 
 def tolerance(x: np.ndarray, margin: float, value_at_margin: float = 0.1) -> np.ndarray:
-    """Compute dm_control's tolerance around zero with the quadratic sigmoid."""
+    """Compute dm_control's ``tolerance`` with bounds of zero and a quadratic sigmoid."""
     scaled = np.abs(x) / margin * np.sqrt(1.0 - value_at_margin)
     return np.where(scaled < 1.0, 1.0 - scaled**2, 0.0)
 
@@ -35,10 +35,6 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
 
 
 def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """Some states lie beyond the rail and the margins, and some actions exceed the control range.
-
-    The reward receives the given action, not the clipped control.
-    """
     env = shared_env("cartpole_swingup", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for _ in range(5):

@@ -45,7 +45,7 @@ def test_policy_observations_have_uniform_noise_and_critic_observations_have_non
 
 
 def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
-    """Compare with MuJoCo's own contacts after every substep."""
+    """Compare timers with MuJoCo's contacts after every substep."""
     env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
     model = mujoco.MjModel.from_xml_path(GO1)
     feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
@@ -112,7 +112,10 @@ def test_commands_have_the_distribution_of_mjlab() -> None:
 
 
 def command_of(env: lw.Env) -> torch.Tensor:
-    """Return each world's random velocity, heading and command timer, (nworld, 5)."""
+    """Return each world's random velocity, heading and command timer.
+
+    The shape is (nworld, 5).
+    """
     parts = env.state_space.split(env.get_state())
     return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 

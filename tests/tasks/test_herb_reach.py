@@ -10,7 +10,7 @@ import lyceum_warp as lw
 NWORLD = 64
 SIDES = ("left", "right")
 
-# masses in kg: the arm from Barrett D1005 AC-02, the hand from Barrett's mass properties of the BH280
+# masses in kg, from Barrett D1005 AC-02 (arm) and Barrett's mass properties of the BH280 (hand)
 MASSES = {
     "wam_base": 9.97059584,
     "wam1": 10.76768767,
@@ -30,7 +30,7 @@ MASSES = {
     "finger2_1": 0.062139,
     "finger2_2": 0.04166,
 }
-ARM = {  # ranges in rad and peak torques in N m (Barrett D1001, tables 5 and 6; HERB turns the first joint by pi)
+ARM = {  # ranges in rad and peak torques in N m, from Barrett D1001, tables 5 and 6; HERB turns the first joint by pi
     "j1": (np.pi - 2.6, np.pi + 2.6, 77.3),
     "j2": (-2.0, 2.0, 160.6),
     "j3": (-2.8, 2.8, 95.6),
@@ -50,7 +50,7 @@ INERTIAS = {
     "wam5": (0.00005029, 0.00007582, 0.00006270, 0.00000020, -0.00000005, -0.00000359),
     "wam6": (0.00055516, 0.00024367, 0.00045358, 0.00000061, -0.00000074, -0.00004590),
 }
-# Denavit-Hartenberg parameters a in m, alpha in rad and d in m (Barrett D1001, table 5, with the palm as the tool)
+# Denavit-Hartenberg parameters a in m, alpha in rad and d in m, from Barrett D1001, table 5; the palm is the tool
 CHAIN = ((0, -np.pi / 2, 0), (0, np.pi / 2, 0), (0.045, -np.pi / 2, 0.55), (-0.045, np.pi / 2, 0),
          (0, -np.pi / 2, 0.3), (0, np.pi / 2, 0), (0, 0, 0.072 + 0.095))  # fmt: skip
 
@@ -82,7 +82,6 @@ def test_model_has_the_published_masses_limits_and_torques(shared_env: SharedEnv
 
 @pytest.mark.parametrize("side", SIDES)
 def test_model_has_the_published_inertias(shared_env: SharedEnv, side: str) -> None:
-    """Barrett's frames are rotated about x by +90 and -90 degrees alternately."""
     model = shared_env("herb_reach").model
     for i, (name, values) in enumerate(INERTIAS.items()):
         body = model.body(f"{side}/{name}")
@@ -124,7 +123,6 @@ def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
 
 
 def test_one_motor_moves_both_joints_of_a_finger(shared_env: SharedEnv) -> None:
-    """The fingertip turns by 45 degrees when the finger turns by 140 degrees. Both spread joints move together."""
     env = shared_env("herb_reach", nworld=1, autoreset=False)
     env.reset()
     action = torch.zeros(1, 22)
@@ -151,7 +149,10 @@ def targets(env: lw.Env) -> np.ndarray:
 
 
 def put_targets(env: lw.Env, offset: np.ndarray) -> None:
-    """Stop the arms, and place each target at an offset along x from its palm. Offsets are in metres, (nworld, 2)."""
+    """Stop the arms, and place targets beside the palms.
+
+    Offsets along x are in metres, (nworld, 2).
+    """
     state = env.get_state()
     parts = env.state_space.split(state)
     parts["qvel"][:] = 0.0
@@ -162,7 +163,6 @@ def put_targets(env: lw.Env, offset: np.ndarray) -> None:
 
 
 def test_reward_evaluation_and_observation_equal_their_formulas(shared_env: SharedEnv) -> None:
-    """The states are far from the targets and close to them, so every reward term is covered."""
     env = shared_env("herb_reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for near in (False, True):
@@ -207,7 +207,6 @@ def test_random_resets_place_targets_in_front_of_each_shoulder_and_arms_near_hom
 
 
 def test_both_hands_can_reach_their_targets_at_the_same_time(shared_env: SharedEnv) -> None:
-    """Inverse kinematics solves random targets and the corners of their boxes, within limits and without contacts."""
     env = shared_env("herb_reach", nworld=16)
     model, rng = env.model, np.random.default_rng(0)
     corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)

@@ -1,4 +1,4 @@
-"""The tests of reward terms also cover aloha_lift."""
+"""Test panda_lift, and the reward terms of aloha_lift."""
 
 import mujoco
 import numpy as np
@@ -38,7 +38,6 @@ def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
 
 
 def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
-    """Gravity is compensated, and an action of 1 moves a servo target by 1 rad/s."""
     env = shared_env("panda_lift", nworld=2, autoreset=False)
     before = positions(env)[0][:, :9]
     for _ in range(50):
@@ -52,7 +51,6 @@ def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
 
 @pytest.mark.parametrize("physics", ["exact", "fast"])
 def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv, physics: str) -> None:
-    """The gripper descends, closes and rises. The task succeeds with a reward of nearly 6.5."""
     env = shared_env("panda_lift", nworld=4, autoreset=False, physics=physics)
     start, at = positions(env)[0], cube(env)
     waypoints = np.zeros((3, 4, 8))

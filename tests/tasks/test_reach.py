@@ -24,7 +24,6 @@ def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
 
 
 def test_arm_moves_like_the_original_arm_for_three_seconds(shared_env: SharedEnv) -> None:
-    """The controls push one joint against its limit. The expected numbers come from the original arm."""
     model = shared_env("reach").model
     np.testing.assert_allclose(model.jnt_range, RANGES)
     data = mujoco.MjData(model)
@@ -53,7 +52,6 @@ def errors(env: lw.Env) -> np.ndarray:
 
 
 def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
-    """Each world has a different target."""
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)
@@ -71,7 +69,6 @@ def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_e
 
 @pytest.mark.usefixtures("freed")
 def test_random_resets_place_the_target_within_its_box() -> None:
-    """Each world has another random target. The arm starts at rest with all joints at zero."""
     env = lw.make("reach", engine="mujoco", nworld=2000, target_range=(0.1, 0.5, 0.2))
     env.rand_reset(0)
     check_uniform(targets(env) / np.float32([0.1, 0.5, 0.2]))
@@ -104,7 +101,6 @@ def put_targets(env: lw.Env, distance: np.ndarray) -> None:
 
 
 def test_success_depends_on_the_mean_of_the_last_ten_distances(shared_env: SharedEnv) -> None:
-    """The targets jump every six steps."""
     env = shared_env("reach", nworld=64, autoreset=False, horizon=0)
     rng = np.random.default_rng(0)
     distances: list[np.ndarray] = []

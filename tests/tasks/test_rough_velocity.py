@@ -69,7 +69,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_those_of_mujoco
         points = data.qpos[:2] + grid[::7] @ np.array([forward, [-forward[1], forward[0]]])
         scan = [data.qpos[2] - ray_height(model, data, x, y) for x, y in points]
         np.testing.assert_allclose(critic["height_scan"][world, ::7], scan, atol=2e-4)
-    # an edge of the ground may carry a foot between the corners of its sole
+    # a foot may stand on an edge that lies between the corners of its sole
     assert equal > 0.8 * NWORLD * len(feet) and touched > NWORLD / 2
     noise = (parts(env, "policy")["height_scan"] - parts(env, "critic")["height_scan"]).abs()
     assert noise.max() <= 0.1 + 1e-5 and noise.mean() > 0.03
@@ -113,7 +113,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 def test_falling_robot_on_rough_ground_has_bounded_velocities_under_mujoco_warp(
     task: str, shared_env: SharedEnv
 ) -> None:
-    """The soles of the original G1 are boxes. MuJoCo Warp finds contacts for them with normals that point down."""
+    """MuJoCo Warp finds contact normals that point down for the box soles of the original G1."""
     env = shared_env(task, engine="warp", nworld=24)
     rng = np.random.default_rng(0)
     for _ in range(60):

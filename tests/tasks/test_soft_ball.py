@@ -9,7 +9,7 @@ import lyceum_warp as lw
 from lyceum_warp.engines.warp.sizes import probe_sizes
 
 OPEN, CLOSED = -1.0, 0.7
-LOW = -1.0  # height at which the gripper surrounds the ball on the floor
+LOW = -1.0  # the gripper surrounds the ball on the floor at this height
 
 
 def vertices(env: lw.Env) -> np.ndarray:
@@ -31,7 +31,6 @@ def hold(env: lw.Env, steps: int, *action: float) -> None:
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_gripper_squeezes_the_ball_and_lifts_it_to_the_target(shared_env: SharedEnv, engine: str) -> None:
-    """The fingers compress the ball by millimetres, and it bulges upwards."""
     env = shared_env("soft_ball", engine=engine, nworld=1, autoreset=False)
     env.reset()
     hold(env, 20, 0.0, LOW, OPEN)
@@ -71,7 +70,7 @@ def test_observation_and_reward_equal_formulas_of_the_ball_vertices(shared_env: 
 
 @pytest.mark.parametrize("axis", range(3))
 def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: int) -> None:
-    """The ball gets 80 % and 60 % of its width along an axis, or moves by 0.3 and 0.45 m."""
+    """Squeeze the ball to 80 % and 60 % of its width along an axis, or move it by 0.3 and 0.45 m."""
     env = shared_env("soft_ball", nworld=4, autoreset=False)
     env.reset()
     corners = np.array([env.model.body(f"ball_{i // 4}_{i // 2 % 2}_{i % 2}").pos for i in range(8)])
@@ -86,7 +85,6 @@ def test_a_crushed_or_lost_ball_ends_the_episode(shared_env: SharedEnv, axis: in
 
 
 def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
-    """The ball keeps its shape and rests on the floor."""
     env = shared_env("soft_ball", nworld=64)
     ball, widths = env.obs[:, 6:9].numpy(), env.obs[:, 12:15].numpy()
     target = ball + env.obs[:, 18:21].numpy()
@@ -98,7 +96,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_constraint_buffers_of_a_flex_model_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """Fingers that press into the ball cause twice as many constraints as the probed states."""
+    """When fingers press into the ball, it has twice as many constraints as in the probed states."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

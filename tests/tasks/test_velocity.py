@@ -56,8 +56,10 @@ def test_heights_and_contacts_of_feet_equal_those_of_mujoco(task: str, env: lw.E
 @pytest.mark.quick("g1_velocity")
 @pytest.mark.parametrize("task", ROBOTS)
 def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> None:
-    """The metric foot_slip is the squared horizontal speed of feet in contact, times the weight and the step's
-    duration."""
+    """The metric ``foot_slip`` is the squared horizontal speed of feet in contact.
+
+    The task multiplies it by the weight and the duration of a step.
+    """
     random_steps(env, 12, 1.0)
     env.set_params(least_command=-1.0)
     random_steps(env, 1, 1.0)
@@ -79,7 +81,6 @@ def test_velocities_of_feet_equal_those_of_mujoco(task: str, env: lw.Env) -> Non
 @pytest.mark.quick("g1_velocity")
 @pytest.mark.parametrize("task", ROBOTS)
 def test_feet_of_a_standing_robot_carry_its_weight(task: str, env: lw.Env) -> None:
-    """The sum of the forces on the feet is the weight, and joints without actions keep the home pose."""
     total = []
     for _ in range(12):
         env.step(torch.zeros(env.action.shape))

@@ -28,8 +28,8 @@ def bound(task: str) -> BoundTask:
 def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
     """Average masses, gains and ranges with their mirror images.
 
-    Published models are not symmetric: centres of mass differ by up to 6 mm, and both hips of the G1 have the left
-    hip's range.
+    Published models are not symmetric. Centres of mass differ by up to 6 mm, and both hips of the G1 have the range of
+    the left hip.
     """
     model, data = copy.copy(model), mujoco.MjData(model)
     data.qpos[:] = 0.0
@@ -111,7 +111,7 @@ def test_observations_of_mirrored_states_are_mirrored(task: str, shared_env: Sha
     noises = ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
     own = {f"{name}_noise": 0.0 for name in noises} | {"push_seconds": (1e6, 1e6)}
     if task == "go1_velocity":
-        own["imu"] = (0.01, 0.0, 0.02)  # the velocimeter is on one side of the robot
+        own["imu"] = (0.01, 0.0, 0.02)  # put the velocimeter into the plane of symmetry
     env = shared_env(task, nworld=16, **own)
     mirror = walkers.mirror(env.model, SimpleNamespace(**env.task.params))
     for _ in range(15):

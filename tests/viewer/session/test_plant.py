@@ -69,7 +69,7 @@ def test_plant_starts_another_episode_after_the_end_of_an_episode() -> None:
 
 
 class Slow:
-    """A controller that logs its calls, and blocks from the seventh call on."""
+    """A controller that logs its calls. It blocks in the seventh call and all later ones."""
 
     def __init__(self) -> None:
         self.inside, self.log, self.release = 0, [], threading.Event()
@@ -107,7 +107,7 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
     while slow.inside:
         time.sleep(0.01)
     time.sleep(0.1)
-    assert len(slow.log) == calls  # a session that has ended makes no further calls
+    assert len(slow.log) == calls  # no calls after the end of the session
     assert "reset within a call" not in slow.log
 
 

@@ -40,7 +40,6 @@ def test_trace_point_may_be_a_site_a_body_or_the_choice_of_the_task() -> None:
 
 
 def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
-    """The plant follows each path under the actions of the sample."""
     plant = lw.make("reach", autoreset=False, fields=["site_xpos"])
     mppi = lw.MPPI("reach", samples=6, horizon=5)
     control = WorldControl("mppi", mppi)

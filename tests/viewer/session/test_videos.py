@@ -72,7 +72,7 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         time.sleep(0.5)
 
     monkeypatch.setattr(drawing.Drawing, "draw", slow)
-    monkeypatch.setattr(videos, "FPS", 5)  # the video omits some poses, because rendering without a GPU is slow
+    monkeypatch.setattr(videos, "FPS", 5)  # without a GPU, rendering is slow, so the video must omit some poses
     try:
         taker.begin(CAMERA)
         while not drawn.is_set():

@@ -54,7 +54,7 @@ def wait_until(done: object) -> bool:
 
 
 def is_alive(pid: int) -> bool:
-    """A zombie does not count as running."""
+    """Return whether a process is running and not a zombie."""
     with contextlib.suppress(FileNotFoundError):
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     return False
@@ -95,7 +95,7 @@ def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
     os.kill(process_of(shared_window), signal.SIGINT)
     time.sleep(0.3)
     assert shared_window.is_open() and page(shared_window)
-    assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # Ctrl-C in the terminal does not reach the process
+    assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # a terminal sends Ctrl-C to one process group
 
 
 # frames
@@ -135,8 +135,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
     assert capfd.readouterr() == ("", "")  # studio prints nothing
 
 
-def test_frames_for_a_process_that_hangs_do_not_block_and_its_end_is_reported() -> None:
-    """The sending thread notices first that the process has ended."""
+def test_frames_for_a_hanging_window_do_not_block_and_its_end_is_reported() -> None:
     with contextlib.closing(Window(scene_of(MODEL))) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))
@@ -178,7 +177,6 @@ time.sleep(60)
 @pytest.mark.long
 @pytest.mark.parametrize(("number", "fork"), [(signal.SIGKILL, True), (signal.SIGINT, False)])
 def test_window_ends_with_the_session(number: int, fork: bool, tmp_path: Path) -> None:
-    """A fork of the session keeps the connection open."""
     program = tmp_path / "program.py"
     program.write_text(PROGRAM.format(tests=str(Path(__file__).parents[2]), fork=fork))
     with subprocess.Popen([sys.executable, str(program)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as session:

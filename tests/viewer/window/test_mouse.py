@@ -56,10 +56,10 @@ def test_dragged_body_is_placed_only_while_paused_and_only_when_it_moves(bench: 
 
 @pytest.mark.parametrize("paused", [False, True])
 def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> None:
-    """A browser that is closed during a drag never releases the button."""
+    """A browser that closes during a drag never reports that the button was released."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()
-    bench.panel.mouse.let_go()  # another thread makes this call, and no frame is drawn afterwards
+    bench.panel.mouse.let_go()  # called by another thread, and not followed by a frame
     bench.panel.mouse.let_go()
     (end,) = bench.sent
     assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None

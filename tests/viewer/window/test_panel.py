@@ -42,7 +42,7 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
         samples=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
     assert bench.sent == [Opened("http://here")]
-    assert bench.draw() == bench.draw(frame) == []  # draw before and with the first frame
+    assert bench.draw() == bench.draw(frame) == []  # draw without a frame, then with the first frame
     bench.panel.actions.cameras.choose(studio.ux.FREE_CAMERA_IDX)
     assert bench.draw() == []
     small = Bench(bench.model, scene_of(bench.model, nworld=1, controllers=(), episodes=(), curves=()))

@@ -104,7 +104,10 @@ def get(
     proxy: Proxy, path: str = "/PATH/", *headers: str, host: str = "HOST", cookie: str = "lyceum-warp=VALUE",
     method: str = "GET", rest: bytes = b"",
 ) -> bytes:  # fmt: skip
-    """Return the response to a request. Words in capitals stand for the proxy's port, path, cookie and token."""
+    """Return the response to a request.
+
+    In arguments, PORT, PATH, VALUE and TOKEN stand for the proxy's port, path, cookie and token.
+    """
     own, below = entered(proxy)
     words = {"HOST": "127.0.0.1:PORT", "PORT": str(proxy.port), "PATH": below.strip("/"), "TOKEN": token(proxy),
              "VALUE": own.partition("=")[2]}  # fmt: skip
@@ -142,7 +145,7 @@ def test_token_is_exchanged_for_a_cookie_and_removed_from_the_address(proxy: Pro
 
 
 class Jar(http.cookiejar.CookieJar):
-    """A cookie jar that, like a browser, sends cookies to every port of their host, below their path."""
+    """Send cookies to every port of their host, below their path, as browsers do."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
@@ -151,7 +154,6 @@ class Jar(http.cookiejar.CookieJar):
 
 
 def test_browser_does_not_send_the_cookie_to_another_port(proxy: Proxy) -> None:
-    """Other users of the machine may listen on other ports."""
     jar = Jar()
     browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(jar))
     cookie, path = entered(proxy)
@@ -262,7 +264,7 @@ def test_link_with_the_token_on_another_page_opens_the_viewer(proxy: Proxy, upst
     "host", ["127.0.0.1", "127.0.0.1:9000", "localhost:9000", "Localhost:80", "[::1]:9000", "192.168.0.7:8080"]
 )
 def test_addresses_of_this_machine_are_accepted_at_any_port(proxy: Proxy, host: str) -> None:
-    """The port in a request may differ, because ports may be forwarded."""
+    """A forwarded port may differ from the proxy's own port."""
     assert status(get(proxy, "/PATH/", f"Origin: http://{host.lower()}", host=host)) == 200
 
 
@@ -327,7 +329,7 @@ def test_silent_connections_do_not_block_other_connections(proxy: Proxy, monkeyp
         assert silent[0].recv(1) == b""
 
 
-def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connection_is_closed_if_the_client_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "WRITE_SECONDS", 0.3)
     size = 64 * 2**20
     upstream = Upstream(b"HTTP/1.1 200 OK\r\nContent-Length: %d\r\n\r\n" % size + bytes(size))
@@ -338,7 +340,7 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
             client.connect(("127.0.0.1", proxy.port))
             client.sendall(f"GET {path}/ HTTP/1.1\r\nHost: 127.0.0.1\r\nCookie: {key}\r\n\r\n".encode())
             wait_until(lambda: upstream.ended == 1)
-            with pytest.raises(ConnectionError):  # an open connection would accept these bytes
+            with pytest.raises(ConnectionError):  # the connection is closed
                 for _ in range(1000):
                     client.send(b"x")
                     time.sleep(0.01)
@@ -349,7 +351,10 @@ def test_connection_of_a_client_that_does_not_read_is_closed(monkeypatch: pytest
 
 @pytest.fixture
 def echo() -> Iterator[tuple[Proxy, list[ServerConnection], list[float]]]:
-    """Run a proxy of a WebSocket server; yield the proxy, the connections, and the times of reported silence."""
+    """Run a proxy of a WebSocket server.
+
+    Yield the proxy, its connections, and the times at which silence was reported.
+    """
     opened: list[ServerConnection] = []
     quiet: list[float] = []
 
@@ -409,7 +414,7 @@ def test_private_server_notices_a_lost_tab(echo: Echo) -> None:
     proxy, opened, _ = echo
     tab = open_tab(proxy)
     wait_until(lambda: len(opened) == 1)
-    tab.socket.shutdown(socket.SHUT_RDWR)  # a killed browser's connection is closed in the same way
+    tab.socket.shutdown(socket.SHUT_RDWR)  # a killed browser closes its connection in the same way
     wait_until(lambda: not opened)
 
 
@@ -418,7 +423,7 @@ def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytes
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:
         tab.send(b"input")
-        wait_until(lambda: len(quiet) == 1)  # the tab may be hidden, or the connection may be lost
+        wait_until(lambda: len(quiet) == 1)  # tabs send nothing if they are hidden or if the connection is lost
         tab.send(b"input")
     wait_until(lambda: len(quiet) == 2)  # closed
     time.sleep(1.0)

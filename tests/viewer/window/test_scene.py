@@ -43,7 +43,7 @@ def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, bes
     scene = ExtraGeoms(MODEL, limit)
     geoms = scene.draw(frame(traces=traces, best=best), SHOWN)
     assert len(geoms) <= min(limit, 160)
-    assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # a trace has at least 4 lines
+    assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # each trace needs at least 4 lines
     ghosts = tuple(ghost(i) for i in range(20))
     assert len(scene.draw(frame(ghosts=ghosts, traces=traces, best=best), SHOWN)) <= limit
 

@@ -8,7 +8,7 @@ from lyceum_warp.viewer.window import studio
 
 
 def test_screen_does_not_listen_on_a_public_socket_of_studio(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The test simulates a later version of Studio that does not call bind_public_socket."""
+    """Simulate a later version of Studio that does not call ``bind_public_socket``."""
 
     def start(config: object, endpoint: object, plugins: list[object]) -> None:
         plugin_registry.PluginRegistry(plugins).dispatch(studio.Started(viewer=None))
