@@ -1,4 +1,4 @@
-"""Generate models with every element that both engines support."""
+"""Generate models that together contain every element that both engines support."""
 
 import functools
 import itertools
@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 
 Case = dict[str, str]
-"""The level of each factor."""
+"""Map each factor to one of its levels."""
 
 GENERAL = "<general {place} {kind} {extra}/>"
 DRIVES = {
@@ -33,7 +33,7 @@ DRIVE_GROUPS = {
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""A model combines each actuator of one group with each transmission."""
+"""Groups of actuators. A model combines each actuator of one group with each transmission."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -115,7 +115,7 @@ STAGES = {
     "energy": "energy",
     "acceleration": "qacc qfrc_actuator",
 }
-"""Fields of World, by the stage that computes them."""
+"""Map each stage of the physics to the fields of World that it computes."""
 
 FIELDS = {
     "nothing": "",
@@ -165,7 +165,7 @@ REFUSED: list[tuple[Mapping[str, tuple[str, ...]], str]] = [
     ({"integrator": ("discrete",), "flex": ("rope",)}, "flex edge stiffness and damping are not supported"),
     ({"integrator": ("discrete",), "noslip": ("2",)}, "noslip solver not implemented for the discrete integrator"),
 ]  # fmt: skip
-"""Combinations that MuJoCo or MuJoCo Warp rejects, with their errors."""
+"""Combinations of levels that MuJoCo or MuJoCo Warp rejects, and the error of each combination."""
 
 UNKNOWN = {
     "mjTRN_SO3": "MuJoCo Warp refuses it",
@@ -192,7 +192,7 @@ UNKNOWN = {
     "mjDSBL_AUTORESET": "MuJoCo Warp refuses it",
     "mjNDISABLE": "it is a number of flags",
 }
-"""Enum members that no model uses, each with a reason."""
+"""Enum members that no model uses, and the reason for each."""
 
 
 def xml(case: Case, sensors: str | None = None) -> str:
@@ -281,7 +281,7 @@ def is_refused(case: Case) -> bool:
 
 
 def singles() -> Iterator[Case]:
-    """Yield a case for each level of each factor. All other factors have their first levels."""
+    """Yield a case for each level of each factor. In it, all other factors have their first levels."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -290,10 +290,7 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that contain every combination of ``strength`` levels.
-
-    The search is greedy: a case starts with a missing combination, and each further level adds the most missing ones.
-    """
+    """Return cases that contain every combination of ``strength`` levels, by a greedy search."""
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
     for chosen in itertools.combinations(FACTORS, strength):
@@ -303,7 +300,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
     while missing:
         first = next(iter(missing))
         if (case := _completed(dict(first), rng, missing, strength)) is None:
-            del missing[first]  # an engine always rejects this combination
+            del missing[first]  # every case with this combination is refused
             continue
         for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
             missing.pop(part, None)
@@ -312,7 +309,7 @@ def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
 
 
 def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Choose the remaining levels in random order, to add the most missing combinations."""
+    """Choose a level for each remaining factor, so that the case contains many missing combinations."""
     rest = [name for name in FACTORS if name not in case]
     rng.shuffle(rest)
     for name in rest:

@@ -24,7 +24,7 @@ from lyceum_warp.fields import describe
 
 @pytest.fixture
 def without_allocators(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Remove custom allocators, which exist only on CUDA devices."""
+    """Disable custom allocators, because they need a CUDA device."""
     monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
 
 
@@ -66,7 +66,7 @@ def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pyte
     assert 100_010 <= block.size < 100_010 + 512
 
 
-# on a GPU, the order of contacts and rows is random; these tests shuffle them instead
+# these tests shuffle contacts and rows, because their order is random only on a GPU
 
 
 @pytest.fixture(scope="module", params=["dense", "sparse"])
@@ -121,7 +121,7 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
         kinds = np.minimum(wanted["type"][w, :n], 5)
         groups = {key: rng.random() for key in zip(kinds, wanted["id"][w, :n], strict=True)}
         keys = [groups[kind, i] for kind, i in zip(kinds, wanted["id"][w, :n], strict=True)]
-        shuffle = np.argsort(keys, kind="stable")  # rows of one constraint stay adjacent and ordered
+        shuffle = np.argsort(keys, kind="stable")  # a stable sort keeps the rows of a constraint adjacent and in order
         place = np.argsort(shuffle)
         for name in names:
             array = getattr(d.efc, name).numpy()
@@ -150,7 +150,6 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
 def test_contact_field_without_a_sorting_rule_raises_an_error(
     forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A new version of MuJoCo Warp may add contact fields."""
     engine, _ = forwarded
     # type: ignore[attr-defined]
     known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
@@ -160,7 +159,7 @@ def test_contact_field_without_a_sorting_rule_raises_an_error(
 
 
 class Capturing:
-    """A fake CUDA device. During a capture, Warp allocates some memory in the capture and some outside it."""
+    """Imitate a CUDA device on which Warp captures a graph."""
 
     is_capturing = True
 
@@ -198,7 +197,6 @@ def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch)
     scratch.deallocate(more, 2000)
     assert not device.freed
     for within in (True, False):
-        # this memory belongs to the graph, or was allocated outside a capture
         device.stream.is_capturing, device.is_capturing = within, within
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)

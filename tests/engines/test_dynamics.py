@@ -74,9 +74,8 @@ def draw(engine: Engine, seed: int = 0, *chosen: int) -> None:
     rng = np.random.default_rng(seed)
     for name in sorted(engine.dynamics):
         array, own = engine.arrays[name].numpy(), engine.nominal[name].numpy()
-        shape = (
-            (*array.shape[:-1], 1) if name == "body_inertia" else array.shape
-        )  # one factor per body keeps the inertia valid
+        # scaling all of a body's moments of inertia by one factor keeps them valid
+        shape = (*array.shape[:-1], 1) if name == "body_inertia" else array.shape
         drawn = own * rng.uniform(0.8, 1.2, size=shape).astype(np.float32)
         if name == "body_ipos":
             drawn[:, 1:] += 0.01
@@ -140,7 +139,7 @@ def test_worlds_with_their_own_models_step_like_plain_mujoco(engine: type[Engine
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_nominal_per_world_fields_give_the_steps_of_the_shared_model() -> None:
+def test_worlds_with_nominal_fields_step_like_the_shared_model() -> None:
     np.testing.assert_array_equal(run(make(MujocoEngine, *DRAWN)), run(make(MujocoEngine)))
 
 
@@ -166,7 +165,6 @@ def test_restored_nominal_values_give_the_original_steps(engine: type[Engine]) -
 def test_rollout_uses_the_model_fields_of_each_state(
     engine: type[Engine], integrator: str, current: tuple[str]
 ) -> None:
-    """The C engine computes the first case in one native call, and the second case step by step."""
     model = copy.copy(MODEL)
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     source, planner = (make(engine, *DRAWN, fields=current, model=model) for _ in range(2))
@@ -192,7 +190,7 @@ def test_rollout_uses_the_model_fields_of_each_state(
 
 
 class WholeWarpEngine(WarpEngine):
-    """``settle`` computes forward passes of all worlds, as in the deterministic engine."""
+    """A Warp engine whose ``settle`` runs forward passes of all worlds."""
 
     partial_refresh = False
 
@@ -279,7 +277,7 @@ SLIDERS = """<mujoco><worldbody>
 
 
 def test_inverse_weights_equal_those_of_a_compiled_model() -> None:
-    """If a body cannot move in a direction, MuJoCo sets its inverse weight to 0. MuJoCo Warp does not."""
+    """MuJoCo sets the inverse weight to 0 if a body cannot move in a direction."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
     engine = make(WarpEngine, "body_mass", nworld=2, model=model)
     for scale in (1.0, 2.0):

@@ -85,7 +85,7 @@ def test_fields_of_the_last_substep_are_current_after_a_reset(file: Path, engine
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
     for _ in range(6):
         env.step(torch.ones(2, 1))
-        if not env.done.any():  # these fields are one substep older than the state
+        if not env.done.any():  # these fields still have the values of the previous substep
             assert (env.obs[:, 0] != env.obs[:, 1]).all()
     assert env.truncated.all()
     torch.testing.assert_close(env.obs[:, :2], torch.full((2, 2), 0.5))
@@ -94,9 +94,7 @@ def test_fields_of_the_last_substep_are_current_after_a_reset(file: Path, engine
 CLEARED = TASK.replace('lagged = ("sensordata",)', 'lagged = cleared = ("sensordata",)').replace("Filtered", "Cleared")
 
 
-@pytest.mark.parametrize(
-    "fields", [[], ["xpos"], ["qacc"]]
-)  # the listed fields must be computed at the start of an episode
+@pytest.mark.parametrize("fields", [[], ["xpos"], ["qacc"]])
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_fields_listed_as_cleared_are_zero_when_an_episode_begins(
     task_file: TaskFile, engine: str, fields: list[str]
@@ -119,7 +117,6 @@ def test_fields_listed_as_cleared_are_zero_when_an_episode_begins(
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) -> None:
-    """A low-pass filter of the controls continues from restored controls, and starts from zero after a reset."""
     env = lw.make(file, engine=engine, nworld=2, horizon=0)
     action = torch.ones(2, 1)
 
@@ -151,7 +148,6 @@ def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: st
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_additional_fields_do_not_change_the_simulation(file: Path, engine: str) -> None:
-    """The state only grows by an acceleration field."""
     plain = lw.make(file, engine=engine, nworld=2, seed=3)
     other = lw.make(file, engine=engine, nworld=2, seed=3, fields=["qacc_warmstart", "xpos", "qacc"])
     parts = list(plain.state_space.parts)
@@ -191,7 +187,6 @@ def test_reset_does_not_change_faults_of_other_worlds() -> None:
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_listed_fields_are_computed_even_if_the_task_does_not_read_them(engine: str) -> None:
-    """A sensor is enabled only if a listed field needs it."""
     env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
     size = env.state_space.size  # cfrc_ext includes the contact forces
     env.step()
@@ -225,7 +220,7 @@ def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A world starts with too many contacts."""
+    """Contacts exceed the buffer already in the initial state."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1

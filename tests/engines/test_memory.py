@@ -27,7 +27,7 @@ def test_error_of_too_many_worlds_contains_the_largest_number_that_fits(monkeypa
     check_fit(1000, 10**9, CPU)
 
 
-def test_memory_check_first_frees_the_gpu_memory_that_torch_has_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_check_frees_cached_gpu_memory_of_torch_first(monkeypatch: pytest.MonkeyPatch) -> None:
     free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
     monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))
@@ -37,12 +37,11 @@ def test_memory_check_first_frees_the_gpu_memory_that_torch_has_cached(monkeypat
 
 
 def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
-    """The estimate includes data for all worlds, data for the few worlds of one refresh, and temporary arrays."""
     for task in ("hopper", "ant"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine
         found = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays_in(engine.d)) / 64
-        pool = engine.spare * 500 / 64  # memory of additional contacts, which all worlds share
+        pool = engine.spare * 500 / 64  # all worlds share this memory of additional contacts
         estimate = type(engine).bytes_per_world(env.model, engine.fields.values())
         assert found - pool < estimate < 1.6 * found, task
         assert estimate < env.bytes_per_world < 1.3 * estimate
@@ -63,8 +62,8 @@ def resident() -> int:
 
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
-def test_memory_estimate_of_the_c_engine_covers_worlds_without_their_own_mjdata(fields: tuple[str, ...]) -> None:
-    """An MjData takes 165 kB even for a small model."""
+def test_memory_estimate_of_the_c_engine_covers_its_worlds(fields: tuple[str, ...]) -> None:
+    """A world must not need its own MjData, because even that of a small model takes 165 kB."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size
     assert own < env.bytes_per_world

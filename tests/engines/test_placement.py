@@ -96,7 +96,6 @@ def test_engine_options_are_read_from_its_signature(model: mujoco.MjModel) -> No
 def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made(
     engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Memory that the caller allocates is also counted."""
     cpu = wp.get_device("cpu")
     each = placement.bytes_per_world(engine, model, cpu, [])
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
@@ -116,7 +115,7 @@ def test_only_engine_auto_moves_few_worlds_to_the_cpu() -> None:
 
 
 def test_plant_runs_on_the_cpu_even_if_its_device_is_a_gpu(gpu: Any) -> None:
-    """On the GPU, the plant's steps would wait for the planner."""
+    """On the GPU, the planner would delay the plant's steps."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU
     for engine, device in (("auto", None), ("warp", "cpu"), ("mujoco", "cpu"), (ToyEngine, "cuda:0")):
@@ -124,8 +123,6 @@ def test_plant_runs_on_the_cpu_even_if_its_device_is_a_gpu(gpu: Any) -> None:
 
 
 def test_engine_of_a_planner_depends_on_the_number_of_samples(gpu: Any) -> None:
-    """An explicit engine is used unchanged."""
-
     def chosen(
         samples: int,
         engine: str = "auto",

@@ -14,7 +14,7 @@ from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
 
 SENSORS = {name: table.SENSORS[name] for name in ("position", "velocity", "limits", "histories")}
-SENSORS["limits"] = re.sub(r"<\w+frc [^>]*>", "", SENSORS["limits"])  # forces belong to the acceleration stage
+SENSORS["limits"] = re.sub(r"<\w+frc [^>]*>", "", SENSORS["limits"])  # the acceleration stage computes force sensors
 SENSORS["mixed"] = table.SENSORS["velocity"] + table.SENSORS["acceleration"]
 FIELDS = "site_xpos xpos xquat subtree_com cam_xpos cvel sensordata"
 
@@ -32,7 +32,7 @@ def only(engine: Engine, *worlds: int) -> wp.array:
 
 
 def begin(engine: Engine, mask: wp.array, seed: int) -> None:
-    """Begin episodes in random states, some beyond a limit or in contact."""
+    """Begin episodes in random states. Some states exceed a joint limit or have contacts."""
     rng, chosen = np.random.default_rng(seed), mask.numpy().astype(bool)
     engine.reset(mask)
     write(engine, "qpos", chosen, engine.arrays["qpos"].numpy() + 0.1 * rng.normal(size=engine.arrays["qpos"].shape))
@@ -89,7 +89,7 @@ def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine that cannot run a forward pass of only a few worlds."""
+    """A Warp engine without forward passes of selected worlds."""
 
     partial_refresh = False
 
@@ -167,7 +167,7 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # the sensors of a restored world belong to the restored state, even after another refresh
+    # another refresh does not change the sensors of a world with a restored state
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
@@ -185,7 +185,7 @@ def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> 
         engine.refresh_current(everyone(engine))
         np.testing.assert_array_equal(state_of(engine), before)
         engine.refresh(only(engine, 1))
-        size = engine.integration_size  # after a restart, acceleration sensors belong to the first state of the episode
+        size = engine.integration_size
         np.testing.assert_array_equal(state_of(engine)[:, :size], before[:, :size])
     before = state_of(engine)
     begin(engine, only(engine, 2), 5)
@@ -228,7 +228,6 @@ def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
-    """Worlds that share an MjData run each stage in turn. Fields of other stages then belong to another world."""
     model, device = model_of("mixed"), wp.get_device("cpu")
     for lagged, current in ((), ("xpos",)), (("cvel",), ("xpos",)), (("cvel", "xpos"), ("sensordata",)):
         fields = [describe(model, name, lagged=name in lagged) for name in (*lagged, *current, "qacc", "qvel")]
@@ -248,7 +247,7 @@ def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # other sensors belong to the last substep
+    early = early_sensor_columns(model)  # all other sensors keep the values of the last substep
     for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
         data = mujoco.MjData(model)
         mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)

@@ -53,10 +53,10 @@ def state_of(engine: WarpEngine, m: mjw.Model, d: mjw.Data) -> np.ndarray:
 
 
 def plain(function: Callable[[mjw.Model, mjw.Data], None], m: mjw.Model, d: mjw.Data) -> None:
-    """Run MuJoCo Warp's step or forward pass, but let constraints read the current velocities.
+    """Run MuJoCo Warp's step or forward pass, but compute constraints from the current velocities.
 
-    MuJoCo Warp's ``make_constraint`` reads velocities of the last forward pass. The engine recomputes them, so a step
-    depends only on the state.
+    MuJoCo Warp's ``make_constraint`` uses the velocities of the last forward pass. The engine recomputes them, so that
+    a step depends only on the state.
     """
 
     def make_constraint(m: mjw.Model, d: mjw.Data) -> None:
@@ -91,7 +91,7 @@ def check(case: Case, device: wp.Device) -> None:
     last = {name: getattr(d, name).numpy().copy() for name in names}
     set_state(m, d, found)
     plain(mjw.forward, m, d)
-    if "energy" in names:  # MuJoCo Warp's forward pass loses the kinetic energy if the model has an energy sensor
+    if "energy" in names:  # with an energy sensor, MuJoCo Warp's forward pass loses the kinetic energy
         mjw.energy_pos(m, d)
         mjw.energy_vel(m, d)
     late = np.setdiff1d(np.arange(model.nsensordata), early_sensor_columns(model))
@@ -118,7 +118,6 @@ def check_or_refuse(case: Case, device: wp.Device) -> None:
 
 @pytest.mark.parametrize("case", table.covering(1), ids=table.title)
 def test_step_equals_that_of_mujoco_warp_bit_for_bit(case: Case, device: wp.Device) -> None:
-    """The cases cover all levels of all factors."""
     check_or_refuse(case, device)
 
 
@@ -147,7 +146,6 @@ LADEN = table.PLAIN | {
 @pytest.mark.quick("com", "tendon", "transmission", "com velocity", "energy", "acceleration")
 @pytest.mark.parametrize("asked", table.STAGES)
 def test_step_reuses_fields_that_are_already_computed(asked: str, device: wp.Device) -> None:
-    """A step computes a stage of the physics only if a field needs it and it is not computed yet."""
     check(LADEN | {"asked": asked}, device)
 
 
@@ -160,11 +158,11 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Levels that a field needs to have an effect, by field. All other factors have the levels in ``DRAWN``."""
+"""Map a field to levels with which it has an effect. All other factors have the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
-    """Return states with contacts, saturated actuators and joints at their limits, (N, integration size)."""
+    """Return states (N, integration size) with contacts, saturated actuators and joints at their limits."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     data.qpos[model.joint("elbow").qposadr[0]] = 0.1
     data.qvel[:] = 0.05 * rng.normal(size=model.nv)
@@ -181,7 +179,7 @@ def touching(model: mujoco.MjModel) -> np.ndarray:
 )  # fmt: skip
 @pytest.mark.parametrize("name", VARYING_FIELDS)
 def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, device: wp.Device) -> None:
-    """Some model fields are zero by default. Results are bitwise equal if no constants are derived from the field."""
+    """Require bitwise equality unless constants are derived from the field."""
     case = DRAWN | OF_ANOTHER_MODEL.get(name, {})
     spec = mujoco.MjSpec.from_string(table.xml(case))
     for body in spec.bodies[1:]:
@@ -189,7 +187,7 @@ def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, devi
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    # most joints slip, and a slipping joint's friction force does not depend on solref
+    # a slipping joint's friction force does not depend on solref, and most joints slip
     most = 3.0 if name == "dof_solref" else 1.1
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
@@ -233,7 +231,7 @@ def test_engines_reject_the_listed_combinations(levels: dict[str, tuple[str, ...
 
 
 def test_table_contains_every_member_of_the_mujoco_enums() -> None:
-    """A new MuJoCo element must be added to the table, or listed with a reason."""
+    """List each new MuJoCo element in the table, or with a reason in ``UNKNOWN``."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}
