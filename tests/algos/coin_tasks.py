@@ -1,6 +1,6 @@
 """Define tasks for planner tests.
 
-The reward of a step is its action times 1 or -1, as a fair coin decides.
+A fair coin decides whether the reward of a step is its action or minus its action.
 """
 
 import warp as wp

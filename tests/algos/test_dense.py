@@ -8,7 +8,7 @@ from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
 def perturbed(module: nn.Module) -> nn.Module:
-    """Add random numbers to the weights, because initial weights give some derivatives of zero."""
+    """Add random numbers to the weights, so that derivatives are not zero."""
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in module.parameters():

@@ -15,7 +15,6 @@ from lyceum_warp.algos import distributed
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.runs.folder import Run
 
-# these settings use every feature that might depend on the number of processes
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
            "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip

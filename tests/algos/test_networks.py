@@ -30,7 +30,6 @@ def test_npg_learns_with_different_activations_of_policy_and_value() -> None:
     npg = lw.NPG(env, config=config)
     assert (npg.policy.shape["activation"], npg.value.shape["activation"]) == ("elu", "relu")
     iteration = next(npg)
-    # a correct step length shows that the Fisher products are correct
     assert iteration.kl == pytest.approx(0.5 * config.delta, rel=0.3)
 
 

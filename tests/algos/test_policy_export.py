@@ -43,7 +43,6 @@ def compare(policy: lw.GaussianPolicy, path: Path, run: Run) -> None:
             expected = policy(torch.from_numpy(obs)).numpy()
         action = run(path, obs)
         assert action.shape == (n, 2) and action.dtype == np.float32
-        # three layers add rounding errors
         np.testing.assert_allclose(action, expected, rtol=1e-5, atol=1e-5)
 
 

@@ -67,7 +67,7 @@ class Plain(torch.nn.Module):
 
 
 def quantile_huber(quantiles: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Compute equation 10 of Dabney et al. (2018) in loops over quantiles and targets."""
+    """Compute the quantile Huber loss with plain loops."""
     (rows, n), losses = quantiles.shape, []
     for row in range(rows):
         for i in range(n):

@@ -25,7 +25,7 @@ def learner(env: lw.Env, symmetry: str, **changes: Any) -> lw.PPO:
 
 
 def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> float:
-    """Return how far a policy is from equivariance, as a mean absolute difference of actions."""
+    """Return the mean absolute equivariance error of a policy."""
     mirror = PolicyMirror(reflections(env))
     obs = torch.randn(500, env.obs_space.size, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
@@ -102,7 +102,7 @@ def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
     weight = ppo.policy.network[0].weight.grad
     signs = torch.tensor([1.0, -1.0])
     rows, columns = signs, signs.repeat(3)
-    assert weight.abs().min() < 1e-6 * weight.abs().max()  # the gradient of weights between x and y cancels
+    assert weight.abs().min() < 1e-6 * weight.abs().max()
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 
@@ -123,7 +123,7 @@ def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env,
     policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
-        # converting actions to their bounds causes rounding errors
+        # the scaling of actions causes rounding errors
         assert max(before, asymmetry(policy.act, env)) < 1e-6
         assert lw.SAC(env, lw.load(tmp_path / "run"), config=lw.SACConfig(batch=64)).config.symmetry == "exact"
     else:

@@ -26,7 +26,7 @@ def test_both_engines_play_the_same_episodes(shared_env: SharedEnv) -> None:
     assert returns.first == pytest.approx(own.returns.mean().item())
     assert lengths.first == pytest.approx(own.lengths.mean().item())
     assert falls.first == pytest.approx(own.terminated.mean().item())
-    # without paired episodes, differences between initial states would hide the agreement
+    # pairing the episodes removes the differences between initial states
     assert returns.verdict == lengths.verdict == "same" and own.lengths.std() > 1.0
     assert returns.high - returns.low < 0.2 * own.returns.std().item()
     assert shown[-1][0] <= shown[-1][1] == 400 and torch.equal(env.get_state(), before)

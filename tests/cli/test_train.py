@@ -161,7 +161,6 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
-    # videos need 1 world, training and eval 2, and the final evaluation 32
     assert {env.nworld for env in made_envs} == {1, 2, 32}
     assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
     made_envs.clear()

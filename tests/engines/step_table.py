@@ -281,7 +281,7 @@ def is_refused(case: Case) -> bool:
 
 
 def singles() -> Iterator[Case]:
-    """Yield a case for each level of each factor. In it, all other factors have their first levels."""
+    """Yield one case for each level of each factor. The other factors have their first levels."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}

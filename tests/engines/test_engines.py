@@ -188,7 +188,7 @@ def test_reset_does_not_change_faults_of_other_worlds() -> None:
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_listed_fields_are_computed_even_if_the_task_does_not_read_them(engine: str) -> None:
     env = lw.make("adroit_pen", engine=engine, fields=["sensordata", "cfrc_ext"])
-    size = env.state_space.size  # cfrc_ext includes the contact forces
+    size = env.state_space.size
     env.step()
     assert env.field("sensordata").abs().max() > 0
     assert env.field("cfrc_ext").shape == (1, env.model.nbody, 6)
@@ -220,7 +220,7 @@ def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
 def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     partial: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Contacts exceed the buffer already in the initial state."""
+    """The initial state has more contacts than the buffer can hold."""
     monkeypatch.setattr(WarpEngine, "partial_refresh", partial)
     spec = lw.gymnasium_model("humanoid.xml").spec()
     spec.body("torso").pos[2] = 0.1

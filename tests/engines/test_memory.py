@@ -41,7 +41,7 @@ def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine
         found = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays_in(engine.d)) / 64
-        pool = engine.spare * 500 / 64  # all worlds share this memory of additional contacts
+        pool = engine.spare * 500 / 64  # all worlds share the memory for additional contacts
         estimate = type(engine).bytes_per_world(env.model, engine.fields.values())
         assert found - pool < estimate < 1.6 * found, task
         assert estimate < env.bytes_per_world < 1.3 * estimate
@@ -63,7 +63,6 @@ def resident() -> int:
 
 @pytest.mark.parametrize("fields", [(), ("xpos",)])
 def test_memory_estimate_of_the_c_engine_covers_its_worlds(fields: tuple[str, ...]) -> None:
-    """A world must not need its own MjData, because even that of a small model takes 165 kB."""
     env = lw.make("hopper", fields=fields, nthread=2)
     own = 4 * (2 * env.obs_space.size + 2 * env.action_space.size) + 8 * env.state_space.size
     assert own < env.bytes_per_world

@@ -167,7 +167,7 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     np.testing.assert_array_equal(pushed[:, late], left[:, late])
     np.testing.assert_array_equal(pushed[[1, 3]], left[[1, 3]])
     assert (pushed[[0, 2]] != left[[0, 2]]).any()
-    # another refresh does not change the sensors of a world with a restored state
+    # a refresh does not change the sensors of a restored world
     engine.step(1)
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))

@@ -158,7 +158,7 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Map a field to levels with which it has an effect. All other factors have the levels in ``DRAWN``."""
+"""Map a field to the levels that it needs to have an effect. All other factors have the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:
@@ -187,7 +187,7 @@ def test_randomized_field_has_the_same_effect_as_an_edited_model(name: str, devi
     model = spec.compile()
     edited, field = copy.copy(model), describe_model_field(model, name)
     value = field.value(edited)
-    # a slipping joint's friction force does not depend on solref, and most joints slip
+    # most joints slip, and then solref does not affect their friction force
     most = 3.0 if name == "dof_solref" else 1.1
     drawn = value * np.random.default_rng(0).uniform(1.0, most, size=value.shape) + 0.03 * (value == 0)
     if name.endswith("quat"):
@@ -231,7 +231,7 @@ def test_engines_reject_the_listed_combinations(levels: dict[str, tuple[str, ...
 
 
 def test_table_contains_every_member_of_the_mujoco_enums() -> None:
-    """List each new MuJoCo element in the table, or with a reason in ``UNKNOWN``."""
+    """Add each new MuJoCo element to the table, or give a reason in ``UNKNOWN``."""
     models = [table.model_of(case) for case in table.singles()]
     for enum, members in table.ENUMS.items():
         found = {int(member) for model in models for member in members(model)}

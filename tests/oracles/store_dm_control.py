@@ -72,7 +72,7 @@ def round_target(domain: str, physics: Any) -> None:
 def stored(domain: str, task: str) -> dict[str, Any]:
     """Return a task's arrays.
 
-    Episodes have the shape (starts, segments, size), and initial states (resets, size).
+    Episodes have the shape (starts, segments, size). Initial states have the shape (resets, size).
     """
     env = suite.load(domain, task, task_kwargs={"random": 0})
     physics, spec = env.physics, env.action_spec()

@@ -22,7 +22,7 @@ from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "dm_control"
 LAST_SUBSTEP = ("touch", "imu", "force_torque")
-"""Parts of the observation that cannot be computed from the state, only by a substep."""
+"""Parts of the observation that only a substep can compute."""
 RESETS = 512
 quick = pytest.mark.quick("dm/cartpole_swingup", "dm/finger_turn_hard", "dm/manipulator_bring_ball", "dm/walker_walk")
 

@@ -1,7 +1,7 @@
 """Compare the C engine with the Warp engine for every task of the package.
 
-The C engine uses float64, and the Warp engine float32. The tests use elliptic friction cones. With pyramidal cones,
-trajectories differ, because MuJoCo and MuJoCo Warp use different contact frames for a capsule on a plane.
+The C engine uses float64, and the Warp engine float32. The tests use elliptic friction cones. With pyramidal cones, the
+engines differ for a capsule on a plane, because they use different contact frames.
 """
 
 import dataclasses
@@ -22,14 +22,14 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = package_task_names()
-# these small models have most features between them
+# together, these small models have most features
 quick = pytest.mark.quick(
     "cartpole_swingup", "go1_velocity", "hopper", "reach", "soft_ball",
 )  # fmt: skip
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]
 
 FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
-"""Parts of the observation that depend on constraint forces. The solver computes them only to its tolerance."""
+"""Parts of the observation that depend on constraint forces. These are exact only to the solver's tolerance."""
 
 
 WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
@@ -58,8 +58,8 @@ class Bounds:
     qvel_p95: float
 
 
-# Each bound is three to four times a difference measured on the CPU with mujoco and mujoco_warp 4.0.0. The states are
-# 320 states of random rollouts. A float32 position of about 1 has a precision of 6e-8.
+# Each bound is three to four times a difference measured on the CPU with mujoco and mujoco_warp 4.0.0. The differences
+# were measured in 320 states of random rollouts. A float32 position of about 1 has a precision of 6e-8.
 ONE_STEP = {  #                         measured: median and 95 % quantile of qpos, then of qvel
     "adroit_door": Bounds(1.5e-7, 7e-7, 2e-5, 3.5e-4),  # 4.1e-8, 1.9e-7; 6.2e-6, 9.6e-5
     "adroit_hammer": Bounds(6e-7, 8e-7, 3e-4, 4e-4),  # 1.6e-7, 2.2e-7; 8.0e-5, 1.1e-4
@@ -76,12 +76,12 @@ ONE_STEP = {  #                         measured: median and 95 % quantile of qp
     "h1_velocity": Bounds(2.4e-7, 7e-7, 1.7e-5, 1.8e-4),  # 5.9e-8, 1.7e-7; 4.3e-6, 4.5e-5
     "spot_velocity": Bounds(2.4e-7, 8e-7, 8e-6, 2e-4),  # 6.0e-8, 1.9e-7; 2.0e-6, 5.1e-5
     "t1_velocity": Bounds(2.5e-7, 1.4e-6, 4.4e-5, 3.4e-4),  # 6.2e-8, 3.5e-7; 1.1e-5, 8.6e-5
-    # on a height field, the C engine creates a contact per triangle, and MuJoCo Warp at most four per pair of geoms
+    # on a height field, the engines create different numbers of contacts
     "g1_rough_velocity": Bounds(3e-4, 8e-3, 8e-2, 2.2),  # 8.5e-5, 2.2e-3; 2.1e-2, 5.6e-1
     "go1_rough_velocity": Bounds(1.2e-5, 1.4e-3, 2e-3, 3e-1),  # 3.0e-6, 3.7e-4; 5.1e-4, 7.5e-2
     "go1_velocity": Bounds(4e-7, 1.5e-6, 4e-5, 3e-4),  # 9.8e-8, 4.4e-7; 1.1e-5, 8.7e-5
     "half_cheetah": Bounds(1e-7, 1e-6, 1e-5, 1e-4),  # 3.2e-8, 2.9e-7; 3.0e-6, 2.9e-5
-    # arms and fingers rarely touch; MuJoCo Warp finds fewer contact points between two boxes
+    # MuJoCo Warp finds fewer contact points between two boxes
     "herb_reach": Bounds(4e-7, 8e-7, 5e-5, 2e-4),  # 1.1e-7, 2.2e-7; 1.3e-5, 4.8e-5
     "hopper": Bounds(1e-7, 2e-7, 1e-6, 5e-6),  # 3.0e-8, 5.5e-8; 2.9e-7, 1.6e-6
     "humanoid": Bounds(2e-7, 4e-7, 3e-5, 1.2e-4),  # 5.6e-8, 1.1e-7; 8.8e-6, 3.9e-5
@@ -129,7 +129,7 @@ class Engines:
     c: lw.Env
     warp: lw.Env
     states: list[torch.Tensor]
-    """States of a random rollout, (NWORLD, size) each. They are float32 numbers, so both engines represent them."""
+    """States (NWORLD, size) of a random rollout, rounded to float32."""
 
     def action(self, rng: np.random.Generator) -> torch.Tensor:
         return random_action(self.c, rng, 1.3)
@@ -191,7 +191,7 @@ def relative_error(a: torch.Tensor, b: torch.Tensor) -> float:
 def check_same(ours: Outcome, other: Outcome, force_parts: dict[str, slice] | None = None) -> None:
     """Compare numbers with a tolerance of 1e-5, and flags exactly.
 
-    Parts in ``force_parts`` have a tolerance of 1e-3 of their maximum, or of 0.01 N if a task clips them.
+    The tolerance of ``force_parts`` is 1e-3 of their maximum, or 0.01 N if that is larger.
     """
     forces = torch.zeros(ours["obs"].shape[1], dtype=torch.bool)
     for part in (force_parts or {}).values():

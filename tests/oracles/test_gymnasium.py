@@ -1,6 +1,6 @@
 """Compare tasks with their Gymnasium environments on the C engine.
 
-Both run the same C code in float64, so from equal states, results differ only by rounding to float32. The tests find
+Both run the same C code in float64. From equal states, their results differ only by rounding to float32. The tests find
 tasks by their attribute ``gymnasium``, so new tasks are included.
 """
 
@@ -222,7 +222,7 @@ def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """Return the evaluation that Gymnasium's info implies (a distance, height or position), or None."""
+    """Return the expected evaluation according to Gymnasium's info, or None."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:
@@ -280,7 +280,7 @@ def test_pushed_cylinder_moves_as_in_gymnasium() -> None:
         start = pair.theirs.data.qpos[7:9].copy()
         check([pair.step() for _ in range(10)])
         moved.append(np.linalg.norm(pair.theirs.data.qpos[7:9] - start))
-    assert min(moved) > 5e-4  # in m; an untouched cylinder does not move
+    assert min(moved) > 5e-4  # the distance is in metres
 
 
 @pytest.mark.quick("ant")
@@ -297,7 +297,7 @@ def test_unchanged_gymnasium_class_differs_only_in_contact_forces(task: str) -> 
     for step in steps:
         assert relative_error(np.delete(step.obs, forces), np.delete(step.gym_obs, forces)) <= 1e-5
         assert step.reward_error <= 1e-4
-    # if contact forces agree and this fails, remove the note in tasks/humanoid.py
+    # if this fails, remove the note in tasks/humanoid.py
     assert max(relative_error(step.obs[forces], step.gym_obs[forces]) for step in steps) > 1e-3
 
 
@@ -506,7 +506,7 @@ def halve_timestep(root: ET.Element) -> None:
 @pytest.mark.quick("ant", "hopper")
 @pytest.mark.parametrize("task", TASKS)
 def test_a_changed_model_file_has_the_same_effect_as_in_gymnasium(task: str, tmp_path: Path) -> None:
-    """Pass a modified copy as ``model``, and as Gymnasium's ``xml_file``."""
+    """Pass the same modified file to both environments."""
     tree = ET.parse(make_theirs(task).fullpath)
     halve_timestep(tree.getroot())
     for motor in tree.getroot().iterfind("actuator/*"):

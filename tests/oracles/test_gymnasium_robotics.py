@@ -1,6 +1,6 @@
 """Compare tasks with their Gymnasium-Robotics environments on the C engine.
 
-For a new task, add the states that reach its bonuses to SPECIAL.
+SPECIAL needs states of each new task in which it gives its reward bonuses.
 """
 
 import dataclasses
@@ -50,10 +50,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
-    """Return Gymnasium-Robotics' class, but with the task's model.
-
-    The model contains no contact pair twice.
-    """
+    """Return Gymnasium-Robotics' class, but with the task's model and without duplicate contact pairs."""
     registered: Any = load_env_creator(ENTRIES[name])
 
     class Oracle(registered):  # type: ignore[misc]
@@ -76,7 +73,7 @@ class Pair:
     def __init__(self, ours: lw.Env, theirs: Any) -> None:
         self.ours, self.theirs = ours, theirs
         self.places = {field: getattr(theirs.model, field).copy() for field in ("body_pos", "body_quat", "site_pos")}
-        """Copies of model fields. Random resets change the fields themselves."""
+        """Copies of model fields that random resets change."""
         self.theirs.reset(seed=0)
         self.rng = np.random.default_rng(0)
         self.goals = 0
@@ -84,7 +81,7 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # these controls are float32, so Gymnasium-Robotics must not use its own float64 controls
+        # use our float32 controls, because rounding errors would grow over many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
@@ -159,7 +156,7 @@ class Special:
     """A state that random actions do not reach."""
 
     reward: float
-    """Reward of the next step in Gymnasium-Robotics, with a tolerance of 0.1."""
+    """Reward of the next step, with a tolerance of 0.1."""
     joints: dict[str, float]
     """Map names of joints to positions."""
     moved: dict[str, tuple[float, ...]] = dataclasses.field(default_factory=dict)
@@ -293,7 +290,7 @@ KINDS = {
     "site": mujoco.mjtObj.mjOBJ_SITE, "tendon": mujoco.mjtObj.mjOBJ_TENDON,
     "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "sensor": mujoco.mjtObj.mjOBJ_SENSOR, "dof": None, "wrap": None,
 }  # fmt: skip
-"""Map each kind of element to the MuJoCo type under which its name is found."""
+"""Map each kind of element to its MuJoCo type."""
 
 
 def differences(ours: mujoco.MjModel, theirs: mujoco.MjModel) -> set[tuple[str, str]]:

@@ -67,7 +67,7 @@ def test_an_update_gives_the_same_parameters_as_rsl_rl(
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
     ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
-    for module in (ppo.policy, ppo.value):  # last layers near zero would give small gradients
+    for module in (ppo.policy, ppo.value):  # layers near zero would have small gradients
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
     other = theirs(ppo, given)

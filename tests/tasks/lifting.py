@@ -1,4 +1,4 @@
-"""Script a lift with joint positions for waypoints and servos that move to them."""
+"""Compute joint positions of a scripted lift, and move a robot's servos to them."""
 
 from collections.abc import Sequence
 

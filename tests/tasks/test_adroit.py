@@ -1,4 +1,4 @@
-"""oracles/test_gymnasium_robotics.py compares these tasks with the original ones."""
+"""Test the Adroit tasks. oracles/test_gymnasium_robotics.py compares them with the original tasks."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""oracles/test_gymnasium_robotics.py compares this task with the original one."""
+"""Test adroit_pen. oracles/test_gymnasium_robotics.py compares it with the original task."""
 
 import numpy as np
 import torch
@@ -28,7 +28,7 @@ def test_every_threshold_changes_rewards_or_terminations() -> None:
     parts["qpos"][:, 27:] = torch.from_numpy(rng.uniform(-1.5, 1.5, (n, 3)))
     env.set_state(state)
     assert not env.reward.any()
-    # positions change the reward after the next step, because set_state restores fields of the previous substep
+    # new positions affect the reward only after a step
     counts, terms = np.zeros(n), set()
     for _ in range(6):
         env.step(torch.zeros(n, 24))

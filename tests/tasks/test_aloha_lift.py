@@ -1,4 +1,4 @@
-"""Test aloha_lift, except its reward terms, which test_panda_lift.py checks."""
+"""Test aloha_lift. The tests of its reward terms are in test_panda_lift.py."""
 
 import mujoco
 import numpy as np

@@ -26,7 +26,7 @@ def places(env: lw.Env, state: torch.Tensor | None = None) -> dict[str, np.ndarr
 
 
 def reward(place: dict[str, np.ndarray]) -> np.ndarray:
-    """Return Lyceum's reward. Lyceum's second stage used another goal distance."""
+    """Return Lyceum's reward with the correct goal distance."""
     ball = place["ball"]
     palm = np.minimum(np.linalg.norm(place["palm"] - ball, axis=1), 0.5) / 0.5
     goal = np.minimum(np.linalg.norm(GOAL - ball, axis=1), 0.5) / 0.5

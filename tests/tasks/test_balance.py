@@ -107,7 +107,7 @@ def test_humanoid_that_must_get_up_starts_lying_and_does_not_terminate_while_lyi
     env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
     qpos = env.field("qpos")
     assert (qpos[:, 2] < 0.4).all()
-    # this is the height of the torso's x axis, which points up if the robot lies on its back
+    # height of the torso's x axis, which points up if the robot lies on its back
     forward = 2.0 * (qpos[:, 4] * qpos[:, 6] - qpos[:, 3] * qpos[:, 5])
     assert forward.max() > 0.7 and forward.min() < -0.7
     for _ in range(5):

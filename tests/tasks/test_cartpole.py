@@ -1,4 +1,7 @@
-"""oracles/test_dm_control.py compares the models, and cartpole's rewards, with dm_control's."""
+"""Test both cartpole tasks.
+
+oracles/test_dm_control.py compares the models and cartpole's rewards with those of dm_control.
+"""
 
 import mujoco
 import numpy as np

@@ -1,4 +1,7 @@
-"""oracles/test_mjlab.py compares observations, rewards and terminations with mjlab's."""
+"""Test go1_velocity.
+
+oracles/test_mjlab.py compares its observations, rewards and terminations with those of mjlab.
+"""
 
 import itertools
 

@@ -151,7 +151,7 @@ def targets(env: lw.Env) -> np.ndarray:
 def put_targets(env: lw.Env, offset: np.ndarray) -> None:
     """Stop the arms, and place targets beside the palms.
 
-    Offsets along x are in metres, (nworld, 2).
+    ``offset`` is the distance along x in metres, (nworld, 2).
     """
     state = env.get_state()
     parts = env.state_space.split(state)

@@ -33,7 +33,7 @@ def test_action_accelerates_only_the_agent(shared_env: SharedEnv) -> None:
     assert np.array_equal(env.model.jnt_range, np.tile([-1.4, 1.4], (4, 1)))
     env.step(torch.tensor([[1.0, 0.0], [0.0, -3.0]]))  # -3 is clipped to -1
     qpos, qvel = positions(env)
-    # a semi-implicit Euler step from rest; the damping of 0.1 is implicit
+    # semi-implicit Euler step from rest, with implicit damping of 0.1
     speed = 0.02 * 4.0 / (0.3 + 0.01 + 0.02 * 0.1)
     np.testing.assert_allclose(qvel, [[speed, 0, 0, 0], [0, -speed, 0, 0]], rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(qpos, [[0.02 * speed, 0, 1, 0], [0, -0.02 * speed, 1, 0]], rtol=1e-6, atol=1e-9)

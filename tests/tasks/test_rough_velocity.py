@@ -113,7 +113,7 @@ def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
 def test_falling_robot_on_rough_ground_has_bounded_velocities_under_mujoco_warp(
     task: str, shared_env: SharedEnv
 ) -> None:
-    """MuJoCo Warp finds contact normals that point down for the box soles of the original G1."""
+    """For the box soles of the original G1, MuJoCo Warp finds contact normals that point down."""
     env = shared_env(task, engine="warp", nworld=24)
     rng = np.random.default_rng(0)
     for _ in range(60):

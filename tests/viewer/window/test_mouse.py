@@ -59,7 +59,7 @@ def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> N
     """A browser that closes during a drag never reports that the button was released."""
     drag(bench, "ball", paused=paused)
     bench.sent.clear()
-    bench.panel.mouse.let_go()  # called by another thread, and not followed by a frame
+    bench.panel.mouse.let_go()
     bench.panel.mouse.let_go()
     (end,) = bench.sent
     assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None

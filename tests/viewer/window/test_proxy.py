@@ -145,7 +145,7 @@ def test_token_is_exchanged_for_a_cookie_and_removed_from_the_address(proxy: Pro
 
 
 class Jar(http.cookiejar.CookieJar):
-    """Send cookies to every port of their host, below their path, as browsers do."""
+    """Send a host's cookies to all its ports, as browsers do."""
 
     def sent_to(self, address: str) -> str | None:
         asked = urllib.request.Request(address)
