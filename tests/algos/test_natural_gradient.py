@@ -30,7 +30,7 @@ def test_fisher_product_equals_the_covariance_of_the_score() -> None:
     torch.testing.assert_close(product(vector), fisher @ vector + 0.1 * vector, atol=2e-4, rtol=2e-4)
 
 
-def test_conjugate_gradient_solves_the_system_and_more_iterations_change_nothing() -> None:
+def test_conjugate_gradient_solves_the_system() -> None:
     generator = torch.Generator().manual_seed(3)
     root = torch.randn(12, 12, generator=generator, dtype=torch.float64)
     matrix, target = root @ root.T + torch.eye(12), torch.randn(12, generator=generator, dtype=torch.float64)

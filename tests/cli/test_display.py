@@ -35,7 +35,7 @@ def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display
         yield shown
 
 
-def test_first_line_names_task_worlds_algorithm_and_folder(npg: lw.NPG) -> None:
+def test_first_line_shows_task_worlds_algorithm_and_folder(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
     with display.Display(console).training(Run(Path("run"), {}), npg, 10):
         pass

@@ -112,7 +112,7 @@ def test_new_task_for_a_model_of_another_package_passes_check_task(model: Path, 
     check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
 
-def test_commented_functions_work_once_they_are_uncommented(folder: Path) -> None:
+def test_functions_in_comments_work_after_uncommenting(folder: Path) -> None:
     file = new("everything", RICH)
     head, body = file.read_text().split("# Three more functions that most tasks have:\n#\n")
     commented, tail = body.split("\n\n@lw.register")

@@ -27,7 +27,7 @@ def test_error_of_too_many_worlds_contains_the_largest_number_that_fits(monkeypa
     check_fit(1000, 10**9, CPU)
 
 
-def test_memory_check_frees_cached_gpu_memory_of_torch_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_check_frees_the_gpu_memory_cached_by_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     free, gpu = [1000], types.SimpleNamespace(is_cuda=True, alias="cuda:0")
     monkeypatch.setattr(memory, "free_memory", lambda device: free[0])
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: free.__setitem__(0, 5000))

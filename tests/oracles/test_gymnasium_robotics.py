@@ -1,6 +1,6 @@
 """Compare tasks with their Gymnasium-Robotics environments on the C engine.
 
-SPECIAL needs states of each new task in which it gives its reward bonuses.
+Add the special states of a new task to SPECIAL.
 """
 
 import dataclasses

@@ -103,7 +103,7 @@ def test_g1_walk_lifts_the_feet_in_turn_without_actions(shared_env: SharedEnv) -
     assert left.max() > 0.59 and right.max() > 0.59 and torch.minimum(left, right).abs().max() < 1e-6
 
 
-def test_humanoid_that_must_get_up_starts_lying_and_does_not_terminate_while_lying(shared_env: SharedEnv) -> None:
+def test_humanoid_get_up_starts_lying_without_terminating(shared_env: SharedEnv) -> None:
     env = shared_env("humanoid_get_up", nworld=16, autoreset=False)
     qpos = env.field("qpos")
     assert (qpos[:, 2] < 0.4).all()

@@ -37,7 +37,7 @@ def cartpole_reward(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, a
     return upright * centred * small_control * small_velocity
 
 
-def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+def test_task_functions_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
     env = shared_env("cartpole_swingup", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for _ in range(5):

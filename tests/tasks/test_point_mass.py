@@ -8,7 +8,7 @@ import lyceum_warp as lw
 NWORLD = 256
 
 
-def test_reward_evaluation_observation_and_success_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+def test_task_functions_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     for size in (1.3, 1.3, 0.08):

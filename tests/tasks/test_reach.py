@@ -51,7 +51,7 @@ def errors(env: lw.Env) -> np.ndarray:
     return finger(env, positions(env)[0]) - targets(env)
 
 
-def test_reward_evaluation_and_observation_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
+def test_task_functions_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> None:
     env = shared_env("reach", nworld=NWORLD, autoreset=False)
     rng = np.random.default_rng(0)
     assert env.obs.shape == (NWORLD, 20)

@@ -77,7 +77,7 @@ def test_heights_contacts_and_scans_on_every_kind_of_patch_equal_those_of_mujoco
 
 @pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
-def test_robots_start_at_their_level_and_rise_by_walking(task: str, env: lw.Env) -> None:
+def test_robots_start_at_their_level_and_reach_higher_levels_by_walking(task: str, env: lw.Env) -> None:
     def memory(name: str) -> torch.Tensor:
         return env.state_space.split(env.get_state())[name][:, 0].int()
 
@@ -98,7 +98,7 @@ def test_robots_start_at_their_level_and_rise_by_walking(task: str, env: lw.Env)
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_an_episode_ends_outside_the_field(task: str, env: lw.Env) -> None:
+def test_robot_outside_the_field_ends_the_episode(task: str, env: lw.Env) -> None:
     state = env.get_state()
     env.state_space.split(state)["qpos"][0, 0] = 100.0
     env.set_state(state)

@@ -31,9 +31,7 @@ def test_push_ends_when_the_viewer_shows_another_world(shared_env: SharedEnv) ->
 
 @pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
                                     SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
-def test_push_restored_by_stepping_back_ends_at_the_next_change_of_the_world(
-    shared_env: SharedEnv, branch: protocol.Command
-) -> None:
+def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch: protocol.Command) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"policy": pushing, "other": pushing}, paused=True)
     for command in (PUSH, StepBy(4), RELEASE, StepBy(2), StepBy(-4)):
@@ -53,7 +51,7 @@ def test_push_released_in_a_past_step_does_not_act_in_the_newest_state(shared_en
     assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
-def test_state_for_a_planner_excludes_a_push_and_the_push_continues() -> None:
+def test_state_for_a_controller_excludes_the_push() -> None:
     env = lw.make("hopper", nworld=2)
     seen = []
 

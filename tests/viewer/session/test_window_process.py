@@ -63,7 +63,7 @@ def is_alive(pid: int) -> bool:
 # a running window
 
 
-def test_page_and_model_are_served_and_a_second_window_gets_another_port(shared_window: Window) -> None:
+def test_two_windows_serve_page_and_model_at_different_ports(shared_window: Window) -> None:
     assert shared_window.is_open()
     assert b"canvas" in page(shared_window) and SCRIPT.encode() in page(shared_window)
     assert wait_until(lambda: len(page(shared_window, "model")) > 1000)
@@ -135,7 +135,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
     assert capfd.readouterr() == ("", "")  # studio prints nothing
 
 
-def test_frames_for_a_hanging_window_do_not_block_and_its_end_is_reported() -> None:
+def test_frames_for_a_hanging_window_do_not_block() -> None:
     with contextlib.closing(Window(scene_of(MODEL))) as window:
         os.kill(process_of(window), signal.SIGSTOP)
         frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))

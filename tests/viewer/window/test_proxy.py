@@ -384,7 +384,7 @@ def open_tab(proxy: Proxy, path: str = "/ui") -> ClientConnection:
                    additional_headers={"Cookie": cookie})  # fmt: skip
 
 
-def test_proxy_serves_two_tabs_at_the_same_time_and_one_may_close(echo: Echo) -> None:
+def test_proxy_serves_two_tabs_and_one_may_close(echo: Echo) -> None:
     proxy, opened, _ = echo
     with open_tab(proxy) as one:
         with open_tab(proxy, "/state?sid=b") as two:
@@ -418,7 +418,7 @@ def test_private_server_notices_a_lost_tab(echo: Echo) -> None:
     wait_until(lambda: not opened)
 
 
-def test_a_controlling_browser_that_sends_nothing_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
+def test_silence_of_the_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.5)
     proxy, _, quiet = echo
     with open_tab(proxy) as tab:

@@ -55,7 +55,7 @@ def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, bes
     ("name", "seen"),
     [("geom_size", True), ("geom_rgba", True), ("body_pos", True), ("gravity", False), ("dof_damping", False)],
 )
-def test_model_values_of_a_world_report_changes_and_visible_changes(name: str, seen: bool) -> None:
+def test_changed_and_visible_model_values_are_reported(name: str, seen: bool) -> None:
     values, nominal = ModelValues(MODEL), np.array(field(MODEL, name)).ravel()
     assert values.set({name: nominal * (1 + 1e-9)}) == (False, False)  # rounded
     for value in (nominal + 0.1, nominal):
