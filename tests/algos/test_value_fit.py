@@ -46,7 +46,7 @@ def test_user_value_network_is_fitted_by_autograd() -> None:
 
 
 @pytest.mark.gpu
-def test_gpu_captured_value_fit_equals_plain_launches() -> None:
+def test_value_fit_in_a_gpu_graph_equals_plain_launches() -> None:
     samples, batch = 1000, 96
     generator = torch.Generator("cuda").manual_seed(2)
     data = [torch.randn(samples, 6, generator=generator, device="cuda") for _ in range(2)]

@@ -19,7 +19,7 @@ from lyceum_warp.viz.cameras import find_camera
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("runs") / "[" / "bold]x"  # rich must not take this name for markup
+    out = tmp_path_factory.mktemp("runs") / "[" / "bold]x"  # rich must not parse this name as markup
     assert train(out, "--iterations", "2") == 0
     return out
 

@@ -38,7 +38,7 @@ def test_command_plan_starts_no_episode_after_the_time_limit(
 
 
 def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "[" / "bold]x"  # rich must not take this name for markup
+    out = tmp_path / "[" / "bold]x"  # rich must not parse this name as markup
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
     shown = capsys.readouterr().out
     assert f"files in {out}" in shown

@@ -1,4 +1,4 @@
-"""Compare cartpole and cartpole_swingup with the suite's tasks, which test_dm_suite.py compares with dm_control."""
+"""Compare cartpole and cartpole_swingup with the tasks of dm_control's suite."""
 
 import mujoco
 import numpy as np

@@ -39,7 +39,7 @@ PARAMS: dict[str, dict[str, Any]] = {
     "go1_velocity": {"fall_angle": 0.5},
     "soft_ball": {"reach": 0.15},
 }
-"""Parameters with which some episodes end.
+"""With these parameters, some episodes end during the tests.
 
 Higher solver limits let the solver converge. Otherwise the engines would not agree up to rounding.
 """

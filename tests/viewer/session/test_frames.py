@@ -30,7 +30,7 @@ def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: Shared
     assert len(session.stage.frame().ghosts) == 3
 
 
-def test_ends_of_episodes_and_faults_are_shown_as_messages(shared_env: SharedEnv) -> None:
+def test_faults_and_ends_of_episodes_are_shown_as_messages(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
 
     def bad(obs: torch.Tensor) -> torch.Tensor:
