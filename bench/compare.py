@@ -41,12 +41,12 @@ ENGINES = ("mujoco", "warp")
 
 EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "control")
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
-"""On other tasks, only MPPI is compared."""
+"""Tasks on which every planner is compared. On other tasks, only MPPI is compared."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
 """Tasks on which learners are compared, by engine."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
 SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
-"""One task without contacts, one with a mocap body, one whose episodes end early, and one with all other features."""
+"""Tasks of a comparison with --short."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Options:
     new: tyro.conf.Positional[str] = str(ROOT)
     """The revision or folder to compare with; by default this working tree."""
     tasks: tuple[str, ...] = ()
-    """Tasks to compare; by default all. By default, the parts "learners" and "commands" run on only a few tasks."""
+    """Tasks to compare; by default all. By default, the parts "learners" and "commands" use only a few tasks."""
     engines: tuple[Literal["mujoco", "warp"], ...] = ENGINES
     """Engines."""
     device: str = "cpu"
@@ -112,7 +112,7 @@ def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 
 
 def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
-    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # NumPy's string dtypes contain a length
+    if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # the dtype of a string contains its length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
@@ -277,7 +277,7 @@ class Report:
         return True
 
     def add(self, name: str, found: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
-        """Add and print the differences of a unit with the given number of arrays."""
+        """Add the differences of a unit, and print them."""
         self.found += found
         self.differing += bool(found)
         self.units += 1
@@ -291,7 +291,7 @@ class Report:
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
-    """Return a unit's failures. A failure of both checkouts counts, too, because nothing was compared."""
+    """Return a unit's failures. If both checkouts fail, this also counts as a difference."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
@@ -313,7 +313,7 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
     found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # arrays that are missing after a failure are not additional differences
+    if found:  # arrays that are missing because of a failure are not reported
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
     found += differences(unit.name, old, new, axes)
     report.add(unit.name, found, time.perf_counter() - began, len({**old, **new}))

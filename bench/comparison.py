@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 MOST_SPLITS = 20_000
-"""If there are more splits of the seeds, the test uses a random subset."""
+"""Maximum number of splits of the seeds that a test uses."""
 
 
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -37,7 +37,7 @@ def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     statistics = np.stack([_welch(both[first], both[~first]) for first in chosen])
     observed = _welch(a, b)
     largest = statistics.max(axis=1)
-    # the tolerance keeps rounding from excluding the observed split
+    # the tolerance allows for rounding
     return (largest[:, None] >= observed * (1.0 - 1e-9)).mean(axis=0)
 
 

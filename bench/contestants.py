@@ -1,7 +1,7 @@
 """Step worlds with lyceum_warp, ``mujoco.rollout`` and other libraries, for the experiment "throughput".
 
 A sample is one environment step whose observation and reward the caller has received. All contestants use the same
-model, substeps and random actions, and each its best number of worlds per thread.
+model, substeps and random actions. Each contestant uses the number of worlds per thread at which it is fastest.
 """
 
 import importlib.util
@@ -35,7 +35,7 @@ LABELS = {
 }
 
 WORLDS = {"c": 64, "warp": 64, "native": 64, "envpool": 64, "gym-async": 2, "gym-sync": 16, "dm_control": 8}
-"""Default number of worlds per thread; SyncVectorEnv has one thread."""
+"""Default number of worlds per thread."""
 
 GPU_WORLDS = 16_384
 
@@ -89,7 +89,7 @@ class LyceumWarp:
 
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
-    """Return the actions of several steps as a list, because indexing a tensor takes time."""
+    """Return a list with the actions of each step; indexing a tensor would take time."""
     low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
     drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
     return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))

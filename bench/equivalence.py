@@ -75,8 +75,7 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
 
 
 def equivalence(a: np.ndarray, b: np.ndarray) -> dict[str, Any]:
-    """Compare means by Welch's 90 % interval of their difference (b minus a), and a margin of one standard
-    deviation."""
+    """Test whether Welch's 90 % interval of the difference between the means (b minus a) lies within the margin."""
     parts = a.var(ddof=1) / len(a), b.var(ddof=1) / len(b)
     spread = sum(parts)
     freedom = spread**2 / (parts[0] ** 2 / (len(a) - 1) + parts[1] ** 2 / (len(b) - 1)) if spread else 1.0

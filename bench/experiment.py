@@ -44,7 +44,7 @@ GPU_QUERY = {
     "driver": "driver_version", "power_limit": "power.limit", "clock_sm": "clocks.sm", "clock_sm_max": "clocks.max.sm",
     "clock_memory": "clocks.mem", "throttled": "clocks_event_reasons.active",
 }  # fmt: skip
-"""Fields of nvidia-smi, by the names in stored results."""
+"""Names in stored results, and the fields of nvidia-smi that they hold."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
 """Results are compared only if the versions of these packages are equal."""
@@ -65,7 +65,7 @@ class Options:
     """Options of every experiment; an experiment may derive a class with additional options."""
 
     short: bool = False
-    """Run a small measurement, which takes two minutes on two cores; the results go to results/short/."""
+    """Run a small measurement (two minutes on two cores), and write the results to results/short/."""
     out: Path | None = None
     """File of the results (JSON lines); by default results/NAME.jsonl."""
     tasks: tuple[str, ...] = ()
@@ -79,9 +79,9 @@ class Options:
     repeats: int | None = None
     """Number of repeats of each comparison."""
     seeds: tuple[int, ...] = ()
-    """Seeds, if the experiment uses any."""
+    """Seeds, for experiments that use seeds."""
     jobs: int = 1
-    """Number of cases that run at the same time, each on separate cores; the experiment must allow this."""
+    """Number of cases that run at the same time, each on its own cores. Some experiments allow only one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Experiment:
     """Other libraries whose versions are stored with the results."""
     apart: bool = False
     parallel: bool = False
-    """Whether cases run in subprocesses if there are several jobs."""
+    """Whether cases may run in subprocesses (``--jobs``)."""
     pooled: bool = False
     """Whether the tables combine the results of all machines."""
 
@@ -142,7 +142,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names, or else the default names, or else all known names."""
+    """Return the given names. If there are none, return the default names, or all known names without a default."""
     known = tuple(known)
     for name in given:
         if name not in known:
@@ -208,7 +208,7 @@ def machine(row: Row) -> tuple[Any, ...]:
 
 
 def software(row: Row) -> tuple[Any, ...]:
-    """Return a row's package versions; only numbers from equal versions are compared."""
+    """Return a row's package versions."""
     return tuple(row.provenance.get(name) for name in SOFTWARE)
 
 
@@ -431,7 +431,7 @@ def _values(result: Mapping[str, Any]) -> str:
 
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
-    """Run an experiment; return 0, 1 if a case failed, 2 for bad input, 130 after Ctrl-C."""
+    """Run an experiment and return its exit code: 1 if a case failed, 2 for bad input, 130 after Ctrl-C, else 0."""
     options = tyro.cli(experiment.options, prog=f"lyceum-warp bench {experiment.name}", args=argv)
     return guarded(lambda: run(experiment, options), experiment.name)
 

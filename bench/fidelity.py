@@ -3,8 +3,9 @@
     lyceum-warp bench fidelity --device cuda --jobs 4
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
-compared with the Warp engine (float32). Chaos separates any two trajectories, so the C engine is also compared with
-itself when its state is rounded to float32: after every step, or once at the start.
+compared with the Warp engine (float32). Because of chaos, any two trajectories diverge. The C engine is therefore also
+compared with itself under rounding. One copy rounds its state to float32 after every step, and another copy once at the
+start.
 
 Two states are compared by their observations without contact forces, relative to max(1, |value|).
 """
@@ -27,15 +28,15 @@ from lyceum_warp.spaces import COUNTERS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)
-"""Steps at which differences are stored, besides the last."""
+"""Steps at which differences are stored. The last step is stored, too."""
 
 SETTLING = 20
-"""Steps before the trajectories start, in which robots come into contact with the ground."""
+"""Number of steps before the trajectories start. Robots touch the ground in these steps."""
 
 ROUNDING = 2.0**-24
 
 APART = 0.01
-"""Two trajectories have diverged if their observations differ by more than this."""
+"""Difference of observations above which two trajectories count as diverged."""
 
 
 @dataclasses.dataclass(frozen=True)

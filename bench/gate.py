@@ -1,4 +1,4 @@
-"""Test whether a robot walks: give it fixed commands, and check its tracking, falls and gait against limits.
+"""Test whether a robot walks: measure its tracking, falls and gait under fixed commands.
 
     lyceum-warp bench gate --policy runs/g1
     lyceum-warp bench gate --policy runs/go1-1 runs/go1-2
@@ -6,11 +6,11 @@
 The mean policy controls the robot on the C engine under the task's exact physics.
 
 A Unitree G1 must pass nanoG1's gate (kingjulio8238/nanoG1, eval.py): six commands of 20 s, each from four initial
-states, and the gait of 2,000 steps at 0.5 m/s, without noise and pushes. The action change is measured in nanoG1's
-unit: 0.25 rad of a servo's target.
+states, without noise and pushes. The gate also measures the gait in 2,000 steps at 0.5 m/s. The unit of an action
+change is nanoG1's: 0.25 rad of a servo's target.
 
-Any other robot is tested in 100 episodes of 20 s with noise: ten commands from ten initial states, once without and
-once with pushes.
+Any other robot is tested in 100 episodes of 20 s with noise: ten commands from each of ten initial states. All episodes
+run once without pushes and once with pushes.
 """
 
 import dataclasses
@@ -120,8 +120,7 @@ class Steps:
 
 @torch.no_grad()
 def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: int, start: torch.Tensor) -> Steps:
-    """Run a policy from the states ``start`` under each world's command; after a fall, a world returns to its initial
-    state."""
+    """Run a policy from the states ``start``, under a command for each world. A robot that falls starts again."""
     parts = env.state_space.split(start)
     parts["drawn_velocity"][:] = torch.tensor(commands)
     parts["heading_controlled"][:], parts["standing"][:], parts["command_timer"][:] = 0.0, 0.0, NEVER

@@ -20,7 +20,7 @@ TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v
 class GymnasiumRollout(Rollout):
     """Fill NPG's rollout buffer from a Gymnasium vector environment.
 
-    The first episode of each world starts at the step count of the same world in ``env``.
+    Each world's first episode starts with the step count that this world has in ``env``.
     """
 
     def __init__(self, env: lw.Env, steps: int, envs: VectorEnv, seed: int, *, segments: bool) -> None:
@@ -30,7 +30,7 @@ class GymnasiumRollout(Rollout):
         self.elapsed = torch.zeros(env.nworld)
         if segments:
             self.elapsed.copy_(env.episode_step)
-            # an attribute of the outermost wrapper, TimeLimit
+            # the outermost wrapper, TimeLimit, has this attribute
             envs.set_attr("_elapsed_steps", env.episode_step.tolist())
             self.running_return.masked_fill_(self.elapsed > 0, torch.nan)
 

@@ -1,12 +1,11 @@
-"""Plan for humanoids in real time, at their control rates: standing and walking under pushes, and getting up.
+"""Measure MPPI in real time on humanoids that stand or walk under pushes, or get up.
 
     lyceum-warp bench humanoid
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
 
-Starts and pushes are constants of this program. An episode lasts 20 s. ``real_time``: the plant keeps its rate, and
-the planner plans as often as it can (``lw.control_async``). ``predicted``: in addition, the planner plans from
-predicted states (``predict=True``). ``in_turn``: the plant waits until each plan is ready. Run the real-time episodes
-on idle cores, because other processes delay plans.
+An episode lasts 20 s. In the contestant ``real_time``, the plant never waits, and the planner plans as often as it can
+(``lw.control_async``). ``predicted`` is the same with plans from predicted states (``predict=True``). In ``in_turn``,
+the plant waits until each plan is ready. Run the real-time episodes on idle cores, because other processes delay plans.
 """
 
 import dataclasses

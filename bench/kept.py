@@ -125,7 +125,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # warm-up: graphs are captured, and a robot needs two seconds until it walks
+    # these steps capture the graphs, and a robot needs two seconds until it walks
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

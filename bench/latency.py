@@ -28,9 +28,9 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds to simulate one step of one sample on two cores, by task and planning physics."""
+"""Microseconds per simulated step of a sample on two cores, for each task and planning physics."""
 LONGEST = 0.2
-"""Plans that take more seconds run only if samples or horizons are given."""
+"""Maximum seconds per plan, unless samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
 CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 
@@ -46,10 +46,10 @@ class Options(experiment.Options):
     own: bool = False
     """Whether to use the samples and the horizon that each task suggests."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: exact, or a name that the task defines. By default, the physics that the task
-    suggests; if they have a name, a second measurement uses the exact physics."""
+    """Names of the planner's physics: exact, or a name that the task defines. The default is the physics that the task
+    suggests. If this physics has a name, the exact physics is measured, too."""
     seconds: float = 10.0
-    """Seconds of a case; the 99.9 % quantile needs a thousand plans."""
+    """Seconds per case. The 99.9 % quantile needs a thousand plans."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,8 +37,7 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Episodes per evaluation, episodes in a run's mean return, and (worlds, steps) in the test of tracking errors and
-falls."""
+"""Episodes per evaluation, episodes in a mean return, and (worlds, steps) of the test of tracking and falls."""
 
 
 @dataclasses.dataclass(frozen=True)

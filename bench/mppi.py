@@ -76,7 +76,7 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the cases: plans, then episodes; compared contestants are adjacent."""
+    """List the cases of plans, then those of episodes. Compared contestants are adjacent."""
     short, cuda = options.short, options.device.startswith("cuda")
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes"), what="part")
@@ -196,7 +196,7 @@ def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
 
 
 def run_plans(case: Case, options: Options) -> dict[str, Any]:
-    """Plan from the states of an episode; the first four plans do not count."""
+    """Measure plans from the states of an episode, without the first four plans."""
     made, given = controller(case, options), states(case.task, case.first, case.steps, case.threads)
     made.reset(case.first)
     times: list[float] = []
@@ -241,7 +241,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
-    """Return (seed, success, return, seconds or None) of the episodes, by set and seed."""
+    """Return (seed, success, return, seconds or None) of each episode, sorted by set and seed."""
     sets: dict[int, dict[int, list[Any]]] = {}
     for row in rows:
         sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})

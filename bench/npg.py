@@ -48,7 +48,7 @@ CONTESTANTS = {
     "trpo_sb3": "TRPO, sb3-contrib",
     "npg_gpu": "NPG, lyceum_warp on a GPU",
     "ppo_gpu": "PPO, lyceum_warp on a GPU",
-    # this contestant is only in stored results of an earlier commit
+    # only stored results of an earlier commit have this contestant
     "ppo_rsl_rl": "rsl_rl's PPO, lyceum_warp on a GPU",
 }
 ON_CPU, ON_GPU, YARDSTICKS = tuple(CONTESTANTS)[:4], tuple(CONTESTANTS)[4:6], ("ppo_sb3", "trpo_sb3")
@@ -60,7 +60,7 @@ EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
 
 EVALUATIONS, EPISODES = 20, 16
-"""Evaluations per run after the first, and episodes per evaluation."""
+"""Number of evaluations after the first, and episodes per evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -187,7 +187,7 @@ class Curve:
         return (2 if self.case.short else EVALUATIONS) * progress
 
     def add(self, samples: int, act: Act) -> None:
-        """Evaluate a policy and add a point, unless there is one at this number of samples."""
+        """Evaluate a policy and add a point, unless this number of samples already has a point."""
         if self.points and self.points[-1][0] == samples:
             return
         seconds, self._next = self.seconds(), int(self._evaluations(samples)) + 1
@@ -347,7 +347,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Tabulate final results, and the time until 90 % of the final return of NPG on Gymnasium."""
+    """Make a table of final returns, and of the times until 90 % of the return of NPG on Gymnasium."""
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}

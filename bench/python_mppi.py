@@ -76,7 +76,7 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
     "half_cheetah": lambda model: GymnasiumEnv("HalfCheetah-v5", model),
     "adroit_pen": lambda model: GymnasiumEnv("AdroitHandPen-v1", model, "target"),
 }
-"""Environments by this package's task names; their actions are bounded by -1 and 1."""
+"""Environment of each task. Actions lie between -1 and 1."""
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
@@ -99,7 +99,7 @@ class PythonMPPI:
             pipe, other = context.Pipe()
             settings = (task, int(share), config.horizon, config.noise, config.smoothing, i)
             context.Process(target=_roll_out, args=(other, *settings), daemon=True).start()
-            other.close()  # with the child's end closed here, recv raises EOFError if the subprocess has ended
+            other.close()  # close the child's end here, so that recv raises EOFError after the subprocess has ended
             self.pipes.append(pipe)
         for pipe in self.pipes:
             pipe.recv()
@@ -124,7 +124,7 @@ class PythonMPPI:
 def _roll_out(
     pipe: Connection, task: str, samples: int, horizon: int, scale: Any, smoothing: tuple[float, float, float], own: int
 ) -> None:
-    """Roll out a subprocess's share of the samples for each plan that it receives."""
+    """Roll out this subprocess's samples of every plan that it receives."""
     env = ENVS[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng((own, 0))
     pipe.send("ready")

@@ -1,11 +1,11 @@
-"""Measure how coarser physics affect a planner: how well it ranks its samples, and how much return is lost.
+"""Measure how coarser physics affect a planner's ranking of samples and its return.
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
 Each line of results/rank-loss.jsonl holds the rank correlations of ``lyceum-warp tune --planning`` and three returns.
-The loss is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return if the planner uses the task's physics,
-R_setting the return if it uses the setting, and R_none the return without a planner. Episodes do not run in real time,
-so the load of the machine does not matter.
+The loss is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return of a planner with the task's physics,
+R_setting that of a planner with the setting, and R_none the return without a planner. The load of the machine does not
+matter, because episodes do not run in real time.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> n
 
 
 def main(tasks: tyro.conf.Positional[tuple[str, ...]]) -> None:
-    """Measure the settings of tasks, except for those that are already stored.
+    """Measure the settings of tasks that are not stored yet.
 
     Args:
         tasks: Names of tasks.

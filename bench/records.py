@@ -5,8 +5,8 @@
 
 The clock starts before the command, so the seconds include imports, compilation and graph captures. It stops when the
 run's config.json says that the target is reached. With a cold cache, all kernels are compiled. With a warm cache, the
-same command has trained for one iteration before. A run that lasts longer than --seconds is stopped; the same command
-continues it, and the seconds of all calls are summed.
+same command has already run one iteration. A run that lasts longer than --seconds is stopped. The same command
+continues it, and the result is the sum of the seconds.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags for targets of the training episodes' mean return."""
+"""Flags for tasks whose threshold is a mean return of training episodes."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags for targets of the mean policy's return in 16 episodes; the clock includes these evaluations."""
+"""Flags for tasks whose threshold is the mean policy's return in 16 evaluation episodes."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
 

@@ -1,15 +1,15 @@
-"""Run tasks for a very long time with and without injected faults, measure memory, and kill and resume training runs.
+"""Test very long runs with injected faults, memory use, and training runs that are killed and resumed.
 
     lyceum-warp bench soak --threads 2
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
     lyceum-warp bench soak --parts faults --device cuda --work runs/soak
 
-Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. Some kinds
-of faults are requested by an additional action in a variant of the task (``VARIANT``). Every fault must be reported in
-its world and step, and no other fault may be reported. A second environment without faults must give bitwise equal
-numbers for each world until its first fault. Every fourth world gets no faults.
+Part "faults": worlds step under random actions, and each world gets a fault every thousand steps on average. In a
+variant of the task (``VARIANT``), an additional action requests some kinds of faults. Every fault must be reported in
+its world and step, and no other fault may be reported. A second environment runs without faults. Each world must be
+bitwise equal to its copy there until its first fault. Every fourth world gets no faults.
 
-A run is divided into chunks. Each chunk continues from the states that the chunk before it wrote into the folder
+A run is divided into chunks. Each chunk continues from the states that the previous chunk stored in the folder
 ``--work``.
 
 Part "random": worlds step under random actions, without injected faults. Part "memory": environments are made and
@@ -51,20 +51,20 @@ KINDS = {"state": Done.NAN, "speed": Done.NAN, "action": Done.ACTION, "reward": 
 """The reason that must be reported for each kind of fault. Kinds are numbered from 1."""
 NBIT = len(Done)
 EVERY = 16
-"""Steps between writes of invalid states. If writes are less frequent, each of them affects more worlds."""
+"""Steps between two writes of invalid states."""
 SAMPLES = 5
 TASKS = {
     "point_mass": (1024, 10**7, 10, 4.0), "hopper": (512, 10**6, 10, 100.0), "soft_ball": (256, 10**6, 10, 100.0),
     "panda_lift": (256, 10**6, 10, 250.0), "adroit_relocate": (256, 10**6, 10, 250.0),
     "humanoid": (256, 10**6, 10, 300.0), "go1_velocity": (256, 10**6, 10, 300.0),
 }  # fmt: skip
-"""By task: worlds, steps per chunk, chunks, and seconds per million steps on two cores."""
+"""Worlds, steps per chunk, chunks, and seconds per million steps on two cores, for each task."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""The same of all other tasks."""
+"""The entry of every other task in ``TASKS``."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
-"""The same in the deterministic mode."""
+"""Entries like those of ``TASKS``, for the deterministic mode."""
 TRAININGS = {
     "hopper": "--iterations 400 --nthread 2",
     "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
@@ -202,7 +202,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # another machine with a copy of the folder continues from the last state
+            # store the states, so that another machine with this folder can continue
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         for task, sizes, _ in runs if "random" in parts else ():
@@ -470,7 +470,7 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
-    """Train once without interruption and once with kills, each after some progress, and compare the results."""
+    """Train once without interruption and once with kills, and compare the results."""
     straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)

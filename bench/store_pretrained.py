@@ -1,6 +1,6 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
-lyceum_warp/pretrained/TASK then has the run's settings, the policy's weights in float16, and its return.
+The folder lyceum_warp/pretrained/TASK stores the run's settings, and the policy's float16 weights and return.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from lyceum_warp.runs.folder import Run
 FOLDER = Path(lw.__file__).parent / "pretrained"
 KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")
 EPISODES, SEED = 32, 1
-FEW, FIRST = 4, 60  # number of worlds and of steps in which a stored policy is tested
+FEW, FIRST = 4, 60  # worlds and steps of the test of a stored policy
 
 
 def store(folder: Path, which: str) -> Path:

@@ -61,7 +61,7 @@ class Options(experiment.Options):
     """Number of worlds of lyceum_warp and of native C; by default 64 per thread, and 16,384 on a GPU. In the part
     "suite", number of worlds of every contestant; by default 2, 16 and 128."""
     policy: str | None = None
-    """Folder of the run whose policy acts in the part "kept" (``--parts kept``); by default, actions are random."""
+    """Folder of a run whose policy chooses the actions in the part "kept". By default, actions are random."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Case:
     part: str
     task: str
     repeat: int
-    """Number of the repeat, which is also the seed of actions and initial states."""
+    """Number of the repeat. It is also the seed of actions and initial states."""
     contestant: str
     worlds: int
     threads: int

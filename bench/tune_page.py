@@ -13,7 +13,7 @@ TEXT = "# tune\n\nFaster physics at equal returns. Written by `lyceum-warp bench
 
 
 def searches(name: str) -> list[list[dict[str, Any]]]:
-    """Read a file's searches, each of which has a row per setting with a verdict, the fastest first."""
+    """Read the searches in a file. A search is a list of settings with verdicts, starting with the fastest."""
     found: dict[str, list[dict[str, Any]]] = {}
     for line in (RESULTS / name).read_text().splitlines():
         row = json.loads(line)

@@ -1,6 +1,6 @@
 """Run programs of other libraries, in separate virtual environments if they need other package versions.
 
-``peers/NAME/requirements.txt`` pins the packages of a library. Its virtual environment is made at first use in
+``peers/NAME/requirements.txt`` pins the packages of a library. The first use makes a virtual environment in
 ``~/.cache/lyceum_warp/peers`` (or ``$LYCEUM_WARP_PEERS``).
 """
 
@@ -38,7 +38,7 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make the virtual environment of a library if it does not exist; return its Python, and an error message or ""."""
+    """Make the virtual environment of a library unless it exists. Return its Python, and an error message or ""."""
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")

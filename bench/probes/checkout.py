@@ -1,9 +1,9 @@
-"""Compute numbers with a checkout's lyceum_warp, one unit of work after another, for bench/compare.py.
+"""Compute the arrays of one checkout that bench/compare.py compares.
 
 The first answer lists the checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of
 a function in PARTS as JSON), and each line on stdout is an answer. The arrays of a unit are written to the file given
-as the program's argument. The program uses only public names of the package: the checkouts may differ in everything
-else.
+as the program's argument. The program uses only public names of the package, because private names may differ between
+checkouts.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ class Numbers:
         """Add an array, a number, a string, or every leaf of a mapping, a dataclass or a list; omit None.
 
         Args:
-            name: Name of the value; the names of leaves are appended to it.
+            name: Name of the value. The name of a leaf is appended to it.
             value: The value.
             axes: Names of the leading axes.
             along: Name of an additional leading axis, along which the values of several calls are stacked.
@@ -77,7 +77,7 @@ class Numbers:
 
 
 def make(task: str, engine: str, device: str, **options: Any) -> Any:
-    """Make an environment, which is deterministic on a GPU."""
+    """Make an environment. On a GPU, it is deterministic."""
     import lyceum_warp as lw
 
     try:
@@ -92,7 +92,7 @@ def placed(engine: str, device: str) -> dict[str, Any]:
 
 
 def draw_actions(env: Any, task: str, steps: int) -> torch.Tensor:
-    """Draw actions, (steps, nworld, nact), of which about a quarter exceed their bounds."""
+    """Draw actions, (steps, nworld, nact). About a quarter of them exceed their bounds."""
     space = env.action_space
     unit = np.random.default_rng(zlib.crc32(task.encode())).uniform(-1.3, 1.3, (steps, env.nworld, space.size))
     low, high = (np.asarray(bound, np.float64) for bound in (space.low, space.high))
@@ -313,7 +313,7 @@ def failure(error: Exception) -> dict[str, Any]:
 
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Compute a unit, and write its arrays, even those before a failure."""
+    """Compute a unit and write its arrays. After a failure, write the arrays that are complete."""
     numbers, answer = Numbers(), {}
     try:
         PARTS[unit.pop("part")](numbers, **unit)

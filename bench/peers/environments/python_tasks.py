@@ -91,7 +91,7 @@ class HerbReachEnv(MujocoEnv):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         self.do_simulation(action, self.frame_skip)
-        mujoco.mj_kinematics(self.model, self.data)  # mj_step computes no site positions of the new state
+        mujoco.mj_kinematics(self.model, self.data)  # mj_step does not update site positions to the new state
         return self._get_obs(), self._get_rew(0.0, action)[0], False, False, {}
 
     def reset_model(self) -> np.ndarray:
@@ -113,7 +113,7 @@ POSITIONS = {
 
 
 def dm_control_env(task: str, seed: int) -> Any:
-    """Make a dm_control environment: a task of its suite, or Gymnasium's formulas on dm_control's physics."""
+    """Make a dm_control environment. Its task is one of dm_control's suite, or uses Gymnasium's formulas."""
     from dm_control import mujoco as dm_mujoco
     from dm_control import suite
     from dm_control.rl import control

@@ -1,7 +1,7 @@
 """Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
 
 The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
-are uniform within their bounds and drawn before the clock starts.
+are uniform within their bounds. They are drawn before the clock starts.
 """
 
 import json
@@ -190,7 +190,7 @@ PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoc
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
-    """Return the number of steps and the seconds that they took, after ``warm`` steps.
+    """Run ``warm`` steps, and then measure. Return the number of measured steps and their seconds.
 
     ``step`` gets the index of the actions, from 0 to ``period`` - 1. ``wait`` waits for the end of asynchronous steps.
     """
