@@ -202,7 +202,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # store the states, so that another machine with this folder can continue
+            # continue from the last stored state, even from another machine's
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         for task, sizes, _ in runs if "random" in parts else ():

@@ -1,7 +1,7 @@
 """Configure the site that ``make docs`` builds from the pages in docs/, CONTRIBUTING.md, CHANGELOG.md and bench/.
 
-The source folder is the repository's root, so relative links lead to the same file in the repository and on the site.
-The build replaces comments ``<!-- KIND: words -->``, whose kinds are in ``PLACES``, by generated text.
+The source folder is the repository's root, so the same relative links work in the repository and on the site.
+The build replaces comments ``<!-- KIND: words -->`` by generated text. ``PLACES`` lists the kinds.
 """
 
 import logging
@@ -57,11 +57,11 @@ CONTENTS = {
     "Reference": "reference/environments reference/tasks reference/functions reference/models reference/learning "
     "reference/planning reference/runs",
 }
-"""The paths of each section's pages, relative to docs/, in order."""
+"""The pages of each section in order, as paths relative to docs/."""
 
 
 def contents(_: str) -> str:
-    """Return the tables of contents for the margin."""
+    """Return the contents of the sidebar."""
     return "\n".join(
         "\n".join(["```{toctree}", ":hidden:", f":caption: {caption}", *pages.split(), "```", ""])
         for caption, pages in CONTENTS.items()

@@ -1,6 +1,6 @@
 """Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-The policy of a run in FOLDER (by default a pretrained policy) controls its task, and MPPI controls other tasks. The
+The policy of a run in FOLDER controls its task; the default is a pretrained policy. MPPI controls the other tasks. The
 program writes pictures and results into docs/images/gallery/, and then the page gallery.md. By default, it draws all
 tasks.
 """
@@ -45,7 +45,7 @@ class Show:
     params: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Task parameters of the planner's worlds."""
     replan_every: int = 1
-    """Steps from one plan to the next."""
+    """Steps between two plans."""
     seconds: float = 4.0
     """Maximum simulated seconds of the picture."""
     start: float = 0.0
@@ -147,9 +147,9 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""Settings of tasks that need other ones than the defaults."""
+"""Settings of tasks that do not use the defaults."""
 
-# there is no policy for these tasks, and a planner lets the robots fall soon
+# these tasks have no policy, and under a planner the robots soon fall
 for _name in ("g1_full_velocity", "g1_rough_velocity"):
     _settings = {"horizon": 32, "samples": 48, "knots": 5, "noise": 0.1, "temperature": 0.02}
     SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
@@ -181,7 +181,7 @@ def draw(name: str, run: Path | None) -> dict[str, str]:
 
 
 def training(name: str, run: Path, config: dict[str, Any]) -> str:
-    """Return the command that repeats a run, with every flag that affects the policy."""
+    """Return the command that repeats a run. It contains every flag that affects the policy."""
     algorithm = config["algorithm"]
     rows = (run / "metrics.csv").read_text().splitlines()
     flags = {"algorithm": algorithm} | ({"device": "cuda"} if config["device"].startswith("cuda") else {})
@@ -268,7 +268,7 @@ def number(value: float) -> str:
 
 
 def families() -> dict[str, tuple[str, list[str]]]:
-    """Return the title and the task names of each page in docs/tasks/, by page."""
+    """Return a dict with the title and the task names of each page in docs/tasks/."""
     found = {}
     for path in sorted((DOCS / "tasks").glob("*.md")):
         text = path.read_text()
