@@ -31,11 +31,11 @@ ALIASES = {
     "quat": ("class", "A quaternion in MuJoCo's order w, x, y, z: ``wp.vec4``."),
     "vec10": ("class", "The ten numbers of a contact's or a geom's row that Warp has no name for."),
 }
-"""Public names that refer to Warp objects, with their kinds and descriptions."""
+"""Kinds and descriptions of the public names that are Warp objects."""
 
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
-"""Warp's names of types, and the names that task files use."""
+"""The names of types in task files, by Warp's names."""
 
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
@@ -97,7 +97,7 @@ def members(cls: type) -> list[str]:
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Convert a docstring to reStructuredText, without the attributes, which are documented as members."""
+    """Convert a docstring to reStructuredText. Omit attributes, because they are documented as members."""
     if what == "class" and "Attributes:" in lines:
         del lines[lines.index("Attributes:") :]
     lines[:] = converted("\n".join(lines))
@@ -151,7 +151,7 @@ def type_name(annotation: Any) -> str:
 
 
 def tasks(words: str) -> str:
-    """Return a section for each task; names are separated by spaces."""
+    """Return a section for each of the tasks in ``names``, which spaces separate."""
     return "\n\n".join(map(task_section, words.split()))
 
 
@@ -205,7 +205,7 @@ def facts(task: BoundTask) -> list[str]:
 
 
 def shortened(value: Any) -> str:
-    """Format a setting; of a long list, give only the length."""
+    """Format a setting. For a long list, return only its length."""
     return f"({len(value)} numbers)" if isinstance(value, list | tuple) and len(value) > 3 else f"{value}"
 
 
@@ -264,7 +264,7 @@ def spelled(default: Any, value: Any) -> str:
 
 
 def comments(task: type) -> dict[str, str]:
-    """Return the comments behind the fields of ``Params``, including those of base classes."""
+    """Return the comments of the fields of ``Params``, including fields of base classes."""
     found: dict[str, str] = {}
     for cls in reversed(task.__mro__[:-1]):
         lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
