@@ -151,7 +151,7 @@ def type_name(annotation: Any) -> str:
 
 
 def tasks(words: str) -> str:
-    """Return a section for each of the tasks in ``names``, which spaces separate."""
+    """Return a section for each task in ``words``."""
     return "\n\n".join(map(task_section, words.split()))
 
 

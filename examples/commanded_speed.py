@@ -1,4 +1,4 @@
-"""Define a cheetah that runs at a commanded speed; the task uses most features that a task can have."""
+"""Define a cheetah that runs at a commanded speed, with most features that a task can have."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ class World:
     qpos: Row[float]
     qvel: Row[float]
     sensordata: Row[float]
-    gravity: Row[float]  # four model fields, which startup and randomize write per world
+    gravity: Row[float]  # four model fields, which startup and randomize write in each world
     body_mass: Row[float]
     geom_friction: Row[wp.vec3]
     actuator_gainprm: Row[lw.vec10]

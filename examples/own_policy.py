@@ -4,7 +4,7 @@
     python examples/own_policy.py --task half_cheetah --iterations 100
 
 The network is any torch module that maps observations (..., nobs) to mean actions (..., nact). ``lw.GaussianPolicy``
-adds noise, log-probabilities and the normaliser of observations.
+adds noise, log-probabilities and a normaliser for observations.
 """
 
 import torch
@@ -23,7 +23,7 @@ class Feedback(nn.Module):
         self.gains = nn.Linear(nobs, nact)
         self.correction = nn.Sequential(nn.Linear(nobs, 32), nn.LayerNorm(32), nn.ELU(), nn.Linear(32, nact))
         for last in (self.gains, self.correction[-1]):
-            nn.init.normal_(last.weight, std=0.01)  # start near the middle of the range
+            nn.init.normal_(last.weight, std=0.01)  # the first actions are near the middle of their range
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return self.middle + self.extent * torch.tanh(self.gains(obs) + self.correction(obs))

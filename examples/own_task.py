@@ -28,7 +28,7 @@ class World:  # the fields that the functions read, by MuJoCo's names
 
 
 @wp.struct
-class Params:  # keyword arguments of lw.make; dt, the seconds in a step, is filled in
+class Params:  # keyword arguments of lw.make; the package sets dt, the seconds per step
     dt: float
     effort_weight: float = 0.01
 

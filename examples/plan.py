@@ -24,11 +24,11 @@ def main(
         task: Name of a task, or a file that defines one.
         episodes: Number of episodes.
         steps: Number of steps per episode; by default the task's horizon.
-        samples: Number of samples per plan; by default the task's setting.
+        samples: Number of samples per plan. The task has a default.
         seed: Seed of the first episode; the next episode has the next seed.
     """
     plant = lw.make(task, autoreset=False)
-    # the planner simulates its samples in worlds of its own
+    # the planner has its own worlds
     plan = lw.MPPI(task) if samples is None else lw.MPPI(task, samples=samples)
 
     trajectories = []

@@ -3,7 +3,7 @@
     python examples/random_search.py
     python examples/random_search.py --task hopper --nworld 64 --iterations 300 --video-every 100
 
-``lw.train`` writes the run folder with metrics, policies, checkpoints and videos, so the class has no code for files.
+The class has no code for files: ``lw.train`` writes a run folder with metrics, policies, checkpoints and videos.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import lyceum_warp as lw
 @dataclasses.dataclass(frozen=True)
 class SearchConfig:
     step: float = 1.0
-    """Learning rate of the weights, for returns divided by their standard deviation."""
+    """Learning rate of the weights. Returns are divided by their standard deviation."""
     noise: float = 0.5
     """Standard deviation of the perturbations of the weights."""
 

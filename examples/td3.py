@@ -29,7 +29,7 @@ class TD3Config:
     n_step: int = 1
     gamma: float = 0.99
     tau: float = 0.005
-    """Fraction by which an update moves the target networks towards the networks."""
+    """Weight of the learned networks in the moving average of the target networks."""
     learning_rate: float = 1e-3
     noise: float = 0.2
     """Standard deviation of the exploration noise."""
@@ -86,7 +86,7 @@ class TD3(lw.Learner):
         with torch.no_grad():
             noise = config.target_noise * self.normal(batch.action)
             unit = actor.unit(actor.act(next_obs)) + noise.clamp(-config.noise_limit, config.noise_limit)
-            # discount is 0 after a termination and 1 after a time limit
+            # discount is 0 after a termination, and 1 if the episode reached its time limit
             target = batch.reward + batch.discount * critic(next_obs, unit.clamp(-1.0, 1.0)).amin(0)
         loss = (self.value(obs, self.policy.unit(batch.action)) - target).square().mean(1).sum()
         descend(critic_step, loss)

@@ -31,8 +31,8 @@ def main(nworld: int = 256, iterations: int = 100, steps: int = 32, device: str 
                 action = torch.normal(actor(obs), log_std.exp())
             env.step(action)  # the step restarts worlds whose episode ended
             with torch.no_grad():
-                # env.obs may already belong to a new episode, but env.final_obs is the observation after this step. A
-                # time limit only truncates the episode, so bootstrap unless the task terminated.
+                # env.obs may already belong to a new episode, so bootstrap from env.final_obs, the observation after
+                # this step. After a termination, do not bootstrap.
                 next_value = critic(env.final_obs) * ~env.terminated
             outcome = env.reward.clone(), env.done.clone(), env.eval.clone()
             samples.append((obs, action, next_value, *outcome))
