@@ -86,7 +86,7 @@ class TD3(lw.Learner):
         with torch.no_grad():
             noise = config.target_noise * self.normal(batch.action)
             unit = actor.unit(actor.act(next_obs)) + noise.clamp(-config.noise_limit, config.noise_limit)
-            # discount is 0 after a termination, and 1 if the episode reached its time limit
+            # discount contains gamma, and is 0 after a termination
             target = batch.reward + batch.discount * critic(next_obs, unit.clamp(-1.0, 1.0)).amin(0)
         loss = (self.value(obs, self.policy.unit(batch.action)) - target).square().mean(1).sum()
         descend(critic_step, loss)
