@@ -96,7 +96,7 @@ def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
 
 
 class Native:
-    """``mujoco.rollout`` without observations and rewards, in the states of lyceum_warp's environment."""
+    """``mujoco.rollout`` without observations and rewards. It starts from the states of lyceum_warp's environment."""
 
     def __init__(self, task: str, nworld: int, threads: int, seed: int, warm: int) -> None:
         ours = LyceumWarp("c", task, nworld, threads, "cpu", seed)

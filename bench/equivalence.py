@@ -3,8 +3,8 @@
     lyceum-warp bench equivalence --device cuda
 
 The area under a learning curve is the run's mean return over all iterations. Two one-sided t tests (TOST) at the level
-0.05 compare the areas of 20 seeds on each engine. The margin, one standard deviation between seeds, was chosen before
-the first run.
+0.05 compare the areas of the two engines, with 20 seeds each. The margin, one standard deviation between seeds, was
+chosen before the first run.
 """
 
 import dataclasses

@@ -38,7 +38,7 @@ NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", 
          "soak")  # fmt: skip
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
-"""Results are compared only if these are equal."""
+"""Fields of stored results. Results are compared only if these fields are equal."""
 
 GPU_QUERY = {
     "driver": "driver_version", "power_limit": "power.limit", "clock_sm": "clocks.sm", "clock_sm_max": "clocks.max.sm",
@@ -108,10 +108,8 @@ class Table:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """An experiment. A case is a frozen dataclass with everything that affects the result except machine and versions.
-
-    List the cases with repeats as the outer loop and contestants as the inner loop, so that compared contestants take
-    turns.
+    """An experiment. A case is a frozen dataclass with everything that affects the result, except machine and versions.
+    In the list of cases, contestants vary faster than repeats, so that compared contestants take turns.
     """
 
     name: str
@@ -257,7 +255,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Divide each contestant's values by those of the contestant ``unit`` in the same repeat."""
+    """Divide each value by that of the contestant ``unit`` in the same repeat."""
     values: dict[str, dict[int, float]] = {}
     for row in rows:
         values.setdefault(row.case["contestant"], {})[row.case["repeat"]] = row.result[quantity]
@@ -274,7 +272,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Restrict this thread, and all threads and processes that it starts later, to the first ``number`` cores."""
+    """Run this thread on the first ``number`` cores only. Threads and processes that it starts inherit this."""
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
         raise Skipped(f"{number} threads need {number} cores, and this process has {len(before)}")
@@ -399,7 +397,7 @@ def outcomes(
 
 def _measure_apart(measure: Callable[[Any, Any], Any], case: Any, options: Options) -> Any:
     """Measure a case in this subprocess, which ends on SIGTERM or with its parent."""
-    # SIGTERM must raise KeyboardInterrupt, so that the subprocesses of the case also end
+    # let SIGTERM raise KeyboardInterrupt, so that the subprocesses of the case also end
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     threading.Thread(target=_interrupt_after_parent, daemon=True).start()
     return measure(case, options)

@@ -1,8 +1,8 @@
 """Compare the step time of an environment with the step time of its physics engine alone, on the same states.
 
-Environment and bare engine (the engine without a task) alternate every ten steps, from the same states. The bare engine
-is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``. ``kept`` is the bare engine's step time divided by
-the environment's step time, and ``added`` is their difference.
+The environment and the bare engine (the engine without a task) take turns of ten steps, from the same states. The bare
+engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``. ``kept`` is the bare engine's step time
+divided by the environment's step time, and ``added`` is their difference.
 """
 
 import statistics

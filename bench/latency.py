@@ -1,4 +1,4 @@
-"""Measure planning in real time: planning times, deadlines, ages of actions and rewards.
+"""Measure planning in real time: planning times, missed deadlines, rewards, and ages of actions.
 
     lyceum-warp bench latency
     lyceum-warp bench latency --tasks reach humanoid --samples 256 1024 --horizons 32 --device cuda

@@ -3,9 +3,9 @@
     lyceum-warp bench learning --device cuda
     lyceum-warp bench learning --tasks go1_velocity --algorithm npg --device cuda
 
-The time includes graph captures, sampling and updates, and excludes kernel compilation and evaluations. The mean return
-is taken over the last 100 episodes, or over 16 separate episodes if iterations are short. On go1_velocity, a robot that
-stands still also reaches high returns, so the program also measures tracking errors and falls.
+The time includes graph captures, sampling and updates. It excludes kernel compilation and evaluations. The mean return
+is that of the last 100 episodes, or of 16 separate episodes if iterations are short. On go1_velocity, even a robot that
+stands still reaches high returns. The program therefore also measures tracking errors and falls.
 """
 
 import collections

@@ -3,10 +3,10 @@
     lyceum-warp bench mppi --threads 16
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
-``episodes``: success and time of episodes of 75 steps, with the paper's settings. ``plans``: the planning time from
-given states. All planners control the same plant, and take turns in blocks of episodes. In the contestants "a set at a
-time", one planner controls the plants of all episodes in a set. ``mppi_fast`` plans with the physics that a task names
-"fast"; the plant keeps the exact physics.
+The part ``episodes`` measures success and time of episodes of 75 steps, with the paper's settings. The part ``plans``
+measures the planning time from given states. All planners control the same plant, and take turns in blocks of episodes.
+In the contestants "a set at a time", one planner controls the plants of all episodes in a set. The contestant
+``mppi_fast`` plans with the task's "fast" physics, and its plant has the exact physics.
 """
 
 import dataclasses

@@ -2,10 +2,10 @@
 
     lyceum-warp bench npg --threads 2 --jobs 16
 
-Both NPGs are the same class with the same settings and seeds; only the environments differ. Gymnasium uses the faster
-of its two vector modes. The PPO of stable-baselines3 and the TRPO of sb3-contrib learn for twelve minutes, with the
-settings of RL Baselines3 Zoo. All policies are evaluated by their mean actions in single Gymnasium environments, from
-the same initial states. The clock starts after kernels are compiled and environments are made, and stops during
+On both kinds of environments, NPG is the same class with the same settings and seeds. Gymnasium's environments run in
+the faster of their two vector modes. The PPO of stable-baselines3 and the TRPO of sb3-contrib learn for twelve minutes,
+with the settings of RL Baselines3 Zoo. All policies are evaluated in single Gymnasium environments, with mean actions
+and from the same initial states. The clock starts after kernels are compiled and environments are made. It stops during
 evaluations.
 """
 

@@ -1,6 +1,6 @@
 """Plan with MPPI in Python, with single Gymnasium environments in subprocesses.
 
-Each subprocess has an environment and gets one message per plan; NumPy computes noise and weights. ``PythonMPPI`` takes
+Each subprocess has an environment and gets one message per plan. NumPy computes noise and weights. ``PythonMPPI`` takes
 its settings from an ``lw.MPPI`` and controls the same plant.
 """
 
@@ -43,7 +43,7 @@ class ReachEnv:
 class GymnasiumEnv:
     """An environment of Gymnasium or Gymnasium-Robotics that can be set to a state of this package's task.
 
-    ``target`` is a mocap body of ``model``; in Gymnasium's model, it is a body with a constant orientation.
+    ``target`` is a mocap body of ``model``. In Gymnasium's model, the target is a body with a constant orientation.
     """
 
     def __init__(self, name: str, model: mujoco.MjModel, target: str | None = None) -> None:

@@ -2,7 +2,7 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds the rank correlations of ``lyceum-warp tune --planning`` and three returns.
+Each line of results/rank-loss.jsonl holds three returns, and the rank correlations of ``lyceum-warp tune --planning``.
 The loss is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return of a planner with the task's physics,
 R_setting that of a planner with the setting, and R_none the return without a planner. The load of the machine does not
 matter, because episodes do not run in real time.

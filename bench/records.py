@@ -3,10 +3,10 @@
     lyceum-warp bench records --device cuda --tasks go1_velocity g1_velocity --seeds 42 43 44
     lyceum-warp bench records --tasks hopper --cache cold
 
-The clock starts before the command, so the seconds include imports, compilation and graph captures. It stops when the
-run's config.json says that the target is reached. With a cold cache, all kernels are compiled. With a warm cache, the
-same command has already run one iteration. A run that lasts longer than --seconds is stopped. The same command
-continues it, and the result is the sum of the seconds.
+The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
+when the run's config.json says that the target is reached. With a cold cache, the command compiles all kernels. With a
+warm cache, the same command has already run one iteration. A run that lasts longer than --seconds is stopped. The same
+command continues it, and the result is the sum of the seconds.
 """
 
 import contextlib

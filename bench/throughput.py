@@ -3,10 +3,10 @@
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
-Six parts. ``sampling``: many worlds on all threads, relative to native C (``mujoco.rollout``). ``suite``: tasks of
-dm_control's suite with equal numbers of worlds, relative to dm_control. ``single``: one world on one thread, relative
-to Gymnasium. ``cores``: the part ``sampling`` on 1, 2, 4, ... cores. ``worlds``: lyceum_warp with 1 to 131,072 worlds.
-``kept``: an environment compared with its bare engine (kept.py).
+The part ``sampling`` measures many worlds on all threads, relative to native C (``mujoco.rollout``). ``suite`` measures
+dm_control's tasks with equal numbers of worlds, relative to dm_control. ``single`` measures one world on one thread,
+relative to Gymnasium. ``cores`` runs the part ``sampling`` on 1, 2, 4, ... cores. ``worlds`` measures lyceum_warp with
+1 to 131,072 worlds. ``kept`` compares an environment with its bare engine (kept.py).
 """
 
 import dataclasses
