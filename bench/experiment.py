@@ -109,7 +109,7 @@ class Table:
 @dataclasses.dataclass(frozen=True)
 class Experiment:
     """An experiment. A case is a frozen dataclass with everything that affects the result, except machine and versions.
-    In the list of cases, contestants vary faster than repeats, so that compared contestants take turns.
+    The list of cases is ordered by repeat, so that compared contestants take turns.
     """
 
     name: str
