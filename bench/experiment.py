@@ -109,6 +109,7 @@ class Table:
 @dataclasses.dataclass(frozen=True)
 class Experiment:
     """An experiment. A case is a frozen dataclass with everything that affects the result, except machine and versions.
+
     The list of cases is ordered by repeat, so that compared contestants take turns.
     """
 
