@@ -141,7 +141,7 @@ def load(name: str) -> Experiment:
 
 
 def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
-    """Return the given names. If there are none, return the default names, or all known names without a default."""
+    """Return the given names, the default names or all known names: the first of these that is not empty."""
     known = tuple(known)
     for name in given:
         if name not in known:
