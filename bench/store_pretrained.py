@@ -19,7 +19,7 @@ from lyceum_warp.runs.folder import Run
 FOLDER = Path(lw.__file__).parent / "pretrained"
 KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")
 EPISODES, SEED = 32, 1
-FEW, FIRST = 4, 60  # worlds and steps of the test of a stored policy
+FEW, FIRST = 4, 60  # a stored policy is tested in this many worlds and steps
 
 
 def store(folder: Path, which: str) -> Path:
