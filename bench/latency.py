@@ -44,7 +44,7 @@ class Options(experiment.Options):
     horizons: tuple[int, ...] = ()
     """Horizons of plans, in steps; by default 16, 32 and 64."""
     own: bool = False
-    """Whether to use the samples and the horizon that each task suggests."""
+    """Whether to use each task's suggested horizon and number of samples."""
     physics: tuple[str, ...] = ()
     """Names of the planner's physics: exact, or a name that the task defines. The default is the physics that the task
     suggests. If this physics has a name, the exact physics is measured, too."""

@@ -129,7 +129,7 @@ class ModelField:
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
-        """Describe the first value that MuJoCo cannot simulate, or return None."""
+        """Describe the first invalid value, or return None."""
         nominal = self.value(model).ravel()
         bad = ~np.isfinite(rows)
         if self.name in NOT_NEGATIVE:

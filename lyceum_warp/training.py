@@ -98,8 +98,8 @@ def train(
             "free" for MuJoCo's default camera.
         transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. The default
             makes only comparisons that take seconds. After training on a GPU, it compares with the C engine. After
-            training with other physics, it compares with exact physics. ``transfer=True`` adds the task's other physics
-            and the Warp engine.
+            training with other physics, it compares with exact physics. ``transfer=True`` also compares with the Warp
+            engine, and with every named physics of the task.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.

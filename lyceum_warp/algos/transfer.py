@@ -132,7 +132,7 @@ def transfer(
     Args:
         env: An environment of the task; its worlds do not change.
         policy: A function that maps observations to actions without noise, or a module whose method ``act`` does this.
-        episodes: Number of pairs of episodes, each in a separate world.
+        episodes: Number of pairs of episodes.
         seed: Seed of the initial states.
         margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction
             of the mean absolute return or mean length in the first simulation. For terminations, it is an absolute

@@ -91,7 +91,7 @@ def compile_model(
 ) -> mujoco.MjModel:
     """Compile a model for both engines.
 
-    - Newton replaces the PGS solver, which MuJoCo Warp lacks. Newton converges to the same accelerations.
+    - MuJoCo Warp has no PGS solver, so Newton replaces it. Newton converges to the same accelerations.
     - Sleep is turned off, because a saved state does not say which bodies are asleep.
     - MuJoCo computes some fields only for sensors. If such a field is read, a sensor is added after the model's own.
     - If no field is read that depends on sensors, all sensors are turned off.

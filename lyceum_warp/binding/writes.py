@@ -134,7 +134,7 @@ class _Reader:
     Args:
         places: The values that the caller passes, one for each argument. A value that cannot be written is None.
         arguments: Names of the arguments of the analysed function.
-        seen: The functions that were already read, with the ``places`` that their callers passed.
+        seen: Pairs of a function and its ``places`` that were already read.
     """
 
     def __init__(

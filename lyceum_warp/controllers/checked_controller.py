@@ -78,7 +78,7 @@ class CheckedController:
         return plan[min(index, len(plan) - 1)]
 
     def check_horizon(self, horizon: int, steps: int) -> None:
-        """Check that ``horizon`` actions suffice for a number of plant steps."""
+        """Check that a plan of ``horizon`` actions is long enough for the given number of plant steps."""
         if (needed := self.steps(steps - 1) + 1) > horizon:
             plan = (
                 f"a plan of {horizon} actions" if hasattr(self._controller, "actions") else "no plan, only one action"

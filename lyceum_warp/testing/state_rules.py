@@ -152,7 +152,8 @@ def _lasting_columns(env: Env) -> list[slice]:
 def check_reset(ctx: Context) -> None:
     """With zero actions, ``reset`` leads to the same state regardless of the past.
 
-    The columns that survive a reset are first made equal in all worlds, because other columns may depend on them.
+    Some columns of the state survive a reset, and others may depend on them. The check first makes these columns equal
+    in all worlds.
     """
     env = ctx.a
     lasting = _lasting_columns(env)
@@ -225,7 +226,7 @@ def check_rand_reset(ctx: Context) -> None:
 
 
 def check_world_count(ctx: Context) -> None:
-    """With the same seed, a world has the same initial state for any number of worlds."""
+    """The initial state of a world depends on its seed, and not on the number of worlds."""
     n = ctx.a.nworld
     doubled = {name: np.concatenate([v, v]) for name, v in ctx.a.task.parameters.per_world.items()}
     more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)

@@ -77,7 +77,7 @@ class Stage:
 
     @property
     def live(self) -> Live:
-        """The worlds that are stepped: the plant if a controller of one world is in use, otherwise all worlds."""
+        """The plant, if a controller acts in it. Otherwise all worlds."""
         return self._plant if self._plant is not None and isinstance(self.control, WorldControl) else self.main
 
     @property
