@@ -1,7 +1,7 @@
 """G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
 Actions are offsets of the leg joints' targets. The targets follow a gait clock and lift the feet. With zero actions,
-the robot steps in place and falls after about a second. A planner only has to keep it upright. The servos have the
+the robot steps in place and falls after about a second. A planner only keeps it upright. The servos have the
 gains of unitree_rl_gym, which also keeps waist and arms rigid. A substep would take twice as long with the upper body's
 17 joints and the legs' dry friction.
 """
