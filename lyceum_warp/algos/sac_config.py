@@ -38,7 +38,8 @@ class SACConfig:
     to Seo et al., 2025 ("Learning Sim-to-Real Humanoid Locomotion in 15 Minutes").
 
     Raises:
-        ValueError: A value is of the wrong type, out of range or not finite.
+        ValueError: A value is of the wrong type, out of range or not finite, or ``dropped_quantiles`` leaves no
+            quantile.
     """
 
     num_steps: int | None = None
@@ -119,6 +120,10 @@ class SACConfig:
     def __post_init__(self) -> None:
         """Check every value."""
         check_fields(self, _BOUNDS)
+        if self.dropped_quantiles >= self.quantiles > 1:
+            raise ValueError(
+                f"dropped_quantiles={self.dropped_quantiles} must be less than quantiles, which is {self.quantiles}"
+            )
 
     def resolved(self, nworld: int) -> "SACConfig":
         """Replace None by defaults in all fields except ``replay`` and ``value_group``.
@@ -127,7 +132,7 @@ class SACConfig:
             nworld: Number of worlds of all processes.
 
         Raises:
-            ValueError: ``actor_every`` does not divide ``updates``, or ``dropped_quantiles`` leaves no quantile.
+            ValueError: ``actor_every`` does not divide ``updates``.
         """
         updates = min(nworld, 8)
         rules = {"num_steps": max(50, -(-1_000 // nworld)), "warmup": max(5_000, 10 * nworld), "updates": updates}
@@ -137,9 +142,5 @@ class SACConfig:
         if config.updates % config.actor_every:
             raise ValueError(
                 f"updates={config.updates} must be a multiple of actor_every, which is {config.actor_every}"
-            )
-        if config.dropped_quantiles >= config.quantiles > 1:
-            raise ValueError(
-                f"dropped_quantiles={config.dropped_quantiles} must be less than quantiles, which is {config.quantiles}"
             )
         return config

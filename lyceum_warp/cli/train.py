@@ -145,8 +145,7 @@ class Train:
     """Whether to also write metrics for TensorBoard into the run's folder."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Total number of worlds in all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
-    samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment
-    of it.
+    samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment of it.
     """
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
     """Number of torch threads on the CPU. Small networks gain little from more threads. Runs are identical bit for bit
