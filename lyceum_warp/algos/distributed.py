@@ -110,12 +110,13 @@ class Team:
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
-        """End all processes if the with block raises an error in one of them.
+        """End all processes if the ``with`` block raises an error in one of them.
 
-        The with block must not communicate, because the other processes would wait for the failed process.
+        Code in the ``with`` block must not communicate with other processes. After an error in one process, the others
+        would wait for it.
 
         Raises:
-            SystemExit: The with block failed in another process.
+            SystemExit: The ``with`` block failed in another process.
         """
         if self.size == 1:
             yield

@@ -70,8 +70,8 @@ def evaluate(
         policy: A function that maps observations (nworld, nobs) to actions (nworld, nact), or a module whose method
             ``act`` does this.
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
-        seed: Seed of the initial states. The same seed in ``lw.make`` gives different initial states. Without a seed,
-            the worlds continue their random streams.
+        seed: Seed of the initial states. ``evaluate`` and ``lw.make`` draw different initial states from the same seed.
+            Without a seed, the worlds continue their random streams.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:

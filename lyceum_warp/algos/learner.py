@@ -155,9 +155,9 @@ class Learner(abc.ABC):
     def best_by(self) -> str:
         """The field of ``Iteration`` that a run uses to select its best policy and to check its target return.
 
-        "mean_return" is the return of the policy after the update, without noise. "return_mean" is the return of the
-        policy before the update, with noise. The default is "mean_return", or "return_mean" if the configuration has
-        ``mean_every=0``.
+        "mean_return" is the return of the updated policy, which acts without noise. "return_mean" is the return of the
+        episodes sampled for the update, in which the old policy acts with noise. The default is "mean_return", or
+        "return_mean" if the configuration has ``mean_every=0``.
         """
         return "return_mean" if getattr(self.config, "mean_every", None) == 0 else "mean_return"
 

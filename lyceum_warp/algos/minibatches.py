@@ -11,7 +11,7 @@ from lyceum_warp.algos.distributed import Captured, Team
 Samples = Mapping[str, torch.Tensor]
 
 _SURE = 6.0
-"""A process's buffer holds the mean number of its samples plus this many standard deviations."""
+"""Room in a process's buffer beyond the mean number of its samples, in standard deviations."""
 
 
 def room(batch: int, team: Team) -> int:

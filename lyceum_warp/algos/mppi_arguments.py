@@ -96,7 +96,7 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
     """Derive each plant's seed from the first plant's seed, or check a list of seeds.
 
     Raises:
-        ValueError: A seed is not a non-negative whole number, or the number of seeds is not ``plants``.
+        ValueError: A seed is negative or not a whole number, or the list does not contain ``plants`` seeds.
     """
     given: Any = seed
     if isinstance(given, (np.ndarray, torch.Tensor)):
@@ -112,7 +112,10 @@ def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
 
 
 def plain(value: Any) -> Any:
-    """Convert a setting, an option or a parameter to a JSON value, as the argument ``default`` of ``json.dumps``."""
+    """Convert a setting, an option or a parameter to a value that JSON supports.
+
+    Pass this function to ``json.dumps`` as the argument ``default``.
+    """
     if isinstance(value, mujoco.MjSpec):
         return f"MjSpec {value.modelname!r}"
     if isinstance(value, PlanUpdate):

@@ -79,7 +79,7 @@ class MPPIConfig:
     a given action (a single number, or a number for each element of the action)."""
     termination: Literal["stop", "ignore"] = "stop"
     """How to treat a sample whose episode ends before the horizon. "stop" counts no rewards after the end. "ignore"
-    counts all rewards up to the horizon, as in Lyceum and trajopt."""
+    ignores the end: all rewards up to the horizon count, as in Lyceum and trajopt."""
     nominal_model: bool = False
     """Whether samples use the nominal values of per-world model fields instead of the values in the given state."""
     models: int = 1

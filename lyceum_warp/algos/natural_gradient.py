@@ -30,10 +30,11 @@ def score_gradient(
 
 
 class FisherProduct:
-    """Compute products with the Fisher information of a Gaussian policy, averaged over observations.
+    """Multiplies vectors by the Fisher information of a Gaussian policy.
 
-    The Fisher information of N(mean(s; theta), diag(sigma^2)) has two blocks. The block of theta is E[J^T
-    diag(1/sigma^2) J] with J = d mean / d theta. The block of log sigma is twice the identity matrix.
+    The Fisher information of N(mean(s; theta), diag(sigma^2)) is averaged over the observations s, and has two blocks.
+    The block of theta is E[J^T diag(1/sigma^2) J] with J = d mean / d theta. The block of log sigma is twice the
+    identity matrix.
 
     ``count`` is the number of observations of all processes. ``weight`` is 0 for observations of other processes, and
     otherwise 1.
@@ -69,7 +70,7 @@ class FisherProduct:
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:
-            # this term is not a sum over samples, so each process adds 1 / size of it
+            # this term is not a sum over samples, so each process adds an equal share
             pulled.insert(self.log_std_at, 2.0 / self.team.size * log_std_part)
         return self.team.sum(flatten(pulled)) + self.damping * vector
 

@@ -63,7 +63,7 @@ class NPGIteration(OnPolicyIteration):
     explained_variance: float
     """Fraction of the returns' variance that the value function explained before the fit."""
     outliers: int
-    """Number of advantages that were clipped to ten standard deviations of the returns."""
+    """Number of clipped advantages. Their limit is ten times the standard deviation of the returns."""
     skipped_updates: int
     """Number of updates that NPG skipped because they were not finite: 0, 1 or 2. Each iteration updates the policy and
     the value function."""
@@ -124,7 +124,7 @@ class NPG(OnPolicyLearner):
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
 
-        # read numbers only if this waits neither for a GPU nor for another process
+        # with a GPU or several processes, the host would wait for each number that it reads
         self._reads_numbers = device.type == "cpu" and team.size == 1
 
         # samples
@@ -250,8 +250,8 @@ class NPG(OnPolicyLearner):
         """Compute generalised advantages and discounted returns of the rollout.
 
         The returns bootstrap from the value function at time limits and at the end of the rollout. Terminal states have
-        the value 0, as in mjrl; Lyceum bootstraps at terminal states too. The standard deviation of the returns becomes
-        the value function's scale.
+        the value 0 (as in mjrl, unlike Lyceum). The standard deviation of the returns becomes the value function's
+        scale.
 
         Returns:
             Advantages and returns, each (steps, nworld); statistics of the value function's errors; and the number of
@@ -283,7 +283,7 @@ class NPG(OnPolicyLearner):
 
     @torch.no_grad()
     def observe(self, obs: torch.Tensor) -> torch.Tensor:
-        """Update the normaliser of the policy's observations, and return the mean actions before the update.
+        """Compute the policy's mean actions, then update the normaliser of its observations.
 
         If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction of the
         update is applied. Later iterations apply the rest. The reported KL divergence includes this change.
@@ -327,7 +327,7 @@ class NPG(OnPolicyLearner):
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Add a step to the policy's parameters, and shorten the step if the KL divergence exceeds its limit.
 
-        The Fisher information approximates the KL divergence only to second order, and on a subset of the samples. If a
+        The KL divergence can exceed its limit because the Fisher information predicts it only to second order. If a
         step is still too long after four reductions, or is not finite, the policy does not change. The host does not
         wait for the device.
 

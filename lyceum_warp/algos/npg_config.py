@@ -15,9 +15,9 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 _LONG_EPISODE = 20
-"""By default, NPG restarts worlds (``min_restarts``) if an episode lasts longer than this number of iterations. When an
-episode of hopper lasted 31 or 63 iterations, the return of some seeds stayed low for a long time. This did not happen
-when an episode lasted 16 iterations (bench/README.md, "NPG's learning curves")."""
+"""If an episode takes more iterations than this limit, NPG restarts worlds by default (``min_restarts``). When an
+episode of hopper took 31 or 63 iterations, the return of some seeds stayed low for a long time. This did not happen
+when an episode took 16 iterations (bench/README.md, "NPG's learning curves")."""
 
 
 @document_attributes
@@ -30,19 +30,19 @@ class NPGConfig:
     """
 
     samples: int | None = None
-    """Samples per iteration, rounded up to a multiple of the number of worlds. The default is the paper's 10,000, or 16
-    steps of every world if that is more."""
+    """Samples per iteration, rounded up to a multiple of the number of worlds. The default is 16 steps of every world,
+    but at least 10,000 samples, as in the paper."""
     rollout: Literal["auto", "episodes", "segments"] = "auto"
     """"episodes" starts new episodes in every iteration, as in the paper. "segments" continues the last iteration's
     episodes, which suits many worlds with few steps each. "auto" selects "episodes" if samples / worlds >= horizon, and
     otherwise "segments"."""
     min_restarts: float | None = None
     """Minimum number of worlds that start an episode in each iteration, as a multiple of samples / horizon; 0 turns
-    restarts off. If fewer worlds started an episode in the last iteration, random worlds are restarted. This requires
-    "segments" and a time limit. Without restarts, worlds that started together reach the time limit together. Between
-    the time limits, few samples come from the start of an episode. The statistics exclude interrupted episodes, so
-    values well above 1 bias ``return_mean`` towards short episodes. The default is 0.5 if an episode lasts longer than
-    20 iterations, and 0 otherwise."""
+    restarts off. If too few worlds started an episode in the last iteration, NPG restarts random worlds. Restarts
+    require "segments" and a time limit. Without restarts, worlds that started together reach the time limit together.
+    Until then, few samples come from the start of an episode. The statistics exclude interrupted episodes. A value well
+    above 1 therefore biases ``return_mean`` towards short episodes. The default is 0.5 if an episode takes more than 20
+    iterations, and 0 otherwise."""
     gamma: float = 0.995
     """Discount factor."""
     lam: float = 0.97
@@ -106,7 +106,7 @@ def enough_samples(config: NPGConfig, nworld: int) -> int:
 
 
 def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> int:
-    """Compute the minimum number of worlds, over all processes, that start an episode in an iteration."""
+    """Compute how many worlds must start an episode per iteration; ``nworld`` counts the worlds of all processes."""
     if horizon == 0:
         return 0
     share = config.min_restarts

@@ -85,9 +85,9 @@ class Planner:
 
     With ``plants=n``, the planner plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n
     worlds. Plant i uses the seed ``seed + i`` for its noise. On the same engine, the plan of plant i equals the plan of
-    a single-plant planner with this seed. With ``models``, all plants use the models of the first seed. With several
-    plants, all buffers except ``model_fields`` have an axis for the plants. This axis follows the axis for steps or
-    knots, if there is one.
+    a single-plant planner with this seed. With ``models``, all plants share the same models; the first plant's seed
+    determines their random fields. With several plants, all buffers except ``model_fields`` have an axis for the
+    plants. This axis follows the axis for steps or knots, if there is one.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
@@ -106,8 +106,8 @@ class Planner:
         words: Settings, options of the planner's worlds, and parameters of the task, by name. Settings are the fields
             of ``lw.MPPIConfig``; None keeps the default. The setting ``update`` may be a custom ``lw.PlanUpdate``.
             Options are those of ``lw.make``. Parameters with one value per world are ordered by plant, then by sample,
-            then by model. With few samples, engine="auto" selects the C engine even if there is a CUDA device. The C
-            engine is faster for few samples, and its plans are on the CPU.
+            then by model. With few samples, engine="auto" selects the C engine even if there is a CUDA device, because
+            the C engine is then faster. It keeps the plan in CPU memory.
 
     Raises:
         ValueError: An argument is unknown, ambiguous or invalid, or the samples do not fit into memory.
@@ -128,7 +128,8 @@ class Planner:
     knot_actions: torch.Tensor
     """The plan's knots, (nknot, nact). The last knot may lie beyond the horizon. Without knots, this is ``actions``."""
     standard_noise: torch.Tensor
-    """The last improvement's standard normal noise, (horizon, samples, nact) or (nknot, samples, nact)."""
+    """Standard normal numbers from which the last improvement computed its noise. The shape is (horizon, samples, nact),
+    or (nknot, samples, nact) with knots."""
     adapted_noise: torch.Tensor | None
     """The adapted standard deviations for the next improvement, before smoothing, (horizon, nact) or (nknot, nact).
     None for updates that do not adapt noise."""
@@ -357,7 +358,7 @@ class Planner:
                 f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the "
                 f"same task, or {hint}. (With fields=[...], an environment's states may be longer.)"
             )
-        # a check on a GPU would wait for the device; an unchecked non-finite state only makes all samples fail
+        # a check on a GPU would wait for the device; without it, a non-finite state makes every sample fail
         if state.device.type != "cpu":
             return state
         values = state.numpy().ravel()
@@ -387,7 +388,7 @@ class Planner:
         )  # fmt: skip
 
     def _program(self, *, first: bool) -> Calls:
-        """List the calls of one improvement; the first improvement also shifts the plan in time."""
+        """List the functions that improve the plan once. If ``first`` is set, they also shift the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)

@@ -233,8 +233,9 @@ class PPO(OnPolicyLearner):
         """Compute the inputs of the update, each (steps, nworld, ...).
 
         The value function's targets are its predictions plus the advantages. Advantages bootstrap from the observation
-        after a step. This observation precedes the task's events, such as a push or a new command, because no action
-        causes events. Advantages also bootstrap at time limits, at faults and at the end of the rollout.
+        right after a step, before events such as a push or a new command. Advantages thus exclude the effects of
+        events, which the action does not cause. Advantages also bootstrap at time limits, at faults and at the end of
+        the rollout.
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]

@@ -98,7 +98,7 @@ class PPOConfig:
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
-        """Compute the entropy coefficient of an iteration, counted from 1."""
+        """Compute the entropy coefficient of an iteration; the first iteration is number 1."""
         if self.final_entropy_coef is None:
             return self.entropy_coef
         first, last = self.entropy_decay

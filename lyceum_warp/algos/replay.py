@@ -13,7 +13,7 @@ from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 Rows: TypeAlias = dict[str, torch.Tensor]
 
 _TRANSITIONS, _STEPS = 1_000_000, 1_024
-"""The default capacity is this number of transitions, or this number of steps of every world if that is more."""
+"""The default capacity is ``_TRANSITIONS`` transitions, but at least ``_STEPS`` steps of every world."""
 
 _SHARE = 0.3
 
@@ -206,7 +206,9 @@ class Replay:
         return {"stored": self.stored, "rows": self.rows(self.stored - self.count, self.stored)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a result of ``state_dict``. Equal random numbers then draw equal transitions.
+        """Restore a result of ``state_dict``.
+
+        With the same random numbers, ``sample`` then returns the same transitions.
 
         Raises:
             ValueError: The state belongs to a buffer of a different size.

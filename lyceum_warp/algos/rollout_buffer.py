@@ -187,8 +187,8 @@ class Rollout:
     def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
         """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
 
-        The statistics exclude interrupted episodes. Do not call this if ``first_only`` is set, because two episodes of
-        a restarted world would count as its first. The host does not wait for the device.
+        The statistics exclude interrupted episodes. Do not call this method if ``first_only`` is set, because the
+        statistics would then include the second episode of a restarted world. The host does not wait for the device.
 
         Args:
             least: Minimum number of such worlds, over all processes.

@@ -1,4 +1,4 @@
-"""Compute statistics over the episodes that ended in a rollout."""
+"""Compute an iteration's statistics from its samples and finished episodes."""
 
 import dataclasses
 import math
@@ -55,7 +55,7 @@ def gathered(
     Args:
         rollout: This process's samples.
         team: The processes.
-        numbers: Further numbers of this process, as scalar tensors.
+        numbers: Additional scalar tensors of this process, by name.
 
     Returns:
         The fields of ``SampledIteration`` that describe samples and episodes, and the ``numbers`` of each process.
@@ -117,8 +117,8 @@ def pooled(parts: Sequence[Mapping[str, float]], *names: str) -> tuple[float, fl
     """Compute the size, mean and sum of squared deviations of the union of several sets.
 
     Args:
-        parts: Numbers of each set.
-        names: Names of a set's size, mean and sum of squared deviations.
+        parts: One mapping for each set, with the set's size, mean and sum of squared deviations.
+        names: The keys of these three values in each mapping.
     """
     sets = [[part[name] for name in names] for part in parts]
     n = sum(size for size, _, _ in sets)

@@ -78,7 +78,7 @@ class SAC(Learner):
 
     Args:
         env: The environment, which must not be stepped between iterations.
-        policy: The policy; by default a new policy. A given policy also acts during the warm-up.
+        policy: The policy; by default a new policy. If you pass a policy, it also acts during the warm-up.
         value: The critics; by default new critics.
         config: Hyperparameters.
         seed: Seed of new networks and of the noise.
@@ -335,7 +335,7 @@ class SAC(Learner):
             if config.quantiles == 1:
                 values = self._bound(values)  # (batch, 1)
             else:
-                # the quantiles of both critics, (batch, 2 * quantiles), without the largest ones
+                # sort the quantiles of both critics together, and drop the largest
                 values = values.transpose(0, 1).flatten(1).sort().values
                 values = values[:, : 2 * (config.quantiles - config.dropped_quantiles)]
             target = batch.reward[:, None] + batch.discount[:, None] * (values + entropy[:, None])
@@ -410,7 +410,7 @@ class GradientStep:
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
-    """Get lower and upper bounds of actions, each (nact,). The bounds of unbounded actions are -limit and limit."""
+    """Get lower and upper bounds of actions, each (nact,). -limit and limit replace infinite bounds."""
     space = env.action_space
     assert space.low is not None and space.high is not None
     return tuple(  # type: ignore[return-value]

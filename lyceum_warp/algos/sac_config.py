@@ -43,19 +43,19 @@ class SACConfig:
     """
 
     num_steps: int | None = None
-    """Number of steps of every world per iteration. The default is 50 steps, or 1,000 samples if that is more."""
+    """Number of steps of every world per iteration. The default is enough steps for 1,000 samples, but at least 50."""
     replay: int | None = None
-    """Capacity of the replay buffer in samples. The default is a million samples, or 1,024 steps of every world if that
-    is more, but at most 30 % of the device's free memory."""
+    """Capacity of the replay buffer in samples. The default is 1,024 steps of every world, but at least a million
+    samples. The default buffer takes at most 30 % of the device's free memory."""
     warmup: int | None = None
-    """Number of samples with random actions before the first update. The default is 5,000 samples, or 10 steps of every
-    world if that is more."""
+    """Number of samples with random actions before the first update. The default is 10 steps of every world, but at
+    least 5,000 samples."""
     updates: int | None = None
     """Number of updates of the critics after each step of all worlds. The default is the number of worlds, but at most
     8."""
     actor_every: int | None = None
-    """Number of updates of the critics for each update of the actor; must divide ``updates``. The default is 1, or 4
-    with 256 or more worlds."""
+    """Number of updates of the critics for each update of the actor; must divide ``updates``. The default is 4
+    with 256 or more worlds, and otherwise 1."""
     batch: int | None = None
     """Number of samples in an update. The default is 8,192 samples with 256 or more worlds, and otherwise 256."""
     n_step: int = 1
@@ -69,8 +69,8 @@ class SACConfig:
     """Number of quantiles that each critic predicts; with 1, it predicts the mean. TQC (Kuznetsov et al., 2020) uses
     25."""
     dropped_quantiles: int = 2
-    """Number of quantiles per critic that the targets drop, as in TQC. The targets drop the largest of both critics'
-    quantiles. With one quantile, the targets use ``critic_bound`` instead."""
+    """Number of quantiles per critic that the targets drop, as in TQC. SAC pools the quantiles of both critics, and
+    drops the largest. With one quantile, the targets use ``critic_bound`` instead."""
     critic_bound: Literal["min", "mean"] | None = None
     """Value of an action if ``quantiles`` is 1: the minimum or the mean of the two critics' predictions. The default is
     "mean" with 256 or more worlds, and otherwise "min"."""

@@ -129,9 +129,9 @@ class SquashedPolicy(Normalized):
         return torch.tanh(u), (gaussian - slope).sum(-1)
 
     def scaled(self, unit: torch.Tensor) -> torch.Tensor:
-        """Convert unit actions to actions."""
+        """Scale actions from the range [-1, 1] to the action bounds."""
         return self.low + 0.5 * self.width * (1.0 + unit)
 
     def unit(self, action: torch.Tensor) -> torch.Tensor:
-        """Convert actions to unit actions."""
+        """Scale actions from the action bounds to the range [-1, 1]."""
         return 2.0 * (action - self.low) / self.width - 1.0

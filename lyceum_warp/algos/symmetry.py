@@ -41,9 +41,10 @@ class PolicyMirror(nn.Module):
         self.obs, self.action = Reflected(reflections["obs"]), Reflected(reflections["action"])
 
     def average(self, function: Callable[[torch.Tensor], torch.Tensor], obs: torch.Tensor) -> torch.Tensor:
-        """Average each action with the mirror image of the action for the mirrored observation.
+        """Make the actions of a function symmetric.
 
-        A mirrored observation then gives the mirrored action, bit for bit.
+        The function also acts on the mirrored observations, and these actions are mirrored back. The result is the mean
+        of both actions. A mirrored observation then gives the mirrored action, bit for bit.
         """
         return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
 

@@ -14,7 +14,7 @@ Result = TypeVar("Result")
 class PhaseTimer:
     """Measures the seconds between calls of ``mark``, starting at construction.
 
-    On a GPU, only ``seconds`` waits for the device.
+    On a GPU, ``mark`` does not wait for the device.
     """
 
     def __init__(self, device: torch.device) -> None:

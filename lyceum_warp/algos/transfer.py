@@ -43,7 +43,11 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Return "same" if the interval is within the margin, "different" if outside, and otherwise "not shown"."""
+        """Compare the confidence interval with the range from -margin to margin.
+
+        "same" means that the interval lies inside this range. "different" means that it lies outside. "not shown" means
+        that it crosses an end of the range.
+        """
         if -self.margin <= self.low and self.high <= self.margin:
             return "same"
         return "different" if self.low > self.margin or self.high < -self.margin else "not shown"
@@ -57,16 +61,20 @@ class Difference:
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Differences between two simulations of the same episodes."""
+    """Differences between two simulations of the same episodes.
+
+    A simulation is named after its engine or its physics options. Comparisons of physics options use the C engine.
+    """
 
     first: str
-    """Name of the first simulation: "C engine", or "exact physics" (on the C engine)."""
+    """Name of the first simulation, "C engine" or "exact physics"."""
     second: str
-    """Name of the second simulation, such as "Warp engine on cuda:0", or "coarse physics" (on the C engine)."""
+    """Name of the second simulation, such as "Warp engine on cuda:0" or "coarse physics"."""
     faults: tuple[int, int]
     """Number of faults in each simulation."""
     differences: tuple[Difference, ...]
-    """Differences of returns and lengths, and of terminated fractions if the task can terminate episodes."""
+    """Differences of returns and lengths. For tasks that can terminate episodes, the terminated fraction is compared as
+    well."""
 
     @property
     def verdict(self) -> str:
@@ -126,8 +134,8 @@ def transfer(
     The Warp engine is compared with the C engine, both with the environment's physics options. On the C engine, the
     task's exact physics is compared with its other sets of physics options, and with the environment's set. Both
     episodes of a pair have the same initial state, the same randomized model fields, and the same pushes and commands.
-    The intervals of returns and lengths use Student's t over the pairs. The interval of the terminated fraction uses
-    Agresti and Min's method.
+    Student's t distribution gives the 95 % confidence intervals of the mean differences in return and length. Agresti
+    and Min's method gives the interval for the terminated fractions.
 
     Args:
         env: An environment of the task; its worlds do not change.
@@ -140,8 +148,8 @@ def transfer(
         device: Device of the Warp engine. The default is a GPU, preferably the environment's. Without a GPU, it is the
             CPU, where Warp's kernels may take minutes to compile.
         warp: Whether to play episodes on the Warp engine.
-        physics: Whether to play episodes with each set of physics options of the task. If False, play only with the
-            environment's physics options and with the exact physics.
+        physics: Whether to play episodes with each of the task's sets of physics options. If False, use only two sets:
+            the exact physics, and the environment's physics options.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:

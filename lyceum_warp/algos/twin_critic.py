@@ -118,7 +118,7 @@ class TwinLinear(nn.Module):
 
 
 class TwinLayerNorm(nn.Module):
-    """Two layer normalisations of inputs (2, rows, m)."""
+    """Normalises inputs of the two critics, (2, rows, m), with a separate gain and shift for each critic."""
 
     def __init__(self, m: int) -> None:
         super().__init__()

@@ -116,7 +116,7 @@ class ValueFunction(Normalized):
 
         Args:
             returns: Returns, of any shape.
-            first: Whether the value function has never been fitted, so that the old scale is arbitrary.
+            first: Whether the value function is new; its scale is then arbitrary.
             team: The processes; each contributes the same number of returns.
         """
         team = team or Team()

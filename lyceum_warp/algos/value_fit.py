@@ -42,9 +42,8 @@ class ValueFit:
     ) -> torch.Tensor:
         """Fit the value function to returns.
 
-        If the result is not finite, restore the value function and return False. Targets are clipped to the value
-        function's shift plus or minus ``BOUND`` times its scale. The generator must have the same state in every
-        process.
+        If the result is not finite, restore the value function and return False. Targets are clipped to the range from
+        ``shift - BOUND * scale`` to ``shift + BOUND * scale``. The generator must have the same state in every process.
         """
         with torch.no_grad():
             features = self.value.features(obs, step)

@@ -73,17 +73,17 @@ def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
 
 PPO = ["--algorithm", "ppo", "--nworld", "12", "--num-steps", "20", "--minibatches", "7", "--hidden", "8",
        "--value-hidden", "8", "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings with unfinished episodes, normalisation, an adaptive learning rate and an evaluation."""
+"""With these settings, PPO bootstraps unfinished episodes, normalises observations, and adapts its learning rate."""
 SAC = ["--algorithm", "sac", "--nworld", "12", "--num-steps", "20", "--updates", "4", "--actor-every", "2", "--n-step",
        "2", "--batch", "64", "--warmup", "60", "--replay", "120", "--hidden", "8", "--value-hidden", "8",
        "--mean-every", "1", "--mean-episodes", "2"]  # fmt: skip
-"""Settings with a full replay buffer (after 10 steps), normalisation, a warm-up and an evaluation."""
+"""With these settings, SAC warms up, fills its replay buffer (after 10 steps), and normalises observations."""
 
 
 @pytest.mark.quick("npg")
 @pytest.mark.parametrize(
     ("settings", "tolerance"),
-    # Adam turns rounding errors of small gradients into steps
+    # Adam amplifies rounding errors in small gradients
     [(OPTIONS, 2e-4), (PPO, 2e-3), ([*PPO, "--whiten-minibatches", "--std-type", "log"], 2e-3), (SAC, 2e-3)],
     ids=["npg", "ppo", "whitened ppo", "sac"],
 )

@@ -67,7 +67,7 @@ def test_planning_attribute_of_the_task_applies_to_the_planner() -> None:
         (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
     ],
 )  # fmt: skip
-def test_error_of_invalid_planning_names_the_task_and_the_entry(planning: Any, message: str) -> None:
+def test_invalid_planning_raises_an_error_that_names_the_task_and_the_entry(planning: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as raised:
         MPPI(type("Planned", (Picky,), {"planning": planning}))
     assert "\n" not in str(raised.value)

@@ -150,7 +150,7 @@ def test_value_function_follows_a_change_in_the_scale_of_returns(factor: float) 
     assert value.shift.item() == pytest.approx(factor * 50.0, rel=0.1)
 
 
-def test_value_function_uses_the_observation_group_critic_if_it_exists() -> None:
+def test_value_function_reads_critic_observations_if_the_task_has_them() -> None:
     env = lw.make(Full, nworld=4)
     npg = lw.NPG(env, config=dataclasses.replace(SMALL, samples=40))
     it = next(npg)
@@ -179,7 +179,7 @@ def test_rollout_segments_continue_the_previous_episodes(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize(("min_restarts", "begun"), [(None, 1), (2.0, 3), (0.0, 0)])
-def test_worlds_restart_if_too_few_begin_an_episode(min_restarts: float | None, begun: int) -> None:
+def test_npg_restarts_worlds_if_too_few_episodes_start(min_restarts: float | None, begun: int) -> None:
     env = lw.make("point_mass", nworld=40, horizon=128)
     config = lw.NPGConfig(samples=40 * 5, hidden=(8,), value_hidden=(8,), mean_every=0, min_restarts=min_restarts)
     npg = lw.NPG(env, config=config)

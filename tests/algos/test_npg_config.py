@@ -39,6 +39,6 @@ def test_lists_and_numbers_of_other_types_are_converted() -> None:
     assert (type(config.samples), type(config.gamma)) == (int, float)
 
 
-def test_samples_default_to_the_larger_of_10000_and_16_steps_per_world() -> None:
+def test_default_number_of_samples_is_16_per_world_but_at_least_10000() -> None:
     assert [enough_samples(lw.NPGConfig(), n) for n in (10, 64, 1000)] == [10_000, 10_000, 16_000]
     assert enough_samples(lw.NPGConfig(samples=5), 1000) == 5

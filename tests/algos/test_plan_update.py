@@ -95,7 +95,7 @@ def test_cem_written_in_torch_gives_the_same_plans_as_the_class_cem(more: dict[s
 
 
 @pytest.mark.parametrize("knots", [None, 3])
-def test_method_fit_of_an_update_may_change_the_plan(knots: int | None) -> None:
+def test_custom_update_can_change_the_plan_in_its_fit_method(knots: int | None) -> None:
     half, whole = (lw.Planner(update=kind(3), knots=knots, **POINT) for kind in (HalfWay, EliteMean))
     state = half.state_of(qpos=[0.1, 0.2, -0.5, 0.3])
     torch.testing.assert_close(half(state), 0.5 * whole(state))  # the first plan starts from zero actions
