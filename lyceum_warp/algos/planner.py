@@ -128,8 +128,8 @@ class Planner:
     knot_actions: torch.Tensor
     """The plan's knots, (nknot, nact). The last knot may lie beyond the horizon. Without knots, this is ``actions``."""
     standard_noise: torch.Tensor
-    """Standard normal numbers from which the last improvement computed its noise. The shape is (horizon, samples, nact),
-    or (nknot, samples, nact) with knots."""
+    """Standard normal numbers from which the last improvement computed its noise. The shape is (horizon, samples,
+    nact), or (nknot, samples, nact) with knots."""
     adapted_noise: torch.Tensor | None
     """The adapted standard deviations for the next improvement, before smoothing, (horizon, nact) or (nknot, nact).
     None for updates that do not adapt noise."""
