@@ -49,8 +49,9 @@ class Replay:
 
     Args:
         env: The environment.
-        capacity: Number of transitions, rounded up to whole steps of all worlds. The default is a million transitions,
-            or 1,024 steps of every world if that is more, but at most 30 % of the device's free memory.
+        capacity: Number of transitions, rounded up to whole steps of all worlds. The default is 1,024 steps of
+            every world, but at least a million transitions. The default buffer takes at most 30 % of the device's free
+            memory.
 
     Raises:
         ValueError: An argument is not valid, or the buffer does not fit into memory.
