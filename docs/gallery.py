@@ -1,8 +1,8 @@
-"""Draw the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
+"""Render the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
 The policy of a run in FOLDER controls its task; the default is a pretrained policy. MPPI controls the other tasks. The
-program writes pictures and results into docs/images/gallery/, and then the page gallery.md. By default, it draws all
-tasks.
+program writes animations and results into docs/images/gallery/, and then the page gallery.md. By default, it renders
+all tasks.
 """
 
 import argparse
@@ -31,14 +31,14 @@ FOLDER = DOCS / "images" / "gallery"
 RESULTS = FOLDER / "results.json"
 PRETRAINED = Path(lw.__file__).parent / "pretrained"
 
-SIZE, SCALE = (208, 156), 2  # pixels; pictures are drawn larger and then scaled down, which smooths edges
+SIZE, SCALE = (208, 156), 2  # pixels; frames are rendered larger and then scaled down, which smooths edges
 RATE = 12.5  # frames per second
-LARGEST = 80_000  # bytes of a picture
+LARGEST = 80_000  # bytes of an animation
 
 
 @dataclasses.dataclass(frozen=True)
 class Show:
-    """Settings for the picture of a task."""
+    """Settings for the animation of a task."""
 
     settings: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Settings of the planner and options of its worlds."""
@@ -47,9 +47,9 @@ class Show:
     replan_every: int = 1
     """Steps between two plans."""
     seconds: float = 4.0
-    """Maximum simulated seconds of the picture."""
+    """The maximum length of the animation, in simulated seconds."""
     start: float = 0.0
-    """Simulated seconds before the picture begins."""
+    """The simulated time of the animation's first frame, in seconds."""
     seed: int = 0
     camera: CameraChoice = None
 
@@ -147,7 +147,7 @@ SHOWS = {
        for robot, distance in (("go1", 1.7), ("go1_rough", 2.2), ("spot", 2.6), ("g1", 2.8), ("g1_full", 2.8),
                                ("g1_rough", 3.2), ("h1", 3.6), ("t1", 2.8))},
 }  # fmt: skip
-"""Settings of tasks that do not use the defaults."""
+"""Maps a task's name to its settings. Other tasks use the defaults."""
 
 # these tasks have no policy, and under a planner the robots soon fall
 for _name in ("g1_full_velocity", "g1_rough_velocity"):
@@ -156,7 +156,7 @@ for _name in ("g1_full_velocity", "g1_rough_velocity"):
 
 
 def draw(name: str, run: Path | None) -> dict[str, str]:
-    """Draw a task, and return its command and its result."""
+    """Render a task's animation, and return its command and its result."""
     show = SHOWS.get(name, Show())
     env = lw.make(name, autoreset=False)
     steps = min(env.horizon or 10**9, round((show.start + show.seconds) / env.timestep))
@@ -240,7 +240,7 @@ def acted(env: lw.Env, policy: Any, show: Show, steps: int) -> torch.Tensor:
 
 
 def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]:
-    """Draw states at the gallery's frame rate."""
+    """Render states at the gallery's frame rate."""
     model = copy.copy(env.model)  # the painter sets each world's model fields
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
     painter = Painter(mujoco, model, size, camera_values(model, show.camera))
@@ -250,7 +250,7 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
 
 
 def save(images: list[Image.Image], path: Path) -> None:
-    """Write a moving picture in the best quality within the size limit."""
+    """Write an animation in the best quality within the size limit."""
     path.parent.mkdir(parents=True, exist_ok=True)
     for quality in (80, 65, 50, 35, 20):
         file = io.BytesIO()
@@ -280,9 +280,9 @@ def families() -> dict[str, tuple[str, list[str]]]:
 def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     introduction = (
-        "Each picture shows a task under a policy or a planner, with the result and a command that shows or trains it. "
-        "The return of a policy is the mean over whole episodes. The return of a planner is the sum of the rewards "
-        "from the start of the episode to the end of the picture. Each name links to the task's details."
+        "Each animation shows a task under a policy or a planner, with the result and a command that shows or "
+        "trains it. A policy's return is the mean over whole episodes. A planner's return is the sum of the rewards "
+        "from the start of the episode to the last frame of the animation. Each name links to the task's details."
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():
@@ -304,12 +304,12 @@ def page(results: dict[str, dict[str, str]]) -> str:
         for name in names if name not in results
     )  # fmt: skip
     if missing:
-        lines += textwrap.wrap(f"These tasks have no picture: {missing.rstrip(',')}.", 120, break_long_words=False)
+        lines += textwrap.wrap(f"These tasks have no animation: {missing.rstrip(',')}.", 120, break_long_words=False)
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
 def main() -> None:
-    """Draw tasks, and write the page."""
+    """Render the animations of the given tasks, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     parser.add_argument("--runs", type=Path, metavar="FOLDER", default=PRETRAINED)
@@ -317,7 +317,7 @@ def main() -> None:
     runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))}
     for name in words.tasks or [name for _, names in families().values() for name in names]:
         result = draw(name, runs.get(name))
-        # another process may have drawn other tasks
+        # read the file again, because another process may have added results
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         results[name] = result
         RESULTS.write_text(json.dumps(results, indent=1, sort_keys=True) + "\n")

@@ -1,6 +1,6 @@
 """Generate the site's reference from the package: public names, and tables of tasks.
 
-Every public name and every task must be on one page, which tests/test_docs.py checks.
+tests/test_docs.py checks that every public name and every task appears exactly once.
 """
 
 import ast
@@ -35,7 +35,7 @@ ALIASES = {
 
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
-"""The names of types in task files, by Warp's names."""
+"""Maps Warp's name of a type to its name in task files."""
 
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
@@ -46,12 +46,12 @@ SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=Fal
 
 
 def names(words: str) -> str:
-    """Return the documentation of public names, separated by spaces."""
+    """Return the documentation of the public names in ``words``."""
     return "\n".join(["```{eval-rst}", *(line for name in words.split() for line in entry(lw, name)), "```"])
 
 
 def modules(words: str) -> str:
-    """Return the documentation of modules such as ``lw.walkers``."""
+    """Return the documentation of the modules in ``words``, such as ``walkers``."""
     lines = ["```{eval-rst}"]
     for word in words.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
@@ -156,7 +156,7 @@ def tasks(words: str) -> str:
 
 
 def task_section(name: str) -> str:
-    """Make the section about a task on its page."""
+    """Return the section that describes a task."""
     task = BoundTask(find_task(name))
     cls = task.task
     text = vars(cls).get("__doc__") or inspect.getdoc(sys.modules[cls.__module__]) or ""

@@ -41,7 +41,8 @@ class Scene:
     curves: tuple[str, ...]
     """The names of the curves: "reward", "eval" and the task's metrics."""
     speeds: tuple[float, float, float] | None = None
-    """The largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s) that the user can command."""
+    """The forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s) of the driving keys. Sliders reach twice
+    these values. The value is None if the robot cannot be driven."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Ghost:
     state: np.ndarray
     """The state, in the format of ``Frame.state``."""
     colour: tuple[float, float, float, float] | None
-    """Red, green, blue and opacity, from 0 to 1. None keeps the model's own colours."""
+    """Red, green, blue and opacity, from 0 to 1, or None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
     """Shift in x and y, in metres."""
 
@@ -71,13 +72,13 @@ class SetGhosts:
     """Choose the ghosts to draw."""
 
     worlds: int = 0
-    """The number of other worlds to draw."""
+    """The number of other worlds to show as ghosts."""
     grid: bool = False
-    """Whether to draw the other worlds side by side."""
+    """Whether to show the other worlds side by side."""
     episodes: int = 0
-    """The number of other episodes to draw. Other episodes are drawn at the displayed step."""
+    """The number of other saved episodes to show as ghosts. All ghosts are at the displayed step."""
     burst: int = 0
-    """The number of past (red) and future (blue) states to draw along the trajectory."""
+    """The maximum number of ghosts along the trajectory. Past states are red, and future states are blue."""
     plan: bool = True
     """Whether to draw the plan's final pose and the traces of the samples."""
 
@@ -97,9 +98,9 @@ class Status:
     """Simulated seconds since the start of the episode."""
     paused: bool
     speed: float
-    """Simulated seconds per second."""
+    """Simulated seconds per second of wall time."""
     measured_speed: float
-    """The measured simulated seconds per second, or NaN while paused."""
+    """The measured speed, or NaN while paused."""
     plan_ms: float
     """The duration of the controller's last call, in milliseconds, or NaN before the first call."""
     backwards: bool
@@ -184,7 +185,7 @@ class SetSpeed:
     """Change the speed."""
 
     speed: float
-    """Simulated seconds per second, from 1/16 to 16."""
+    """Simulated seconds per second of wall time, from 1/16 to 16."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,8 +238,8 @@ class Drive:
     """Command a walking robot."""
 
     command: tuple[float, float, float] | None
-    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). None lets the task choose its commands
-    again."""
+    """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s). If the command is None, the task chooses its
+    commands again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,7 +256,7 @@ class SetVideo:
     """Start a video, or end it."""
 
     camera: dict[str, Any] | None
-    """The attributes of the ``mujoco.MjvCamera``. None ends the video."""
+    """The attributes of the ``mujoco.MjvCamera``, or None to end the video."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,7 +309,7 @@ class Failed:
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """Reports that the window draws the last frame, and is ready for another one."""
+    """Reports that the window has begun to draw a frame, and is ready for the next one."""
 
 
 Reply: TypeAlias = Opened | Failed | Taken | Command

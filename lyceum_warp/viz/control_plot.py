@@ -13,8 +13,9 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
     """Draw episodes of a controller as PNG.
 
-    The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
-    ages of actions against wall time, and a histogram of the planning times. Dashed lines show the deadline.
+    The left side shows reward and evaluation metric against simulated time. Two plots on the right side show planning
+    times and ages of actions against wall time. A histogram below them shows the planning times. Dashed lines show the
+    deadline.
 
     Args:
         episodes: Episodes of the same task, at least one. The first one's control period is the deadline.

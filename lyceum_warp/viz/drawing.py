@@ -21,7 +21,7 @@ from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
-_PATIENCE = 10.0  # seconds until a subprocess that does not end is killed
+_PATIENCE = 10.0  # seconds that a subprocess gets to end before it is killed
 
 
 def check_video() -> None:

@@ -83,7 +83,11 @@ def _packed(array: np.ndarray) -> str:
 
 
 def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tuple[int, int]]]:
-    """Return the visible geoms as vertices, indices of triangles, and each body's first index and number of indices."""
+    """Return the triangles of the visible geoms.
+
+    Returns:
+        The vertices, the vertex indices of the triangles, and a range of indices (first, count) for each body.
+    """
     kind = np.dtype([("at", np.float32, 3), ("normal", np.int8, 4), ("colour", np.uint8, 4)])
     vertices: list[np.ndarray] = []
     indices: list[np.ndarray] = []

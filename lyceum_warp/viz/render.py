@@ -1,9 +1,10 @@
 """Draw states into a video, or as single pictures: ``python render.py folder``.
 
 ``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
-``size``, ``fps``, ``camera`` and ``background``, a ``Shot`` for each picture, and None. EOF without None means that the
-parent process has died. The folder holds the model, ``model.mjb``. The program writes ``video.mp4``, or each picture
-into ``picture.raw`` if ``fps`` is None. The program prints "ready" once it can draw, and "frame" after each picture.
+``size``, ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, and None at the end. If stdin closes
+before None arrives, the parent process has died. The folder holds the model, ``model.mjb``. The program writes
+``video.mp4``, or each picture into ``picture.raw`` if ``fps`` is None. The program prints "ready" once it can draw, and
+"frame" after each picture.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
 therefore starts a process for each library that it tries. Exit code 3 means that the machine cannot draw with this
@@ -114,7 +115,7 @@ def _owner(model: Any, name: str) -> Any:
 
 
 def main(folder: str) -> int:
-    """Draw the shots on stdin."""
+    """Draw the shots that arrive on stdin, and return the exit code."""
     source = sys.stdin.buffer
     try:
         import mujoco

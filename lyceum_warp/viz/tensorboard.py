@@ -26,7 +26,7 @@ _TAGS = {
     "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
     "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
     "time_update": "Perf/learning_time",
-    # names that cannot be made from the column and _GROUPS
+    # columns whose group does not follow from a prefix in _GROUPS
     "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
     "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
     "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",
@@ -54,8 +54,8 @@ class TensorBoard:
     Args:
         folder: The folder, which need not exist. Pass this folder, or a parent folder, to ``tensorboard --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the mean number of episodes per step, over all worlds,
-            that the function NAME ends.
+            time limit in seconds. Episode_Termination/NAME is the number of episodes that the function NAME ends in
+            one step of all worlds, on average.
 
     Raises:
         ImportError: The package tensorboard is not installed.
@@ -108,7 +108,7 @@ class TensorBoard:
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # make TensorBoard discard earlier files' points from this step on
+        if number:  # from this step on, TensorBoard then discards the points of earlier files
             self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:
@@ -123,7 +123,7 @@ def check_tensorboard() -> None:
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
-    """Return mjlab's name, and a factor that converts to mjlab's unit, for each column that mjlab also writes."""
+    """Return mjlab's names for columns, each with a factor that converts to mjlab's unit."""
     task, seconds = env.task.task, env.horizon * env.timestep
     rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {

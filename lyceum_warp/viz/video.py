@@ -48,9 +48,9 @@ def write_video(
         states: The states of one world, one row per step, (steps, state_space.size).
         out: The file. An existing file is replaced when the video is complete.
         camera: A camera of the model by its name or index, a ``FreeCamera`` or ``mujoco.MjvCamera``, or "free" for
-            MuJoCo's default free camera. The default is the model's first tracking camera. A model without a tracking
-            camera gets its first camera that is fixed to the world. If no camera is fixed to the world, a new camera
-            follows the first body.
+            MuJoCo's default free camera. The default is the model's first tracking camera. If the model has no
+            tracking camera, the default is its first camera that is fixed to the world. If it has no such camera
+            either, a new camera follows the first body.
         size: The width and the height in pixels, both even.
         speed: The simulated seconds per second of the video.
         progress: A function that is called after each frame with the number of frames so far and the total number. The
@@ -92,7 +92,7 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 class Recorder:
     """Makes a video of shots that arrive one by one, or a picture of one shot.
 
-    Shots wait in a queue until a subprocess of low priority draws them. If the queue is full, further shots are
+    Shots wait in a queue for a low-priority subprocess, which renders them. If the queue is full, further shots are
     dropped, and the last shot in the queue is displayed longer. The file is written when the video is complete.
 
     Args:
@@ -140,7 +140,7 @@ class Recorder:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """End the video after the shots so far, and finish it in the background."""
+        """Announce that no more shots follow. The subprocess then completes the file."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -150,7 +150,7 @@ class Recorder:
         self._done.wait(seconds)
 
     def close(self) -> Path:
-        """Finish the video, wait until the file is complete, and return its path."""
+        """Call ``end``, wait until the file is complete, and return its path."""
         self.end()
         self._done.wait()
         if self._error is not None:

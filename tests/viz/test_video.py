@@ -39,7 +39,7 @@ with imageio.get_reader(sys.argv[1]) as reader:
 
 
 def frames_of(path: Path) -> dict[str, Any]:
-    """Return the rate, shape and number of frames of a video, and the brightest and the red pixels of each frame."""
+    """Run READ on a video, and return the statistics that it prints."""
     done = subprocess.run([sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True)
     return dict(json.loads(done.stdout))
 
@@ -152,9 +152,7 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_video_of_single_shots_shows_model_fields_transparent_copies_and_lines(
-    model: mujoco.MjModel, tmp_path: Path
-) -> None:
+def test_video_shows_the_model_fields_ghosts_and_lines_of_each_shot(model: mujoco.MjModel, tmp_path: Path) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
     usual = {"geom_size": model.geom_size.copy()}
     mp4 = video_of(model, tmp_path / "video.mp4", fps=25)

@@ -35,9 +35,9 @@ from lyceum_warp.viz import NoVideoError
 _FPS = 30.0
 """Maximum frames per second."""
 _LAG = 0.25
-"""The longest delay that the worlds catch up, in seconds."""
+"""If the worlds fall behind, they catch up on at most this many seconds."""
 _IDLE = 0.5
-"""Seconds between two frames of a paused view without commands."""
+"""Seconds between two frames while the viewer is paused and receives no commands."""
 _CHECK = 0.5
 """Seconds between two calls of the watchers."""
 _PART = 10_000
@@ -167,7 +167,7 @@ class Session:
     def _stepped(self, progress: ControlProgress) -> None:
         self.stage.live.stepped()
         self.stage.steps += 1
-        # `_work` runs while the plant waits, but a late or fast plant never waits
+        # a plant that is late or has short steps never waits, so `_work` must run here
         if time.perf_counter() - self._last_work > 1 / _FPS:
             self._work()
 
@@ -179,9 +179,9 @@ class Session:
     # commands
 
     def obey(self, command: Command) -> None:
-        """Carry out a command, and show an error to the user.
+        """Carry out a command. If it fails, show the error to the user.
 
-        If a command needs the state of a plant that runs in real time, the plant stops.
+        Most commands first stop a plant that runs in real time, because they need its state.
         """
         push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
         if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):

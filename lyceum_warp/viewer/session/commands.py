@@ -58,7 +58,9 @@ def obey(stage: Stage, command: protocol.Command) -> None:
             _perturb(stage, command)
         case protocol.Drive(velocity):
             if stage.driving.limits is None or stage.mode == "playback":
-                raise ValueError("only robots of velocity tasks can be driven, and not in a playback")
+                raise ValueError(
+                    "the robot cannot be driven: this needs a velocity task, and a mode other than playback"
+                )
             stage.driving.wanted = velocity
             stage.driving.apply(stage.live)
         case protocol.SetNumber(of, name, value):

@@ -1,4 +1,4 @@
-"""Call controllers: policies, which act in all worlds, and controllers of one world, such as planners."""
+"""Call policies, which act in all worlds, and controllers of one world, such as planners."""
 
 import dataclasses
 import inspect
@@ -169,10 +169,10 @@ Control = PolicyControl | WorldControl
 
 
 def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
-    """Check controllers: a policy takes one argument, and a controller of one world takes two.
+    """Check controllers. A policy takes one argument, and a controller of one world takes two.
 
     Raises:
-        ValueError: A controller cannot be called, or does not fit the task.
+        ValueError: A controller is not callable, or does not fit the task.
     """
     found: dict[str, Control] = {}
     for name, controller in given.items():

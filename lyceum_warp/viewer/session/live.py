@@ -40,7 +40,7 @@ class Past:
     @property
     def behind(self) -> int:
         """The number of steps that can be undone."""
-        # the first step back replaces the oldest state by the present one
+        # `back` stores the present state, in place of the oldest state if the buffer is full
         return min(self.now - self.oldest, max(self.length - 1, 0))
 
     @property
@@ -73,10 +73,11 @@ class Rows:
     """Earlier states of the displayed world, the latest first, (burst, state_space.size) float64."""
     episode_return: float
     end: tuple[float, ...] | None
-    """The displayed world's last episode that ended since the previous frame: bits of ``Done``, return, length,
-    success."""
+    """The end of the displayed world's last episode: bits of ``Done``, return, length, success. The value is None if no
+    episode has ended since the previous frame."""
     fault: tuple[float, ...] | None
-    """The last fault since the previous frame: bits of ``Done``, the world, and the number of faults so far."""
+    """The last fault: bits of ``Done``, the world, and the number of faults so far. The value is None if no fault has
+    occurred since the previous frame."""
     points: np.ndarray
     """The new points of all curves, (points, 2 + curves) float64."""
 
@@ -86,7 +87,7 @@ class Live:
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
-        self.made = self._reported = 0  # number of steps, in total and until the last frame
+        self.made = self._reported = 0  # number of steps so far, and number of steps before the last frame
         self.world = 0
         self.pushed: int | None = None
         device, n = env.obs.device, env.nworld
@@ -187,7 +188,7 @@ class Live:
     # the history
 
     def back(self, steps: int) -> int:
-        """Restore all worlds to an earlier state, and return how many steps were undone."""
+        """Undo steps of all worlds, and return how many steps were undone."""
         past = self.past
         if not past.ahead and past.behind:  # the current state is not in the history yet
             past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
@@ -197,7 +198,7 @@ class Live:
         return steps
 
     def forward(self, steps: int) -> None:
-        """Restore all worlds to a later state that was undone."""
+        """Redo steps that ``back`` has undone."""
         if steps := min(steps, self.past.ahead):
             self._move(steps)
 

@@ -13,7 +13,7 @@ Numbers = tuple[tuple[str, float], ...]
 
 
 def planner_numbers(controller: Any) -> Numbers:
-    """Return the settings of a planner that the user can change."""
+    """Return the planner settings that the user can change."""
     if not isinstance(controller, Planner):
         return ()
     found = ((name, getattr(controller.config, name)) for name in _SETTINGS)
@@ -21,7 +21,7 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """Return the task's parameters that are floats, including the weights of reward terms."""
+    """Return the task's float parameters, including the weights of reward terms."""
     known = env.task.params
     return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
 

@@ -1,4 +1,4 @@
-"""Make the plant as a copy of the displayed world, and make the clock of the control loop."""
+"""Make the plant, a copy of the displayed world, and the clock of its control loop."""
 
 import threading
 import time
@@ -12,12 +12,12 @@ from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 POLL = 0.005
 """Seconds between two polls of the window's commands."""
 
-_RESERVE = 0.0015  # minimum time between the start of other work and a step, in seconds
-_WARM_UP = 3  # number of first calls during which no other work runs, because they may capture CUDA graphs
+_RESERVE = 0.0015  # no other work starts within this many seconds before a step
+_WARM_UP = 3  # no other work runs during the controller's first calls, which may capture CUDA graphs
 
 
 class InterruptedByCommand(BaseException):
-    """Raised to stop the plant, because a command needs its state."""
+    """Raised to end the plant's control loop, so that a command can be carried out."""
 
 
 def make_plant(main: Live) -> Live:
@@ -34,7 +34,7 @@ def make_plant(main: Live) -> Live:
 
 
 class WorkingClock(Clock):
-    """A wall clock that calls ``work`` while it waits."""
+    """Waits as ``Clock`` does, and calls ``work`` meanwhile."""
 
     def __init__(self, work: Callable[[], None], control: WorldControl) -> None:
         self._work, self._warm = work, control.calls >= _WARM_UP
@@ -50,7 +50,7 @@ class WorkingClock(Clock):
         super().wait_until(moment)
 
     def wait_for(self, event: threading.Event) -> None:
-        """Call ``work`` until an event is set, unless the controller is still capturing graphs."""
+        """Wait for an event. Meanwhile, call ``work``, except while the controller may capture CUDA graphs."""
         if not self._warm:
             event.wait()
         while not event.wait(POLL):

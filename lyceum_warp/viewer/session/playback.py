@@ -47,7 +47,9 @@ def episodes_of(given: Any, env: Env) -> list[Episode]:
     if isinstance(given, Mapping):
         return [_episode(name, each, env) for name, each in given.items()]
     if not isinstance(given, Sequence):
-        raise ValueError(f"episodes must be trajectories, their files or tensors of states, not {described(given)}")
+        raise ValueError(
+            f"episodes must be a list or a dict of trajectories, episode files or state tensors, not {described(given)}"
+        )
     names = [Path(each).name if isinstance(each, str | Path) else f"episode {i}" for i, each in enumerate(given)]
     return [_episode(name, each, env) for name, each in zip(names, given, strict=True)]
 
@@ -94,7 +96,7 @@ class Playback:
         return (self.step + (-1 if self.backwards else 1)) % (self.episode.steps + 1)
 
     def choose(self, index: int) -> None:
-        """Show another episode at the same step, or at the last step of a shorter episode."""
+        """Show another episode at the same step. If it is shorter, show its last step."""
         self.index = index
         self.seek(self.step)
 

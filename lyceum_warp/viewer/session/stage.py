@@ -77,7 +77,7 @@ class Stage:
 
     @property
     def live(self) -> Live:
-        """The plant, if a controller acts in it. Otherwise all worlds."""
+        """The plant if the selected controller controls one world, otherwise all worlds."""
         return self._plant if self._plant is not None and isinstance(self.control, WorldControl) else self.main
 
     @property
@@ -93,7 +93,7 @@ class Stage:
     # steps
 
     def advance(self, steps: int = 1) -> None:
-        """Make steps at once, not in real time."""
+        """Step the worlds or the playback without waiting for real time."""
         for _ in range(steps):
             self.steps += 1
             if self.mode == "playback":

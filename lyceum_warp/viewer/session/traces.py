@@ -1,7 +1,7 @@
-"""Roll out a planner's plan and samples again in a thread, to get their paths.
+"""Repeat a planner's rollouts in a thread, to get the paths of its plan and samples.
 
-A planner does not store positions. If the task draws random numbers during an episode, these paths differ from the
-planner's.
+A planner does not store positions. If the task uses random numbers during an episode, these paths differ from those
+that the planner simulated.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ SHARE = 0.15
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, int]:
-    """Choose the point of a robot whose path is drawn. Return its field in MjData, such as "site_xpos", and its index.
+    """Choose the point whose path the viewer draws. Return its field in MjData, such as "site_xpos", and its index.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
     for an arm is the first site of the last body in the longest chain of actuated bodies. If this body has no site, the

@@ -76,7 +76,7 @@ class VideoTaker:
         video.add(_shot(frame, count))
 
     def end(self) -> None:
-        """End the video, complete it in the background, and write the page beside it."""
+        """Stop adding frames to the video, and write its page. A subprocess finishes the video file."""
         if (video := self._running) is None:
             return
         self._running = None
@@ -94,7 +94,7 @@ class VideoTaker:
             self.files.append(page)
 
     def completed(self) -> list[str]:
-        """Return messages about videos and pictures that are complete or have failed."""
+        """Return a message for each video, picture or page that was completed or has failed since the last call."""
         if self._running is not None and self._running.finished:  # it failed
             self._drawing.append(self._running)
             self._running = None

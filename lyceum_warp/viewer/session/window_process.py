@@ -29,7 +29,7 @@ main(int(sys.argv[1]))
 
 
 class NoWindowError(OSError):
-    """Raised if the window cannot be opened, or ended with an error. The message gives the reason."""
+    """Raised if the window cannot be opened, or if it ends with an error. The message gives the reason."""
 
 
 class Window:
@@ -97,7 +97,7 @@ class Window:
 
     @property
     def wants_frame(self) -> bool:
-        """Whether the window has drawn the last frame."""
+        """Whether the window is ready for a frame."""
         return self._taken and self._pending is None and not self._ended
 
     def commands(self) -> list[Command]:

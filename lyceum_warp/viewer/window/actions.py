@@ -11,9 +11,9 @@ from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
-"""Simulated seconds per second."""
+"""The speeds that the user can choose, in simulated seconds per second of wall time."""
 MANY_STEPS = 50
-"""The number of steps that Shift with an arrow key makes."""
+"""Shift+Right and Shift+Left move by this many steps."""
 
 _DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
 
@@ -66,7 +66,7 @@ class Actions:
             _, viewer.cam_speed = ux.move_camera_with_keys(viewer.model, viewer.camera, viewer.cam_speed)
 
     def drive_by_keys(self) -> None:
-        """Command a walking robot while driving keys are pressed, and stop it when they are released."""
+        """Send a velocity command when the user presses or releases W, A, S, D, Q or E."""
         if self.scene.speeds is None or not self.status.driven or imgui.GetIO().WantCaptureKeyboard:
             return
         ahead, back, left, right, anticlockwise, clockwise = (bool(imgui.IsKeyDown(key)) for key in _DRIVING)

@@ -5,7 +5,7 @@ processes. The proxy forwards a request only if
 
 - the ``Host`` header is an address or a name of this machine (against DNS rebinding);
 - the ``Origin`` and ``Sec-Fetch-*`` headers show that no page of another site sent the request;
-- the request has the cookie and the secret path, which a browser gets for the token in the printed address;
+- the request has the cookie and the secret path, which a browser receives when it opens the printed address;
 - the request is a GET without a body, or opens studio's WebSocket ``/ui`` or ``/state`` (not ``/drop``, which loads
   models).
 
@@ -265,7 +265,7 @@ class Proxy:
                 raise web.HTTPMisdirectedRequest(text=text) from None
         own = (f"http://{host}", f"https://{host}")
         foreign = any(origin.lower() not in own for origin in request.headers.getall("Origin", []))
-        # allow links from any page, and frames in pages of this host name, because both need the token
+        # links on any page and iframes on pages of this host are allowed: they open the viewer only with the token
         site, mode, use = (request.headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode", "Dest"))
         linked = mode == "navigate" and (use == "document" or (site == "same-site" and use == "iframe"))
         if foreign or (_is_cross_site(request) and not linked):
@@ -289,8 +289,8 @@ class Proxy:
         }
         if not _is_cross_site(request):
             return web.Response(status=303, headers={**headers, "Location": target})
-        # After a link on another site, browsers do not send a SameSite=Strict cookie, not even after a redirect. They
-        # do send it when a page of the proxy makes the next request, so answer with such a page.
+        # When the user follows a link on another site, browsers do not send a SameSite=Strict cookie, not even after a
+        # redirect. They do send it when a page of the proxy makes the next request, so answer with such a page.
         page = f'<!doctype html><meta http-equiv="refresh" content="0; url={target}">'
         return web.Response(text=page, content_type="text/html", headers=headers)
 
@@ -310,7 +310,7 @@ class Proxy:
         return f"/{below}{question}{query}"
 
     async def _fetch(self, request: web.BaseRequest, target: str) -> web.StreamResponse:
-        """Forward the body and a few headers of studio's response, or send a file for download."""
+        """Return a saved file, or studio's response with only a few of its headers."""
         if target.startswith("/saved/"):
             if (file := self._files.get(target.removeprefix("/saved/"))) is None or not os.path.isfile(file):
                 raise web.HTTPNotFound(text="no such file\n")

@@ -15,9 +15,9 @@ LINE_WIDTH = 3.0  # pixels
 SHRUNK = 0.98
 ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
 MAX_LINES = 160
-"""Maximum number of lines of all traces. Each line costs about 600 bytes, 60 times a second."""
+"""All traces together have at most this many lines. Each line costs about 600 bytes, 60 times a second."""
 FEWEST_SEGMENTS = 4
-"""Minimum number of lines of one trace. If necessary, some traces are left out."""
+"""Each trace has at least this many lines. If necessary, some traces are left out."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
@@ -36,7 +36,7 @@ class ExtraGeoms:
         self.model, self.limit = model, limit
         self._data = mujoco.MjData(model)
         self._options, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
-        # room for the displayed world, and for one ghost above the limit
+        # `_ghosts` adds a ghost before it counts the geoms, so the scene needs room beyond the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
     def draw(self, frame: Frame, groups: np.ndarray) -> list[mujoco.MjvGeom]:

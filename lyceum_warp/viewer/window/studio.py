@@ -65,7 +65,7 @@ class Screen:
 
 
 class _Guard(Plugin):  # type: ignore[misc]  # studio has no types
-    """Raises an error if studio did not take the given socket. Otherwise studio might listen on all addresses."""
+    """Raises an error if studio does not use the given socket. Its own socket would listen on every address."""
 
     def __init__(self, taken: list[bool]) -> None:
         self.taken = taken

@@ -49,7 +49,7 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw an open window. ``place`` is its left edge, top edge, width and height in pixels."""
+        """Draw a window if it is open. ``place`` is its left edge, top edge, width and height in pixels."""
         left, top, width, height = place
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
@@ -392,7 +392,10 @@ class Curves:
                 self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Reduce the last ``seconds`` to at most ``points`` rows, with the minima, means and maxima of curves."""
+        """Return the minima, means and maxima of the curves, each as at most ``points`` rows.
+
+        Only points of the last ``seconds`` seconds count.
+        """
         rows = self.rows[np.searchsorted(self.rows[:, 0], self.rows[-1:, 0].sum() - seconds) :]
         if len(rows) <= points:
             return rows, rows, rows

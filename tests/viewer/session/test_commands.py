@@ -41,7 +41,7 @@ def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch
     assert not pushed(env, 0)
 
 
-def test_push_released_in_a_past_step_does_not_act_in_the_newest_state(shared_env: SharedEnv) -> None:
+def test_push_ends_in_the_newest_state_if_released_after_steps_back(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
@@ -112,7 +112,7 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
     assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, numbered from 0",)
 
 
-def test_controllers_are_switched_and_passive_worlds_have_no_controls(shared_env: SharedEnv) -> None:
+def test_set_mode_selects_a_controller_or_zero_actions(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     half: Callable[[torch.Tensor], torch.Tensor] = lambda obs: 0.5 * pushing(obs)  # noqa: E731
     session = Session(env, controllers={"push": pushing, "half": half}, paused=True)

@@ -43,8 +43,8 @@ def test_arrows_show_the_commanded_and_the_measured_velocity(shared_env: SharedE
     np.testing.assert_allclose(ways, expected, atol=1e-6)
 
 
-def test_driving_a_task_without_velocity_commands_shows_a_message(shared_env: SharedEnv) -> None:
+def test_driving_outside_a_velocity_task_shows_a_message(shared_env: SharedEnv) -> None:
     session = Session(shared_env("hopper", nworld=2), paused=True)
     session.obey(protocol.Drive((1.0, 0.0, 0.0)))
     frame = session.stage.frame()
-    assert "can be driven" in frame.messages[0] and frame.arrows == () and frame.status.command is None
+    assert "cannot be driven" in frame.messages[0] and frame.arrows == () and frame.status.command is None

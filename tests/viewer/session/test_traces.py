@@ -67,7 +67,7 @@ def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
     assert control.look() is None  # unchanged
 
 
-def test_traces_exclude_pushes_by_events() -> None:
+def test_traces_are_computed_without_events() -> None:
     paths = []
     for pushes in ([0.015 * step for step in range(1, 5)], [1e6]):
         plant = lw.make("humanoid_stand", autoreset=False, push_times=pushes, push_impulse=[10.0, 10.0])

@@ -254,7 +254,7 @@ def test_invalid_or_missing_response_gives_status_502(answer: bytes | None) -> N
 # requests
 
 
-def test_link_with_the_token_on_another_page_opens_the_viewer(proxy: Proxy, upstream: Upstream) -> None:
+def test_following_a_token_link_from_another_site_opens_the_viewer(proxy: Proxy, upstream: Upstream) -> None:
     answer = get(proxy, "/?token=TOKEN", *LINK, cookie="").decode()
     assert answer.startswith("HTTP/1.1 200 ") and "Set-Cookie: " in answer and not upstream.received
     assert f'content="0; url={entered(proxy)[1]}/"' in answer
