@@ -1,4 +1,4 @@
-"""Define the reasons why an episode ends, as bits.
+"""Define a bit for each reason why an episode ends.
 
 Both engines report the same bits for the same fault, except in two cases. On the C engine, a world without enough arena
 memory may report ENGINE_WARNING as well as an overflow. On the Warp engine, all worlds share a pool of contacts. Every

@@ -10,7 +10,7 @@ from lyceum_warp.support.validate import whole_number
 from lyceum_warp.task import Task
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""Options of ``lw.make``, each with the adapter's argument that replaces it."""
+"""The options of ``lw.make`` that adapters refuse. Each value names the argument to use instead."""
 
 
 def environment_of(

@@ -16,7 +16,7 @@ _PPO = {
     "max_grad_norm": "max_grad_norm", "clip_value_loss": "use_clipped_value_loss", "schedule": "schedule",
     "desired_kl": "desired_kl", "whiten_minibatches": "normalize_advantage_per_mini_batch",
 }  # fmt: skip
-"""rsl_rl's names of PPOConfig's hyperparameters."""
+"""Maps each hyperparameter of ``PPOConfig`` to its name in rsl_rl."""
 
 
 def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
@@ -46,7 +46,7 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     return {
         "num_steps_per_env": config.num_steps,
         "save_interval": 50,
-        # skip rsl_rl's NaN check, which would wait for the device; NaN is a fault of the environment
+        # rsl_rl's NaN check would wait for the device, and the environment already reports NaN as a fault
         "check_for_nan": False,
         "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
         "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},

@@ -120,8 +120,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         return self._obs.clone(), env.reward, env.done, extras
 
     def _log(self) -> dict[str, torch.Tensor]:
-        # rsl_rl averages the logs of an iteration's steps. Without earlier episodes in each log, a step with one ended
-        # episode would weigh as much as a step with a thousand.
+        # rsl_rl averages the logs of an iteration's steps with equal weights, even if only one episode ended in a step.
+        # Each log therefore contains means over recent episodes, not only over episodes that ended in this step.
         env = self.env
         if not env.metrics:
             return {}

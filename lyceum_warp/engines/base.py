@@ -141,9 +141,9 @@ class Engine(abc.ABC):
 
     @abc.abstractmethod
     def find_faults(self, mask: wp.array) -> None:
-        """Write the faults that occurred in the masked worlds since the last call into ``fault``.
+        """Find the masked worlds' faults since the last call, and write them to ``fault``.
 
-        The method consists of Warp launches on every engine.
+        Every engine must implement this method by Warp launches only, so that graphs can capture it.
         """
 
     def check_room(self) -> None:  # noqa: B027
@@ -156,12 +156,13 @@ class Engine(abc.ABC):
     def reset(self, mask: wp.array) -> None:
         """Put the masked worlds into the initial state.
 
-        The method consists of Warp launches on every engine. The caller must then update derived fields by ``refresh``.
+        Every engine must implement this method by Warp launches only, so that graphs can capture it. The caller must
+        then update derived fields by ``refresh``.
         """
 
     @abc.abstractmethod
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:
-        """Copy state fields of the masked worlds into the engine, by Warp launches. By default, copy all of them."""
+        """Copy state fields of the masked worlds into the engine, by Warp launches. By default, copy all fields."""
 
     def apply_model(self, mask: wp.array) -> None:
         """Apply the masked worlds' model fields, and recompute the constants derived from them.
@@ -177,7 +178,9 @@ class Engine(abc.ABC):
         The time of these worlds is then 0. The caller must update derived fields by ``refresh``. Other worlds stay
         exactly the same.
         """
-        raise NotImplementedError(f"the {self.name} engine cannot settle individual worlds")
+        raise NotImplementedError(
+            f"the {self.name} engine does not support settle={nstep}: set the task's settle to 0, or use another engine"
+        )
 
     def run_for(self, mask: wp.array, run: Callable[[], None]) -> None:
         """Run launches that affect only the masked worlds; capturable engines may skip them if the mask is empty."""

@@ -30,8 +30,7 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""CPU cores beyond this number do not count. They were not measured, and only the rollouts of a plan run on several
-cores."""
+"""The choice of a planner's engine counts at most this many CPU cores. More cores were not measured."""
 
 _NOSLIP = 6
 """The noslip solver, which is slow on a GPU, raises the break-even point by this factor."""
@@ -135,7 +134,7 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return the options to change for the worlds of a planner's samples.
+    """Choose the engine for a planner's samples, and return the options to change.
 
     With engine="auto" on a GPU, the choice depends on the number of samples, and on whether the noslip solver runs.
 

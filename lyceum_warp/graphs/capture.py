@@ -37,7 +37,7 @@ class Phase:
     """Name of the phase, for ``lyceum_warp.testing``."""
     run: Callable[[], object]
     engine: bool = False
-    """Whether the phase calls the engine, which consists of Warp launches only on some engines."""
+    """Whether the phase calls the physics engine. Graphs can capture the calls of some engines only."""
     by_world: bool = False
     """Whether the worlds can be divided among threads. The phase must launch kernels only through functions such as
     ``arrays.launch_worlds``, and no world may depend on another world."""
@@ -92,7 +92,7 @@ class Graphs:
 SECONDS_A_THREAD = 5e-4
 """Minimum work per thread in seconds; waking a thread takes about 20 microseconds."""
 TIMED = 8
-"""Number of timed calls. Only the fastest counts, because other programs may slow calls down."""
+"""Number of timed calls. The shortest time is used, because other programs can delay a call."""
 _CAPTURING = threading.RLock()
 """Only one thread may capture at a time, but controllers and viewers use environments in separate threads."""
 separate_captures()
@@ -116,7 +116,7 @@ def capturing() -> Iterator[None]:
 
 
 class _Graph:
-    """Captures functions that consist of launches as one graph. If they take long, each thread gets a graph.
+    """Captures the launches of several functions in one graph. Long work is divided into one graph per thread.
 
     The first call runs the functions directly, and loads their modules. If there are workers, the first replays are
     timed, and the shortest time determines how many threads share the work.

@@ -12,7 +12,9 @@ class Workers:
         self._pool = ThreadPoolExecutor(max(nthread - 1, 1), "lyceum_warp")
 
     def run(self, calls: Sequence[Callable[[], object]]) -> None:
-        """Call functions that release Python's GIL in parallel, and wait until all functions have returned.
+        """Call functions in parallel threads, and wait until all functions have returned.
+
+        The functions run at the same time only while they release Python's GIL.
 
         Raises:
             BaseException: Any exception that a function raised; all other functions have ended.

@@ -1,4 +1,4 @@
-"""Judge a setting by the confidence interval of its difference in returns."""
+"""Decide by confidence intervals whether a physics setting changes the returns too much."""
 
 import dataclasses
 import math

@@ -181,9 +181,7 @@ def test_next_step_mode_resets_a_world_in_the_step_after_its_end(vector: Callabl
     assert ends > 3 and envs.env.fault_counts == faults
 
 
-def test_equal_seeds_give_equal_worlds_and_resets_without_seeds_differ(
-    vector: Callable[..., GymnasiumVectorEnv],
-) -> None:
+def test_resets_repeat_initial_states_only_with_the_same_seed(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector()
     first, again = (envs.reset(seed=2**40 + 3)[0]["policy"] for _ in range(2))
     other, going_on = envs.reset(seed=4)[0]["policy"], envs.reset()[0]["policy"]

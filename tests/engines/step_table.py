@@ -33,7 +33,7 @@ DRIVE_GROUPS = {
     "filtered": ("integrator", "filter", "filterexact"),
     "special": ("muscle", "dcmotor", "user"),
 }
-"""Groups of actuators. A model combines each actuator of one group with each transmission."""
+"""Groups of actuator types. A model uses one group, with one actuator for each pair of type and transmission."""
 
 PLACES = {
     "joint": 'joint="hip"',
@@ -281,7 +281,7 @@ def is_refused(case: Case) -> bool:
 
 
 def singles() -> Iterator[Case]:
-    """Yield one case for each level of each factor. The other factors have their first levels."""
+    """Yield one case for each level of each factor. All other factors have the levels in ``PLAIN``."""
     for name, levels in FACTORS.items():
         for level in levels:
             case = PLAIN | {name: level}
@@ -290,7 +290,10 @@ def singles() -> Iterator[Case]:
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Return cases that contain every combination of ``strength`` levels, by a greedy search."""
+    """Choose cases by a greedy search.
+
+    With ``strength=2``, a case exists for every allowed pair of levels from two factors.
+    """
     rng = random.Random(seed)
     missing: dict[tuple[tuple[str, str], ...], None] = {}
     for chosen in itertools.combinations(FACTORS, strength):

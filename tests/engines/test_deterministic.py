@@ -51,7 +51,7 @@ def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pyte
     engine.nworld = 1000
     plain = WarpEngine.bytes_per_world(engine.model, engine.fields.values())
     for sizes, message in [
-        (ScratchSizes(fixed=10, each=100, most=999), "1000 worlds need buffers of more than .* use nworld=999 at most"),
+        (ScratchSizes(fixed=10, each=100, most=999), "1000 worlds are too many for .* use nworld=999 at most"),
         (ScratchSizes(fixed=10, each=100, most=1000), ""),
         (ScratchSizes(fixed=0, each=10 * plain, most=1000), r"^1000 worlds need about .* at most, or omit determ"),
     ]:
@@ -154,7 +154,7 @@ def test_contact_field_without_a_sorting_rule_raises_an_error(
     # type: ignore[attr-defined]
     known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
     monkeypatch.setattr(order.Contacts, "vars", known)
-    with pytest.raises(ValueError, match="can't sort contacts with the field 'adhesion' of this mujoco_warp"):
+    with pytest.raises(ValueError, match="does not know the contact field 'adhesion' of this mujoco_warp"):
         CanonicalOrder(copy.copy(engine.m), engine.d)
 
 

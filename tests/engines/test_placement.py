@@ -108,13 +108,13 @@ def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made
         open_engine(engine, model, 6, cpu, [], reserved=each)
 
 
-def test_only_engine_auto_moves_few_worlds_to_the_cpu() -> None:
+def test_small_batches_move_to_the_cpu_only_with_engine_auto() -> None:
     assert options_for_few_worlds("auto", "cuda:0") == ON_CPU
     for engine, device in (("auto", "cpu"), ("auto", None), ("warp", "cuda:0"), ("mujoco", "cpu"), (ToyEngine, "cuda")):
         assert options_for_few_worlds(engine, device) == {}
 
 
-def test_plant_runs_on_the_cpu_even_if_its_device_is_a_gpu(gpu: Any) -> None:
+def test_plant_moves_from_the_gpu_to_the_cpu(gpu: Any) -> None:
     """On the GPU, the planner would delay the plant's steps."""
     for engine, device in (("auto", "cuda:0"), ("warp", "cuda:0")):
         assert options_for_plant(engine, device) == ON_CPU

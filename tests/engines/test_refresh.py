@@ -89,7 +89,7 @@ def check_current(engine: Engine, *, whole: bool = False, worlds: slice = slice(
 
 
 class WholeWarpEngine(WarpEngine):
-    """A Warp engine without forward passes of selected worlds."""
+    """A Warp engine whose forward passes always compute all worlds."""
 
     partial_refresh = False
 

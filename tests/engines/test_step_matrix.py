@@ -158,7 +158,8 @@ OF_ANOTHER_MODEL = {
     "tendon_solref_fri": {"tendons": "friction"}, "tendon_solimp_fri": {"tendons": "friction"},
     "pair_solreffriction": {"cone": "elliptic"},
 }  # fmt: skip
-"""Map a field to the levels that it needs to have an effect. All other factors have the levels in ``DRAWN``."""
+"""Each of these fields affects only certain models. Its value gives the levels of such a model. All other factors have
+the levels in ``DRAWN``."""
 
 
 def touching(model: mujoco.MjModel) -> np.ndarray:

@@ -17,10 +17,9 @@ from lyceum_warp.model_fields import ModelField
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:
     """Whether ``Batch.rollout`` returns exactly the same values as a loop of ``Batch.step``.
 
-    Each row of a native rollout holds the values in MjData after an ``mj_step``. The state in a row is the state after
-    the substep, but quantities of the position and velocity stages belong to the state before the substep. With RK4,
-    they belong to an intermediate stage. Sensor data come from several stages, so a native rollout cannot return them
-    exactly.
+    ``Batch.rollout`` returns values from MjData after each ``mj_step``. The returned state is the state after the
+    substep. MuJoCo has computed all other quantities from the state before the substep or, with RK4, from an
+    intermediate state. Sensor data come from several stages, so a native rollout cannot return them exactly.
     """
     current = [field for field in fields if field.refresh > Stage.NONE]
     if any(field.snapshot for field in current):

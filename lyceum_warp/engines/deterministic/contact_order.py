@@ -30,7 +30,7 @@ class CanonicalOrder:
         for field in dataclasses.fields(data.contact):
             if field.name not in order.Contacts.vars:  # type: ignore[attr-defined]
                 raise ValueError(
-                    f"deterministic=True can't sort contacts with the field {field.name!r} of this mujoco_warp: "
+                    f"deterministic=True does not know the contact field {field.name!r} of this mujoco_warp: "
                     "install mujoco-warp 4.0"
                 )
             words = _words(getattr(data.contact, field.name))

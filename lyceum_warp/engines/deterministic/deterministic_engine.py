@@ -67,8 +67,8 @@ class DeterministicEngine(WarpEngine):
         sizes = ScratchSizes.probe(self._captured_step)
         if self.nworld > sizes.most:
             raise ValueError(
-                f"{self.nworld} worlds need buffers of more than the {LARGEST_BUFFER / 1e9:.3g} GB in which Warp can "
-                f"sort with deterministic=True: use nworld={sizes.most} at most, or omit deterministic"
+                f"{self.nworld} worlds are too many for deterministic=True, because a buffer would exceed Warp's limit "
+                f"of {LARGEST_BUFFER / 1e9:.3g} GB: use nworld={sizes.most} at most, or omit deterministic"
             )
         fields, dynamics = self.fields.values(), self.dynamics.values()
         plain = super().bytes_per_world(self.model, fields, dynamics, nconmax=self.nconmax, njmax=self.njmax)

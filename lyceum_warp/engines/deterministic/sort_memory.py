@@ -12,7 +12,8 @@ LARGEST_BUFFER = 2**31 - 1
 """Size of the largest byte array in Warp. An axis of a Warp array has fewer than 2**31 elements."""
 
 _PROBED = 1024, 2048
-"""The two numbers of worlds with which memory is measured. They are so large that no buffer has its minimum size."""
+"""Scratch memory is measured with each of these numbers of worlds. With so many worlds, Warp's minimum buffer size does
+not affect the result."""
 
 
 class Scratch(Reserve):
@@ -31,7 +32,7 @@ class Scratch(Reserve):
         self.largest = 0
 
     def open(self) -> None:
-        """Let the following launches reuse the memory from its start."""
+        """Mark the shared memory as free, so that the following launches reuse it."""
         self._block, self._used, self._now = 0, 0, 0
 
     @contextlib.contextmanager
@@ -67,7 +68,7 @@ class ScratchSizes:
 
     @classmethod
     def probe(cls, capture: Callable[[int], Scratch]) -> "ScratchSizes":
-        """Extrapolate from the scratch memory measured for two numbers of worlds."""
+        """Measure the scratch memory of 1024 and of 2048 worlds, and fit a line to the results."""
         few, more = (capture(nworld) for nworld in _PROBED)
         fixed, each = _line(few.peak, more.peak)
         fixed_buffer, each_buffer = _line(few.largest, more.largest)

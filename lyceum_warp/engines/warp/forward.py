@@ -42,9 +42,9 @@ def inertia(model: mjw.Model, data: mjw.Data) -> None:
 
 @functools.cache
 def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
-    """Make versions of MuJoCo Warp's functions that skip the parts in ``done`` in their first forward pass.
+    """Copy MuJoCo Warp's ``step`` and ``forward`` so that the first forward pass skips the parts in ``done``.
 
-    The functions are copies with other global names, so MuJoCo Warp itself does not change.
+    MuJoCo Warp itself does not change.
 
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them. It thus reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
@@ -76,7 +76,7 @@ def _copy(function: str, **names: Any) -> Callable[..., Any]:
 
 
 def _nothing(model: mjw.Model, data: mjw.Data) -> None:
-    """Do nothing. This function replaces a part that is skipped."""
+    """Do nothing. The copied functions call this instead of the parts in ``done``."""
 
 
 _NEEDS: dict[Part, tuple[Part, ...]] = {
@@ -124,7 +124,7 @@ _SENSORS: dict[str, tuple[Part, ...]] = {
     "VELOCIMETER GYRO FRAMELINVEL FRAMEANGVEL SUBTREELINVEL SUBTREEANGMOM": (mjw.com_vel,),
     "TENDONVEL ACTUATORVEL": (mjw.fwd_velocity,),
 }
-"""The parts that sensors of the position and velocity stages need. Other sensors need a full forward pass."""
+"""Maps types of sensors to the parts that compute their inputs. Other types need a full forward pass."""
 
 _PARTS_OF_SENSOR = {
     int(getattr(mujoco.mjtSensor, f"mjSENS_{kind}")): parts
@@ -189,8 +189,9 @@ _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 class PartialForward:
     """Computes the masked worlds' fields in a small group of scratch worlds, and copies them back.
 
-    A forward pass of all worlds costs as much as a substep, but few worlds restart in a step. The masked worlds' states
-    are therefore copied into the group, in as many batches as necessary.
+    In most steps, only a few worlds restart. A forward pass of these worlds is cheaper than a forward pass of all
+    worlds, which costs as much as a substep. If the group is too small for all masked worlds, it processes them in
+    several batches.
     """
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:

@@ -63,7 +63,10 @@ class Turns:
         self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
-        """Call ``turn`` once for each group; ``turn`` may copy the group's rows by ``take`` and ``give``."""
+        """Call ``turn`` once for each group of masked worlds.
+
+        ``turn`` can call ``take`` and ``give`` to copy the rows of the current group.
+        """
         with wp.ScopedDevice(self.device):
             self._count.zero_()
             self._first.zero_()
@@ -112,7 +115,7 @@ class Arena(Reserve):
         self._serving = False
 
     def open(self) -> None:
-        """Reuse the reserved memory from its start."""
+        """Mark the reserved memory as free, so that the following launches reuse it."""
         self._used = 0
 
     @contextlib.contextmanager
@@ -157,7 +160,10 @@ class Conditional:
         self._inside = False
 
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
-        """Run launches that affect only the masked worlds, (nworld,) bool; a nested call always runs them."""
+        """Run launches that affect only the masked worlds.
+
+        ``mask`` is (nworld,) bool. If ``run`` calls this method again, the inner call does not read its mask.
+        """
         if self._inside:
             run()
             return

@@ -40,8 +40,12 @@ _known: dict[str, tuple[int, int]] = {}
 def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
     """Measure how many contacts and constraints to allocate for each world.
 
-    The numbers are twice the peak of random rollouts, plus constraints that a task may turn on. These are inactive
-    equality constraints, friction losses if they are randomized, and all limits if their ranges are randomized.
+    Each number is twice the largest count in random rollouts. The number of constraints also includes constraints that
+    a task may enable:
+
+    - equality constraints that are inactive in the model
+    - all friction losses, if the task randomizes friction losses
+    - all limits of joints and tendons, if the task randomizes fields that affect limits
 
     In the rollouts, 32 worlds run 500 substeps on the C engine. The controls are random and held for 20 substeps. The
     worlds start in the model's initial state or a keyframe, half of them with random velocities. Results are cached for
@@ -52,7 +56,8 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
         varied: The names of the model fields that differ between worlds.
 
     Returns:
-        (nconmax, njmax), both multiples of 8, and at least (8, 8), or (256, 512) with a flex.
+        (nconmax, njmax), both multiples of 8. They are at least (256, 512) if the model has a flex, and at least (8, 8)
+        otherwise.
 
     Raises:
         NotImplementedError, ValueError: MuJoCo Warp does not support the model.
@@ -94,7 +99,7 @@ def warn_of_little_room(
     if contacts.mean() > nconmax or constraints.max() > njmax:
         log.warning(
             "worlds begin with up to %d constraints and %.3g contacts on average, but njmax=%d and nconmax=%d: "
-            "give make() larger values, or steps end with constraint_overflow or contact_overflow",
+            "give make() larger values to avoid the faults constraint_overflow and contact_overflow",
             constraints.max(), contacts.mean(), njmax, nconmax,
         )  # fmt: skip
 
@@ -161,9 +166,9 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 
 _TEMPORARIES = 1.25
-"""A world takes this many times its memory in MuJoCo Warp's Data. In measurements, a step's temporary arrays took 1 to
-9 %; the rest is for graphs and for the group of a partial forward pass. CPU graphs keep all temporary arrays alive and
-take up to three times as much."""
+"""The estimated memory of a world, divided by its memory in MuJoCo Warp's Data. In measurements, a step's temporary
+arrays added 1 to 9 %. The rest is room for graphs and for the group of a partial forward pass. CPU graphs can exceed
+the estimate, because they keep all temporary arrays alive."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The same factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5

@@ -106,10 +106,10 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 
 
 class ModelRows:
-    """Make the model of a group of worlds, which has its own rows of the given fields.
+    """Copies a model for a group of worlds. Each given field has one row per world of the group.
 
-    World w of the group is a different world from world w of the batch, so it must not read row w of the batch's model.
-    The group also gets copies of the fields ``own``, because it writes them.
+    ``take`` fills these rows, because the worlds in the group change. The constructor also copies the fields ``own``,
+    because the group writes them.
     """
 
     def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:

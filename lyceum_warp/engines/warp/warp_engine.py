@@ -42,12 +42,12 @@ class WarpEngine(Engine):
     Args:
         model, nworld, fields: See ``Engine``.
         device: A CUDA device, or the CPU, which uses a single thread and is for tests.
-        dynamics: The model fields that differ between worlds. Contact and constraint capacities are probed with the
+        dynamics: The model fields that differ between worlds. Contact and constraint capacities are measured with the
             model's own values; see ``sizes.probe_sizes``.
         initial: The initial state for ``reset``, rounded to float32; None for the model's initial state.
-        nconmax: Contact capacity of all worlds, divided by the number of worlds. By default, the model is probed, and
-            capacity is added for one world in which all geoms touch.
-        njmax: Constraint capacity of each world; by default the model is probed.
+        nconmax: Contact capacity of all worlds, divided by the number of worlds. By default, it is measured in random
+            rollouts. The engine then adds room for the contacts of a single world whose geoms all touch.
+        njmax: Constraint capacity of each world. By default, it is measured in random rollouts.
 
     Raises:
         ValueError: MuJoCo Warp does not support the model, or an option is out of range.
@@ -317,7 +317,10 @@ class WarpEngine(Engine):
 
     @contextlib.contextmanager
     def _histories_kept(self) -> Iterator[None]:
-        """Restore the sensor histories after the context, because the next step adds the same samples."""
+        """Return a context that restores the sensor histories when it ends.
+
+        Forward passes in the context add samples to the histories. The next step would add the same samples again.
+        """
         if self.d.history.size:
             wp.copy(self._history, self.d.history)
         yield

@@ -1,4 +1,4 @@
-"""Define kernels that copy masked worlds into a small group and back, place static geoms, and correct constants.
+"""Define kernels of the Warp engine. They copy worlds into a group and back, place static geoms, and correct constants.
 
 The masked worlds are numbered from 0 in any order. The number of a world is called its rank. A group holds the worlds
 with consecutive ranks, beginning with rank ``first``.

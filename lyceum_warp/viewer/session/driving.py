@@ -1,4 +1,4 @@
-"""Replace the task's command for a walking robot, and draw arrows for commanded and measured velocities.
+"""Steer a walking robot by the user's commands, and draw commanded and measured velocities as arrows.
 
 The task must store its command like the velocity tasks (see ``docs/velocity.md``). The robot's first joint must be the
 free joint of its base.
