@@ -16,8 +16,8 @@ _lock = threading.RLock()
 def rehearse() -> Iterator[dict[tuple[Any, int | None], None]]:
     """List the modules of this thread's launches instead of running the kernels; graph branches and loops run once.
 
-    Kernels do not run, but copies and allocations do. Arrays may therefore contain garbage afterwards.
-    Only one thread can do this at a time; other threads launch kernels as usual.
+    Kernels do not run, but copies and allocations do. Arrays may therefore contain garbage afterwards. Only one thread
+    can do this at a time; other threads launch kernels as usual.
 
     Yields:
         Modules and block sizes in launch order, as the keys of a dict. A block size of None is Warp's default.
