@@ -2,8 +2,8 @@
 
 With K knots over a horizon of H steps, the knots are H / K steps apart. They stay fixed in time while the horizon
 moves, so the plan keeps the actions of its remaining steps. MuJoCo MPC calls this a sliding plan. Positions are whole
-numbers in units of 1 / K steps: knots are H units apart, and steps are K units apart. The phase is the distance from
-the last knot before the horizon to the horizon's first step, from 0 to H - 1 units.
+numbers in units of 1 / K steps: knots are H units apart, and steps are K units apart. The phase is the position of the
+horizon's first step, measured from the last knot at or before it. It is at least 0 and less than H.
 """
 
 import math
@@ -20,7 +20,7 @@ _NEEDED = {"zero": 1, "linear": 2, "cubic": 4}
 
 
 def knot_count(horizon: int, knots: int, spline: str) -> int:
-    """Return the number of knots that a plan needs at any phase."""
+    """Return the number of knots that a plan needs at its largest phase."""
     largest_phase = horizon - math.gcd(horizon, knots)
     return ((horizon - 1) * knots + largest_phase) // horizon + _NEEDED[spline]
 

@@ -406,7 +406,7 @@ def value_kernel(value: wp.Function) -> wp.Kernel:
     """Make a kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
 
     Raises:
-        ValueError: The function has different arguments.
+        ValueError: The function does not take exactly one argument of type ``Row[float]``.
     """
     types = list(value.input_types.values())
     if len(types) != 1 or getattr(types[0], "ndim", 0) != 1 or types[0].dtype is not wp.float32:

@@ -1,7 +1,7 @@
 """Draw from counter-based random streams: a draw depends only on (seed, world, episode, step).
 
-The streams hash the four numbers one after the other. With a sum of the numbers, seed 0 with episode 1 would have the
-same stream as seed 1 with episode 0.
+Each stream starts at a hash of the four numbers. If it started at their sum, seed 0 with episode 1 would have the same
+stream as seed 1 with episode 0.
 """
 
 import warp as wp

@@ -1,8 +1,8 @@
 """Copy rows of masked worlds between the arrays of an environment and an engine, and cast them.
 
-The float64 arrays are often views of the engine's states. Writes are masked, because a float32 value would round the
-state of a world that should not change. Most masks are nearly empty and most rows are short, so ``launch_rows`` uses a
-single thread per world on the CPU, and at most a warp per world on a GPU.
+The float64 arrays are often views of the engine's states. The kernels write only the masked worlds. A write to any
+other world would round that world's state to float32. Most masks are nearly empty and most rows are short, so
+``launch_rows`` uses a single thread per world on the CPU, and at most 32 threads per world on a GPU.
 """
 
 import warp as wp

@@ -71,7 +71,7 @@ class TaskCode:
     Sums: Any  # the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
     views: Mapping[Any, wp.Function]  # ``Kernels.views``
-    copy_state: wp.Function  # copies the fields that steps change
+    copy_state: wp.Function  # copies the fields that change in a step
     observe_group: wp.Function
     finite_group: wp.Function
     copy_observations: wp.Function
@@ -84,7 +84,10 @@ class TaskCode:
     kernels: dict[str, wp.Kernel | None] = dataclasses.field(default_factory=dict, init=False)
 
     def kernel(self, needed: bool = True) -> Callable[[Any], Any]:
-        """Decorator: add a function to ``kernels``, as a kernel of the task's Warp module, or as None if not needed."""
+        """Return a decorator that turns a function into a kernel of the task's Warp module.
+
+        The decorator stores the kernel in ``kernels``. If the kernel is not needed, the decorator stores None.
+        """
 
         def add(body: Any) -> None:
             made = wp.kernel(module=self.module, enable_backward=False)(body) if needed else None
@@ -93,5 +96,5 @@ class TaskCode:
         return add
 
     def kernel_for(self, function: str) -> Callable[[Any], Any]:
-        """Decorator: turn a function into a kernel, or into None if the task does not define ``function``."""
+        """Return the decorator for a kernel that is needed only if the task defines ``function``."""
         return self.kernel(function in self.written)

@@ -1,4 +1,4 @@
-"""Make the kernels of a step that call a task's functions to map actions, begin episodes and share memory."""
+"""Make the kernels that call a task's functions for actions, restarts, events and shared memory."""
 
 from collections.abc import Mapping
 from types import SimpleNamespace
@@ -17,7 +17,7 @@ NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
 EVENT = wp.constant(-2)
-"""The substream from which ``event`` draws, within a step's random stream."""
+"""Number of the substream from which ``event`` draws."""
 STARTUP = wp.constant(-1)
 """Replaces the episode number in the random stream of ``startup``."""
 

@@ -10,7 +10,7 @@ from lyceum_warp.support.docstrings import document_overloads
 
 
 class Sigmoid(enum.IntEnum):
-    """The shapes of ``tolerance`` between the bounds and the margin, as in dm_control's ``rewards.py``."""
+    """The curves along which ``tolerance`` decreases from 1 towards 0, as in dm_control's ``rewards.py``."""
 
     GAUSSIAN = 0
     HYPERBOLIC = 1
@@ -77,7 +77,7 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
     return put(row, at, value, 0, value.shape[0])
 
 
-# the last overload, because Warp uses the first one that fits
+# keep this overload last: it fits every type, and Warp uses the first overload that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
     for i in range(len(value)):

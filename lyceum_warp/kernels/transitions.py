@@ -15,7 +15,7 @@ OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
 OBSERVE = wp.constant(-1)
-"""The substream of a step's random stream from which observation noise is drawn."""
+"""Number of the substream from which observation noise is drawn."""
 
 # the parts of ``judge``; from OBSERVE_FIRST on, each observation group is a part
 ENDS = wp.constant(0)
@@ -264,8 +264,8 @@ def judge_kernels(task: TaskCode) -> None:
 def rollout_kernels(task: TaskCode) -> None:
     """Make the kernels for open-loop rollouts, which store the fields of all steps.
 
-    Row t * nworld + w is world w after t steps. The world's next state is nworld rows later, so ``before`` and
-    ``after`` are views of the same arrays.
+    Row t * nworld + w is world w after t steps. ``before`` and ``after`` are views of the same arrays, but ``after``
+    starts at row nworld, and thus holds the next states.
     """
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view = task.view

@@ -14,7 +14,7 @@ WORLDS_A_BLOCK = 32
 idle."""
 
 _SPARE = 256
-"""Number of elements that are allocated for an empty array."""
+"""Number of elements that ``with_memory`` allocates."""
 
 
 def alias(array: wp.array, dtype: type, shape: tuple[int, ...], strides: tuple[int, ...] | None = None) -> wp.array:
@@ -37,7 +37,7 @@ def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> 
 
 
 def with_memory(array: wp.array) -> wp.array:
-    """Return the array. If it is empty, return an array of the same shape with allocated memory.
+    """Give memory to an empty array, and return any other array unchanged.
 
     Without this memory, a task that reads an element by mistake would crash the process.
     """
@@ -91,7 +91,7 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
     """Launch a kernel over (nworld, lanes).
 
     Its last arguments are the number of lanes and the first world's index. Lanes are threads that share the work on a
-    world. The CPU uses one lane. A GPU uses a warp, for coalesced memory access.
+    world. The CPU uses one lane. A GPU uses 32 lanes, so that memory access is coalesced.
     """
     lanes = 32 if device.is_cuda else 1
     _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)

@@ -16,8 +16,8 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
 
     Args:
         path: The file.
-        durable: Whether to flush the new content to disk first, so that it survives a power loss.
-        previous: Path to which the old file is saved; by default it is lost.
+        durable: Whether to flush the new file to disk before the replacement, to survive a power loss.
+        previous: Path under which the old file is kept; by default, the old file is lost.
     """
     temporary = path.with_name(path.name + ".tmp")
     try:

@@ -20,7 +20,7 @@ class LeftInParent:
 
 
 def leave_in_parent(thing: Any, *attributes: str) -> None:
-    """Make attributes of an object raise RuntimeError in children that are forked later."""
+    """Make an object's attributes raise RuntimeError in child processes that are forked later."""
     _watched[thing] = attributes
 
 

@@ -17,7 +17,7 @@ class Interrupted(BaseException):
 
 
 def _ignore(number: int, frame: Any) -> None:
-    """Ignore a signal, until ``obeyed`` replaces this handler."""
+    """Ignore a signal. ``obeyed`` replaces only this handler."""
 
 
 def _interrupt(number: int, frame: Any) -> None:
@@ -35,10 +35,11 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
     Args:
         handler: The handler of the signals; by default it raises Interrupted.
-        replaces: The only handler to replace. By default, all handlers are replaced except those that ignore a signal.
+        replaces: If given, only this handler is replaced. By default, all handlers are replaced except those that
+            ignore a signal.
 
     Yields:
-        The replaced handlers by signal. They are restored at the end of the context.
+        The replaced handlers, as a dict with signal numbers as keys. They are restored at the end of the context.
     """
     previous: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # only the main thread may set signal handlers

@@ -53,7 +53,7 @@ def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]
         second: Second outcome of each pair, (pairs,) bool.
 
     Returns:
-        The centre of the interval, an estimate of second minus first, and its half-width.
+        The centre and the half-width of the interval. The centre estimates the second proportion minus the first.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0

@@ -26,7 +26,7 @@ class LongWork(Progress):
         self.began, self.next_line = time.monotonic(), wait
 
     def __call__(self, done: int, total: int) -> None:
-        """Show how many of all units are done."""
+        """Show that ``done`` of ``total`` units are complete."""
         self.update(self.bar, completed=done, total=total)
         seconds = time.monotonic() - self.began
         if not self.console.is_terminal and seconds >= self.next_line and done < total:

@@ -43,7 +43,7 @@ def extend_structs() -> None:
 
 
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
-    """Return whether a module of kernels is loaded or in Warp's cache, for a block size.
+    """Return whether Warp has loaded a module for a block size, or has it in its cache.
 
     If Warp's internals have changed, the result is False, which only costs time.
     """
@@ -101,8 +101,8 @@ class _Tiles(threading.local):
 
 tiles = _Tiles()
 TILES_ON_CPU = threading.RLock()
-"""Lock for kernels with tiles on the CPU. On x86, the address of a kernel's tiles is in a static variable, so two
-threads would overwrite each other's tiles."""
+"""A thread holds this lock while it launches a tiled kernel on the CPU. On x86, the address of a kernel's tiles is in a
+static variable, so two threads would overwrite each other's tiles."""
 
 
 def separate_tiles() -> None:
@@ -120,7 +120,7 @@ def separate_tiles() -> None:
 
 @contextlib.contextmanager
 def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iterator[None]:
-    """Replace functions of Warp for calls from this thread."""
+    """Replace Warp functions for the calling thread only."""
     thread = threading.get_ident()
     with contextlib.ExitStack() as restored:
         for name, instead in functions.items():
@@ -141,7 +141,7 @@ depends only on whether the mask is None."""
 
 
 def quicken_mujoco_warp() -> None:
-    """Cache results in MuJoCo Warp's host code.
+    """Make MuJoCo Warp's host code faster, mostly by caching results.
 
     Without graphs, this code takes most of the time of a step or reset.
     For each pair of geom types, MuJoCo Warp calls a Warp function from Python, and Warp then resolves overloads. The

@@ -44,7 +44,7 @@ def start_warp() -> list[str]:
 
 
 def _stderr_of_start() -> list[str]:
-    """Capture what Warp writes to stderr while it is initialised, as lines."""
+    """Initialise Warp, and return the lines that it writes to stderr."""
     with contextlib.ExitStack() as restored:
         try:
             stderr = os.dup(2)

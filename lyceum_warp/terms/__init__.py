@@ -1,7 +1,7 @@
 """Offer reward terms, commands, contact clocks, noise, random draws and motors for any task.
 
-Every function is a ``wp.func`` of numbers, vectors, rows of ``World`` and tables of ``Params``. An argument's name has
-the same meaning in all functions; see ``ARGUMENTS``.
+Every function is a ``wp.func``. Its arguments are numbers, vectors, rows of ``World`` and tables of ``Params``. An
+argument's name has the same meaning in all functions; see ``ARGUMENTS``.
 """
 
 from lyceum_warp.support.docstrings import document_arguments

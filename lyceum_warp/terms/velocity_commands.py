@@ -1,4 +1,4 @@
-"""Draw random velocity commands (forward velocity, lateral velocity, yaw rate) in the base's axes, and time them.
+"""Draw velocity commands at random times: forward velocity, lateral velocity and yaw rate in the base's axes.
 
 A command is stored in several rows of memory, and a separate function fills each row with random numbers::
 

@@ -1,4 +1,4 @@
-"""Check that a task's environment follows the package's rules, on any engine.
+"""Run a task on an engine, and check that the task follows the package's rules.
 
 The AssertionError of a check names the task, the engine, the rule, the values, the seed and a world's state.
 """
@@ -63,7 +63,7 @@ def check_task(
     checks: Sequence[Callable[[Context], None]] = CHECKS,
     **options: Any,
 ) -> Report:
-    """Check that a task follows every rule of an environment on an engine.
+    """Run a task on an engine, and check that the task follows every rule in ``checks``.
 
     Args:
         task: A task's name, file or class.

@@ -41,7 +41,7 @@ class CheckedFunctions:
         self._copies: dict[int, wp.Function] = {}
         self._scopes: list[tuple[dict[str, Any], list[int]]] = []
         self.kernels = {name: self._kernel(name, function) for name, function in functions.items()}
-        for scope, numbers in self._scopes:  # a function may call copies that are made later
+        for scope, numbers in self._scopes:  # now that every copy exists, let the copies call one another
             scope |= {f"bounds_{number}": self._copies[number] for number in numbers}
 
     def load(self, device: wp.Device) -> None:
@@ -155,7 +155,10 @@ class _Rewriter(ast.NodeTransformer):
         return visited
 
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
-        """Refuse a function that is used as a value, because its copy has one more argument."""
+        """Refuse a function that the source uses as a value.
+
+        Its checked copy takes the report as an additional argument, so other code could not call it.
+        """
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:
             raise Unchecked(
@@ -171,8 +174,8 @@ class _Rewriter(ast.NodeTransformer):
             raise Unchecked(f"{self.source.name} calls a function chosen by a loop ({self.source.place(node)})")
         if kind == "native" and any(is_row(given) or is_struct(given) for given in callee.input_types.values()):
             raise Unchecked(
-                f"{self.source.name} calls the native function {name_of(callee)} ({self.source.place(node)}), which "
-                "has no source in Python: give it numbers instead of rows"
+                f"{self.source.name} passes a row or a struct to the native function {name_of(callee)} "
+                f"({self.source.place(node)}), and C++ code can't be checked: pass numbers instead"
             )
         if kind == "builtin" and callee.key.startswith("atomic_"):
             self._check_atomic(node, callee.key)

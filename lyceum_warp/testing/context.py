@@ -23,7 +23,10 @@ SHORT = 8
 @document_attributes
 @dataclasses.dataclass
 class Context:
-    """Two environments with the same options, and functions that compare values and name the rule in errors."""
+    """Two environments with the same options, and methods that compare their values.
+
+    A method's error names the rule that the task breaks.
+    """
 
     a: Env
     """The environment of most checks."""
@@ -87,7 +90,7 @@ class Context:
         return (env.done_reason & int(FAULTS)) != 0
 
     def calm(self, env: Env) -> torch.Tensor:
-        """Return a mask of the worlds that no event changed after the last step, (nworld,) bool."""
+        """Return a mask of the worlds that ``event`` left unchanged after the last step, (nworld,) bool."""
         if env.task.functions["event"] is None:
             return torch.ones_like(env.done)
         return ~env.worlds.changed_view

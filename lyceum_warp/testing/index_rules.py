@@ -65,7 +65,6 @@ class _Run:
         env = self.env
         self._keep_start()
         self.ctx.restart()
-        # a slow engine takes fewer steps, because functions are the same on every engine
         slow = env.engine.capturable and env.device.is_cpu
         for i, action in enumerate(self.ctx.actions(min(self.ctx.steps, _FEW) if slow else self.ctx.steps)):
             ended = env.done.clone()
@@ -149,7 +148,7 @@ class _Run:
         return batch
 
     def _array(self, shape: tuple[int, ...], dtype: Any) -> wp.array:
-        """Make an array, with memory for at least one element, because a checked function may access it."""
+        """Make an array. Even an empty array gets memory, because checked functions replace a bad index by 0."""
         with wp.ScopedDevice(self.env.device):
             made: wp.array = wp.zeros([max(size, 1) for size in shape], dtype=dtype)
             self.keep.append(made)

@@ -30,8 +30,8 @@ def predicted(
         before: Initial states, (nworld, state_space.size).
         after: States with the controls and inputs of the step; by default ``before``.
         nstep: Number of substeps.
-        dynamics: Whether to take model fields from ``before`` instead of their nominal values.
-        inputs: Whether to take inputs from ``after`` instead of ``before``.
+        dynamics: If True, the step uses the model fields in ``before``; otherwise, it uses the nominal model fields.
+        inputs: If True, the step uses the inputs in ``after``; otherwise, it uses the inputs in ``before``.
     """
     parts, size = env.state_space.parts, env.engine.integration_size
     start = before.cpu().numpy().copy()
@@ -142,7 +142,7 @@ def check_dynamics(ctx: Context) -> None:
         b.rand_reset(ctx.seed + 7)
         b.set_state(after)
         compare(b, after, "after set_state")
-    # many resets give the same random values as one reset
+    # b skips these resets, but has the same episode number
     for _ in range(3 * SHORT):
         a.rand_reset()
     late = a.get_state()

@@ -107,7 +107,7 @@ def check_purity(ctx: Context) -> None:
         for pause in range(2):
             for i, action in enumerate(actions):
                 before = ctx.buffers(env)
-                # an event changes the state after the step is evaluated
+                # skip worlds that an event has changed: their rewards belong to the states before the event
                 calm = live["calm"][: i + 1].all(dim=0)
                 fine = ((live["done_reason"][i] & int(FAULTS)) == 0) & calm
                 reward = env.get_reward(states[i], action, states[i + 1])

@@ -218,7 +218,7 @@ def function_as_a_value(s0: World, action: Row[float], s1: World, p: Params, rng
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (calls_native, r"calls_native calls the native function poke \(.*, line \d+\), which has no source in Python"),
+        (calls_native, r"calls_native passes a row .* to the native function poke \(.*, line \d+\), .*: pass numbers"),
         (function_as_a_value, r"function_as_a_value uses last as a value \(.*, line \d+\): call it instead"),
     ],
 )

@@ -146,7 +146,7 @@ def run(line: list[str]) -> str:
         lines = err.getvalue().splitlines()
         errors = [text for text in lines if text.startswith("lyceum-warp: ")]
         if parsed and (not errors or lines[-1] != errors[-1]):
-            raise ProblemError(f"{_spelled(line)}: stderr ends without an error of one line: {lines[-3:]}")
+            raise ProblemError(f"{_spelled(line)}: stderr does not end with a one-line error: {lines[-3:]}")
         if (after := content(Path())) != before:
             changed = [name for name in after | before if before.get(name) != after.get(name)]
             raise ProblemError(f"{_spelled(line)}: ended with 2, but changed {', '.join(changed)}: {lines[-1:]}")

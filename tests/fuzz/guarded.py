@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 MEMORY = 512 * 2**20
-"""Bytes of address space that a case may add."""
+"""Bytes of address space that a case may allocate."""
 PATIENCE = 3.0
 """Seconds after which a running case receives a SIGINT."""
 LIMIT = 60.0

@@ -168,7 +168,7 @@ def grasps(distance: wp.array[float], finger: wp.array[float], out: wp.array2d[f
     out[i, 2] = grasp
 
 
-def test_grasp_terms_reward_open_fingers_on_the_way_and_closed_fingers_at_the_target() -> None:
+def test_grasp_terms_match_the_documented_values() -> None:
     cases = {  # (distance, finger opening): expected (near, reach, grasp)
         (0.0, 0.005): (1.0, 1.0, 1.0),
         (0.0, 0.04): (1.0, 1.0, 0.0),

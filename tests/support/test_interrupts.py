@@ -8,7 +8,7 @@ from lyceum_warp.support.interrupts import Interrupted, obeyed, postponed, signa
 
 @pytest.fixture(autouse=True)
 def default_handlers() -> Iterator[None]:
-    """Set the default handlers, because programs in a shell's background ignore SIGINT."""
+    """Set the default handlers, because a shell's background jobs ignore SIGINT."""
     before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -17,7 +17,7 @@ def default_handlers() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def test_first_signal_raises_interrupted_and_later_signals_are_ignored() -> None:
+def test_first_signal_raises_an_exception_and_later_signals_are_ignored() -> None:
     with signals():
         with pytest.raises(Interrupted) as raised:
             signal.raise_signal(signal.SIGTERM)
@@ -27,7 +27,7 @@ def test_first_signal_raises_interrupted_and_later_signals_are_ignored() -> None
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_postponed_signal_raises_interrupted_at_the_end_of_the_context() -> None:
+def test_postponed_signal_raises_an_exception_at_the_end_of_the_context() -> None:
     with signals():
         with pytest.raises(Interrupted) as raised, postponed() as noted:
             signal.raise_signal(signal.SIGTERM)
@@ -37,7 +37,7 @@ def test_postponed_signal_raises_interrupted_at_the_end_of_the_context() -> None
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signals_are_ignored_after_interrupted_was_raised() -> None:
+def test_signals_are_ignored_once_the_program_is_ending() -> None:
     with signals():
         with pytest.raises(Interrupted), postponed() as noted:
             signal.raise_signal(signal.SIGTERM)
@@ -45,7 +45,7 @@ def test_signals_are_ignored_after_interrupted_was_raised() -> None:
         signal.raise_signal(signal.SIGTERM)
 
 
-def test_signal_after_the_end_of_a_postponed_context_raises_interrupted() -> None:
+def test_signal_after_a_postponement_raises_an_exception() -> None:
     with signals():
         with postponed():
             pass
@@ -53,7 +53,7 @@ def test_signal_after_the_end_of_a_postponed_context_raises_interrupted() -> Non
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_postponed_with_insist_raises_interrupted_at_the_second_signal() -> None:
+def test_second_signal_is_not_postponed_if_insist_is_true() -> None:
     reached = []
     with signals():
         with pytest.raises(Interrupted) as raised, postponed(insist=True):
@@ -69,7 +69,7 @@ def test_postponed_with_insist_raises_interrupted_at_the_second_signal() -> None
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_obeyed_raises_interrupted_at_the_second_signal_and_ignores_the_third() -> None:
+def test_exactly_one_more_signal_can_raise_an_exception() -> None:
     with signals():
         with pytest.raises(Interrupted):
             signal.raise_signal(signal.SIGINT)
@@ -80,7 +80,7 @@ def test_obeyed_raises_interrupted_at_the_second_signal_and_ignores_the_third() 
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
-def test_obeyed_does_not_replace_ignored_signals_or_other_handlers() -> None:
+def test_handlers_of_other_code_are_not_replaced() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with signals():
         with pytest.raises(Interrupted):

@@ -13,7 +13,7 @@ def test_student_quantile_matches_published_values(freedom: float, quantile: flo
     assert student_quantile(0.975, freedom) == pytest.approx(quantile, rel=2e-5)
 
 
-def test_mean_interval_of_five_values() -> None:
+def test_confidence_interval_of_the_mean_matches_the_t_distribution() -> None:
     mean, half = mean_interval([1.0, 2.0, 3.0, 4.0, 5.0])
     assert (mean, half) == pytest.approx((3.0, 2.77645 * math.sqrt(2.5 / 5)), rel=1e-5)
     assert math.isnan(mean_interval([1.0])[1])

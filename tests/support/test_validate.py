@@ -35,7 +35,7 @@ def test_finite_number_within_its_bounds_is_converted_to_float() -> None:
             finite_number("gamma", wrong, **bounds)
 
 
-def test_error_of_an_object_of_another_type_shows_an_example() -> None:
+def test_object_of_a_wrong_type_raises_an_error_with_an_example() -> None:
     check_kind("policy", torch.nn.Identity(), torch.nn.Module, "as lw.Policy(...)")
     with pytest.raises(ValueError, match=r"policy must be of type Module, as lw\.Policy\(\.\.\.\), not int 3"):
         check_kind("policy", 3, torch.nn.Module, "as lw.Policy(...)")
