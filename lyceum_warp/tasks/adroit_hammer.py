@@ -1,10 +1,10 @@
 """AdroitHammer: pick up a hammer and drive a nail into a board (Gymnasium-Robotics' AdroitHandHammer-v1).
 
-Install the extra "hand" to get the hand's model. The board is a mocap body, because its height is part of the state.
-The original model lists the contact pair of ring and little fingertip twice. This model lists it once. As in
-Gymnasium-Robotics, positions and the force on the nail are one substep old after ``mj_step``. Because of a mistake in
-gymnasium-robotics 1.2.1 to 1.4.2, the reward grows with the palm's distance from the hammer. ``palm_weight=-0.1``
-restores the reward of version 1.2.0.
+Install the extra "hand" to get the hand's model. The board is a mocap body, so that its height is part of the state.
+The original model contains one contact pair twice: the tips of ring finger and little finger. This model contains it
+once. As in Gymnasium-Robotics, positions and the force on the nail are one substep old after ``mj_step``. Because of a
+mistake in gymnasium-robotics 1.2.1 to 1.4.2, the reward grows with the palm's distance from the hammer.
+``palm_weight=-0.1`` restores the reward of version 1.2.0.
 """
 
 import mujoco

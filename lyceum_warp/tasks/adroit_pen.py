@@ -1,10 +1,10 @@
 """AdroitPen: turn a pen in the hand to a target orientation (Gymnasium-Robotics' AdroitHandPen-v1).
 
-Install the extra "hand" to get the hand's model. The target is a mocap body, because it is part of the state. Unlike in
-Gymnasium-Robotics, the pen does not collide with the target. The original model lists the contact pair of ring and
-little fingertip twice. This model lists it once. As in Gymnasium-Robotics, positions are one substep old after
-``mj_step``.
-Success: the pen has been in the goal orientation in more than 20 steps of the episode.
+Install the extra "hand" to get the hand's model. The target is a mocap body, so that its pose is part of the state.
+Unlike in Gymnasium-Robotics, the pen does not collide with the target. The original model contains one contact pair
+twice: the tips of ring finger and little finger. This model contains it once. As in Gymnasium-Robotics, positions are
+one substep old after ``mj_step``. Success: the pen has been in the goal orientation in more than 20 steps of the
+episode.
 """
 
 import mujoco

@@ -1,10 +1,10 @@
 """AdroitRelocate: pick up a ball and carry it to a target (Gymnasium-Robotics' AdroitHandRelocate-v1).
 
-Install the extra "hand" to get the hand's model. The target is a mocap body, and resets move the ball's joints, because
-both positions are part of the state. The original model lists the contact pair of ring and little fingertip twice. This
-model lists it once. As in Gymnasium-Robotics, positions are one substep old after ``mj_step``. Because of a mistake in
-gymnasium-robotics 1.2.1 to 1.4.2, the reward grows with the palm's distance from the ball. ``palm_weight=-0.1``
-restores the reward of version 1.2.0.
+Install the extra "hand" to get the hand's model. The target is a mocap body, so that its position is part of the state.
+Resets set the positions of the ball's joints, which are also part of the state. The original model contains one
+contact pair twice: the tips of ring finger and little finger. This model contains it once. As in Gymnasium-Robotics,
+positions are one substep old after ``mj_step``. Because of a mistake in gymnasium-robotics 1.2.1 to 1.4.2, the reward
+grows with the palm's distance from the ball. ``palm_weight=-0.1`` restores the reward of version 1.2.0.
 """
 
 import mujoco

@@ -1,8 +1,8 @@
 """ArmHandPickup: pick up a ball with an arm and a hand, and hold it at a goal (Lyceum's ArmHandPickup).
 
-The arm and the hand are the Kinova Jaco, whose model the extra "dm-control" installs. Goal, reward and initial states
-are Lyceum's, except for the distance from the ball to the goal. Lyceum's code uses |ball - (ball - goal)|, which is
-constant. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps,
+The arm and the hand are the Kinova Jaco. Install the extra "dm-control" to get their model. Goal, reward and initial
+states are Lyceum's, except for the distance from the ball to the goal. Lyceum's code uses |ball - (ball - goal)|, which
+is constant. Actions are joint velocities. Success: the ball has been within 5 cm of the goal for ten consecutive steps,
 0.2 s.
 """
 

@@ -118,7 +118,7 @@ def test_fields_that_only_some_models_have_are_equal_on_both_engines_and_in_mujo
         torch.testing.assert_close(*(fields[name] for fields in seen), rtol=1e-3, atol=1e-3, msg=name)
 
 
-def test_equality_constraint_activated_at_a_reset_acts_equally_on_both_engines(shared_env: SharedEnv) -> None:
+def test_engines_agree_after_a_reset_activates_an_equality_constraint(shared_env: SharedEnv) -> None:
     ends = []
     for engine in ("mujoco", "warp"):
         env = shared_env(RICH, engine=engine, nworld=2, fields=FIELDS)

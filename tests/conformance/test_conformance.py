@@ -17,12 +17,12 @@ EVERY_RULE = {
 }
 """The tasks that pass every check on an engine. Together they use most features of models."""
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""The checks of other tasks on the C engine, without two slow checks that hardly depend on the task."""
+"""On the C engine, the other tasks pass these checks. Two slow checks, which hardly depend on the task, are missing."""
 OF_THE_STATE = (
     buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
-"""The few checks of other tasks on the Warp engine, which is slow on a CPU."""
+"""On the Warp engine, the other tasks pass only these checks, because this engine is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
 
 

@@ -222,7 +222,7 @@ def test_task_with_every_feature_passes_on_the_warp_engine() -> None:
     check_task(Full, engine="warp", nworld=2, frame_skip=1, checks=checks)
 
 
-def test_every_rule_has_a_patch_that_violates_it() -> None:
+def test_every_check_is_tested_with_code_that_violates_its_rule() -> None:
     rules = {f"check_{rule}" for _, rule, *_ in ALL_BREAKS}
     assert rules == {check.__name__ for check in CHECKS}
 

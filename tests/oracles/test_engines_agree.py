@@ -22,7 +22,7 @@ from lyceum_warp.tasks.velocity import TASKS as VELOCITY
 
 NWORLD = 32
 TASKS = package_task_names()
-# together, these small models have most features
+# together, these small models have most of the model features that the tasks use
 quick = pytest.mark.quick(
     "cartpole_swingup", "go1_velocity", "hopper", "reach", "soft_ball",
 )  # fmt: skip
@@ -49,7 +49,8 @@ Higher solver limits let the solver converge. Otherwise the engines would not ag
 class Bounds:
     """Bounds on the difference between the engines after one substep.
 
-    A world's difference is the maximum over coordinates. The bounds apply to quantiles over the worlds.
+    In each world, only the coordinate with the largest difference counts. The bounds apply to quantiles of these
+    differences over the worlds.
     """
 
     qpos_median: float

@@ -47,10 +47,10 @@ WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
 
 
 class SensorStage:
-    """Give Gymnasium environments the Newton solver and contact forces of the last substep.
+    """Make Gymnasium environments use lyceum_warp's solver (Newton), and compute contact forces as lyceum_warp does.
 
-    Gymnasium computes ``cfrc_ext`` again after the last substep. This class computes it in the sensor stage, as
-    lyceum_warp does.
+    Gymnasium computes ``cfrc_ext`` again after the last substep. This class computes it in the sensor stage of the last
+    substep.
     """
 
     def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -222,7 +222,7 @@ def test_many_steps_equal_those_of_gymnasium(task: str) -> None:
 
 
 def evaluation(info: Mapping[str, Any]) -> float | None:
-    """Return the expected evaluation according to Gymnasium's info, or None."""
+    """Return the value in Gymnasium's info that ``Env.eval`` must equal, or None if there is no such value."""
     if "reward_dist" in info:
         return -info["reward_dist"]
     if "reward_linup" in info:

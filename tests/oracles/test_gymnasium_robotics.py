@@ -81,7 +81,7 @@ class Pair:
         self._simulate, self.theirs.do_simulation = self.theirs.do_simulation, self._with_our_controls
 
     def _with_our_controls(self, ctrl: np.ndarray, frames: int) -> None:
-        # use our float32 controls, because rounding errors would grow over many steps
+        # both simulations get equal float32 controls, because rounding differences would grow over many steps
         ours = self.ours.state_space.split(self.ours.get_state())["ctrl"][0].numpy()
         np.testing.assert_allclose(ours, ctrl, atol=2e-7)
         self._simulate(ours, frames)
@@ -235,7 +235,7 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_unchanged_gymnasium_robotics_agrees_until_contacts_differ(make_pair: MakePair, task: str) -> None:
+def test_task_agrees_with_the_unchanged_original_until_contacts_differ(make_pair: MakePair, task: str) -> None:
     pair = make_pair(registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))

@@ -78,9 +78,7 @@ def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: Shared
     assert landings > 20
 
 
-def test_peak_heights_of_feet_are_cleared_only_at_landings(
-    shared_env: SharedEnv,
-) -> None:
+def test_peak_height_of_a_foot_becomes_zero_only_at_a_landing(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
     landings, before = 0, State(env)
     for action in random_steps(env, 30):

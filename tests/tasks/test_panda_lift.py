@@ -75,7 +75,7 @@ def test_a_scripted_grasp_lifts_the_cube_in_every_world(shared_env: SharedEnv, p
 @pytest.mark.parametrize(
     ("task", "effort", "height", "rest"), [("panda_lift", 0.01, 11, 0.02), ("aloha_lift", 0.005, 18, 0.0658)]
 )
-def test_reward_is_a_weighted_sum_of_terms_between_0_and_1(
+def test_reward_terms_lie_between_0_and_1_and_their_weighted_sum_is_the_reward(
     shared_env: SharedEnv, task: str, effort: float, height: int, rest: float
 ) -> None:
     env = shared_env(task, nworld=16)

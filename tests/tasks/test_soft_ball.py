@@ -45,7 +45,7 @@ def test_gripper_squeezes_the_ball_and_lifts_it_to_the_target(shared_env: Shared
     assert env.eval.item() < 0.03 and env.metrics["near"] > 0.9 and env.metrics["lifted"] > 0.9
 
 
-def test_observation_and_reward_equal_formulas_of_the_ball_vertices(shared_env: SharedEnv) -> None:
+def test_observation_and_reward_agree_with_formulas_in_terms_of_vertices(shared_env: SharedEnv) -> None:
     env = shared_env("soft_ball", nworld=8, autoreset=False)
     rng = np.random.default_rng(0)
     for _ in range(30):
@@ -96,7 +96,7 @@ def test_random_resets_place_ball_and_target(shared_env: SharedEnv) -> None:
 
 
 def test_constraint_buffers_of_a_flex_model_hold_bursts_of_contacts(shared_env: SharedEnv) -> None:
-    """When fingers press into the ball, it has twice as many constraints as in the probed states."""
+    """Fingers that press into the ball cause twice as many constraints as the probe for buffer sizes measures."""
     model = shared_env("soft_ball").model
     assert probe_sizes(model) >= (256, 512)
     env = shared_env("soft_ball", engine="warp", nworld=4, autoreset=False)

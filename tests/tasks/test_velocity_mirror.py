@@ -26,10 +26,10 @@ def bound(task: str) -> BoundTask:
 
 
 def symmetric(model: mujoco.MjModel, mirror: lw.Mirror) -> mujoco.MjModel:
-    """Average masses, gains and ranges with their mirror images.
+    """Return a symmetric model: each mass, gain and range is the mean of its left and right value.
 
-    Published models are not symmetric. Centres of mass differ by up to 6 mm, and both hips of the G1 have the range of
-    the left hip.
+    Published models are not symmetric. Left and right centres of mass differ by up to 6 mm, and both hips of the G1
+    have the range of the left hip.
     """
     model, data = copy.copy(model), mujoco.MjData(model)
     data.qpos[:] = 0.0

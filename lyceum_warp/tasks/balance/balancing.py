@@ -3,8 +3,8 @@
 Balance is measured by the distance of the capture point from the line between the feet. A foot at the capture point
 would stop the robot (Pratt et al. 2006, "Capture point: a step toward humanoid push recovery").
 
-At each of ``push_times``, a horizontal impulse in a random direction changes all velocities by impulse / mass. Planners
-do not foresee pushes.
+At each of ``push_times``, an impulse pushes the robot in a random horizontal direction. It changes the velocity of the
+whole robot by impulse / mass. Planners do not foresee pushes.
 """
 
 import mujoco

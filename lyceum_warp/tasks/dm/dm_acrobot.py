@@ -36,11 +36,11 @@ def lift(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the matrix P of the effort x^T P x (in s) that balances a state x = (qpos, qvel) near upright.
+    """Return the matrix P of the least effort x^T P x (in s) that balances a state x = (qpos, qvel) near upright.
 
-    The effort is the smallest integral of the squared action that brings the arms to rest upright. The linearized
-    dynamics are dx/dt = A x + B u, with unstable modes z_i = w_i^T x, A^T w_i = r_i w_i and b_i = w_i^T B. The effort
-    is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
+    The effort is the integral of the squared action. The best actions bring the arms to rest upright with the least
+    effort, x^T P x. The linearized dynamics are dx/dt = A x + B u, with unstable modes z_i = w_i^T x, A^T w_i = r_i w_i
+    and b_i = w_i^T B. The effort is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
     """
     (a, b, c), (e1, e2) = p.inertia, p.lift
     mobility = np.linalg.inv([[a + 2.0 * c, b + c], [b + c, b]])
@@ -116,7 +116,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class AcrobotSwingup(lw.Task):
     model, frame_skip = suite.model("acrobot"), 1
     obs = {"orientations": 4, "velocity": 2}
-    # the motor is too weak to lift the arms at once, so the planner is rewarded for their energy
+    # the motor is too weak to lift the arms in one swing, so the planner gets a reward for the arms' energy
     planning = lw.Planning(
         settings={"horizon": 25, "samples": 24, "noise": 2.0, "temperature": 0.2},
         options={"timestep": 0.04, "integrator": "rk4"},

@@ -57,8 +57,8 @@ class BallInCupCatch(lw.Task):
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Add a sensor that counts contacts, so that ``reject`` can refuse initial states with contacts.
 
-        Also add a keyframe with the ball in the cup. Simulations from all keyframes size MuJoCo Warp's buffers. Without
-        this keyframe, they find too few constraints.
+        Also add a keyframe with the ball in the cup. MuJoCo Warp's buffers get their sizes from simulations that start
+        at each keyframe. Without this keyframe, the buffers would be too small.
         """
         suite.count_contacts(spec)
         spec.add_key(name="caught", qpos=[0.0, 0.0, 0.0, 0.333])

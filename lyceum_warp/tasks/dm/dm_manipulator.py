@@ -118,8 +118,8 @@ class ManipulatorBringBall(lw.Task):
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Add a sensor for contacts (see ``reject``), give each world its own target, and remove unused objects.
 
-        Also add a keyframe with the ball in the hand. Simulations from all keyframes size MuJoCo Warp's buffers.
-        Without this keyframe, they find too few constraints.
+        Also add a keyframe with the ball in the hand. MuJoCo Warp's buffers get their sizes from simulations that start
+        at each keyframe. Without this keyframe, the buffers would be too small.
         """
         suite.count_contacts(spec)
         for name in ("peg", "target_peg", "cup", "slot"):

@@ -32,7 +32,7 @@ def count_contacts(spec: mujoco.MjSpec) -> None:
 
 
 def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the indices in ``qpos`` of hinges and of joints with limits, which start at random positions."""
+    """Return the ``qpos`` indices of the joints that start at random positions: hinges, and joints with limits."""
     drawn = model.jnt_limited.astype(bool) | (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE)
     return model.jnt_qposadr[drawn]
 

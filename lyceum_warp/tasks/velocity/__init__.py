@@ -1,4 +1,4 @@
-"""Walk at a commanded velocity, with one robot in each module."""
+"""Make legged robots walk at a commanded velocity."""
 
 TASKS = {
     "go1_velocity": "go1",

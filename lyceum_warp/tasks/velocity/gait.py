@@ -1,10 +1,11 @@
 """Make robots with two legs step in time with a gait clock.
 
 The clock says when each foot should stand and when it should swing. It is part of both observation groups, and the
-reward depends on how well the feet follow it. Its frequency is ``gait_frequency``. Each foot stands for the first
-``stance_share`` of its cycle and swings for the rest. The feet are half a cycle apart. Without the clock, policies make
-5 to 7 short steps a second with each foot. A cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1. Two costs of fast
-motion grow with the number of steps. With the full costs from the start, a robot learns to stand still.
+reward depends on how well the feet follow it. Its frequency is ``gait_frequency``. In each cycle, a foot should first
+be on the ground, for the fraction ``stance_share``, and then in the air. The feet are half a cycle apart. Without the
+clock, policies make 5 to 7 short steps a second with each foot. A cycle lasts 0.8 s, as in unitree_rl_gym and nanoG1.
+Two costs of fast motion grow with the number of steps. With the full costs from the start, a robot learns to stand
+still.
 """
 
 import warp as wp

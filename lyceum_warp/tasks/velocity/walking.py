@@ -4,11 +4,11 @@ Actions are offsets of the joints' servo targets from the default pose. Each rob
 joints and the feet, and sets parameters. Observations, rewards, commands, pushes and resets are taken from mjlab
 1.6.0's velocity tasks.
 
-The base is the body of the model's first joint, a free joint. Functions read the state after the last substep. Only the
-forces on the feet are older, because MuJoCo computes them at the start of a substep. They are 0 at the start of an
-episode. Positions and velocities of the feet are computed from the joints, which saves a forward pass. A foot is in
-contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on the shape of
-the ground.
+The base is the body of the model's first joint, a free joint. Functions read the state after the last substep. The
+forces on the feet are an exception: MuJoCo computes them at the start of that substep. At the start of an episode,
+these forces are 0. Positions and velocities of the feet are computed from the joints, which saves a forward pass. A
+foot is in contact if a sphere of its sole (``soles``) reaches the ground. Only ``ground`` and ``distance`` depend on
+the shape of the ground.
 """
 
 import math
@@ -422,7 +422,7 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs that follows velocity commands. Rewards favour steps and a calm trunk."""
+    """A robot with two legs that follows velocity commands. Two terms reward standing on one leg and a calm trunk."""
 
     frame_skip, keyframe = 5, "home"
     training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)
