@@ -223,5 +223,5 @@ def test_make_raises_an_error_for_writes_beyond_shared_memory(name: str, row: st
 
 def test_task_that_defines_share_without_tally_raises_an_error(tmp_path: Path) -> None:
     file = write(tmp_path, with_function("def share(shared: World, sums: World, p: Params):\n    pass"))
-    with pytest.raises(ValueError, match="can share memory only if World has a field shared: Shared, and the task"):
+    with pytest.raises(ValueError, match="lacks a part of shared memory: it needs the structs Shared and Sums"):
         lw.make(str(file))

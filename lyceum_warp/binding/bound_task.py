@@ -113,7 +113,10 @@ def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts
             )
         found[group] = parts.layout(struct, "obs", params, struct.key)
         if others := [name for name in struct.vars if name not in found[group]]:
-            raise ValueError(f"{struct.key}.{others[0]} of the task {source.name!r} needs a size, as lw.part(3)")
+            raise ValueError(
+                f"{struct.key}.{others[0]} of the task {source.name!r} has no size: for three numbers, write "
+                f"{others[0]}: Row[float] = lw.part(3)"
+            )
         if not found[group]:
             raise ValueError(
                 f"the struct {struct.key} of the task {source.name!r} has no parts, such as x: Row[float] = lw.part()"
@@ -266,8 +269,8 @@ class BoundTask:
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
-                f"the task {self.name!r} reads {stale[0]!r}, which MuJoCo computes from {drawn_constants[0]!r}, a "
-                "field that differs between worlds: read the fields from which it is computed instead"
+                f"the task {self.name!r} reads {stale[0]!r}, but its value stays the same when a world changes "
+                f"{drawn_constants[0]!r}: read the fields from which MuJoCo computes {stale[0]}"
             )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
@@ -288,8 +291,8 @@ class BoundTask:
         for name in self.source.memory:
             if is_data_field(name) or is_model_field(name) or name in OWN_PARTS:
                 raise ValueError(
-                    f"World.{name} of the task {self.name!r} is memory, but {name} is already the name of a field or "
-                    "of a part of the state: rename it"
+                    f"the memory World.{name} of the task {self.name!r} has the name of an existing field or part of "
+                    "the state: rename it"
                 )
         whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
         whole_number(f"settle of the task {self.name!r}", task.settle, low=0)

@@ -92,7 +92,8 @@ _MEMORY_CHECKS = {
         "    if not restored_row(before.lasting_memory[w], after.lasting_memory[w], lane, lanes):\n"
         "        finite = False",
 }  # fmt: skip
-"""Warp source that detects non-finite memory, and restores lasting memory to its value before the step."""
+"""Warp source that checks each kind of memory for non-finite numbers. In ``lasting_memory``, it also replaces these
+numbers by the numbers before the step."""
 
 _kernels: dict[Any, steps.Kernels] = {}
 _MAKING = threading.RLock()

@@ -136,8 +136,8 @@ class TaskSource:
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
             raise ValueError(
-                f"{old[0]} of the task {self.name!r} is a row without named parts: replace it by parts in World, as "
-                f"air_time: Row[float] = lw.{old[0]}(4), and use them as s.air_time[0]"
+                f"{old[0]} of the task {self.name!r} is a row without named parts: declare each part in World, for "
+                f"example air_time: Row[float] = lw.{old[0]}(4)"
             )
         if wrong := [name for name, part in parts.items() if part.kind not in MEMORIES]:
             raise ValueError(
@@ -153,8 +153,8 @@ class TaskSource:
                    if isinstance(function, wp.Function) and len(function.input_types) > 1]  # fmt: skip
         if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
             raise ValueError(
-                f"the worlds of the task {self.name!r} can share memory only if World has a field shared: Shared, and "
-                f"the task has the structs Shared and Sums and two functions: {FUNCTIONS['tally'].signature}; and "
+                f"the task {self.name!r} lacks a part of shared memory: it needs the structs Shared and Sums, a field "
+                f"World.shared of the type Shared, and the functions {FUNCTIONS['tally'].signature} and "
                 f"{FUNCTIONS['share'].signature}"
             )
         return field.type, structs[0]
@@ -200,9 +200,9 @@ class TaskSource:
             for own_name, own in (("World", self.world), ("Params", self.params)):
                 if kind is not own and kind.key.rpartition(".")[2] == own_name:
                     raise ValueError(
-                        f"{name} of the task {self.name!r} takes the {own_name} of {_origin(kind)}, but the task has "
-                        f"the {own_name} of {_origin(own)}: import both structs from one module, extend the first by "
-                        f"@wp.struct class {own_name}(module.{own_name}), or rewrite {name} for the task's own structs"
+                        f"{name} of the task {self.name!r} takes {own_name} from {_origin(kind)}, but the task uses "
+                        f"{own_name} from {_origin(own)}: import World and Params from the same file, derive the "
+                        f"task's struct from the other (class {own_name}(module.{own_name})), or rewrite {name}"
                     )
 
     def _kind(self, argument: Any) -> str:

@@ -13,7 +13,7 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 """The modification time and the size of each file."""
 
 _taken: dict[str, Stamps] = {}
-"""The stamps of the modules that task files have imported from their folders, by module name."""
+"""Maps each imported local module to the modification time and size that its file had when it was imported."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:

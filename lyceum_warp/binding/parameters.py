@@ -249,7 +249,7 @@ class Parameters:
 
 
 def _element_field(default: Any) -> str | None:
-    """Return the field of the elements in a default, such as "site_xpos" for a list of sites."""
+    """If a default names elements of the model, return their field, such as "site_xpos" for sites."""
     while isinstance(default, list | tuple) and default:
         default = default[0]
     return default.field if isinstance(default, Element) else None

@@ -32,7 +32,7 @@ Layout = dict[str, Slice]
 
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
-    """Return the parts that a struct declares, by field name. Error messages call the struct ``owner``."""
+    """Return the parts that a struct declares, by field name. ``owner`` is the struct's name in error messages."""
     found = {name: getattr(struct.cls, name, None) for name in struct.vars}
     parts = {name: part for name, part in found.items() if isinstance(part, Part)}
     for name in parts:

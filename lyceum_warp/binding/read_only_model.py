@@ -16,7 +16,7 @@ def _refuse(self: Any, name: str, value: Any) -> None:
 
 
 class _Part:
-    """A part of a model that refuses edits, such as ``model.opt`` or ``model.body("torso")``."""
+    """A read-only part of a model, such as ``model.opt`` or ``model.body("torso")``."""
 
     def __init__(self, part: Any) -> None:
         object.__setattr__(self, "_part", part)

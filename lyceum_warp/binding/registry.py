@@ -25,7 +25,7 @@ from lyceum_warp.task import Task
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""Maps the module of each task file to the stamps that the file and its local modules had when the file last ran."""
+"""Maps the module of each task file to the times and sizes that its source files had when they were loaded."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""
@@ -75,7 +75,8 @@ def package_task_names() -> list[str]:
 def _package_modules() -> dict[str, str]:
     """Find the modules of the package's tasks without importing them.
 
-    A single module contains the task of the same name. A folder lists its tasks and their modules in ``TASKS``.
+    A module directly in ``lyceum_warp.tasks`` has the name of its only task. A folder lists its tasks and their
+    modules in ``TASKS``.
     """
     found: dict[str, str] = {}
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
@@ -192,7 +193,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
     sys.modules[name] = module
     try:
         code = compile(source, file, "exec")  # cached bytecode with the same time stamp may be stale
-        # Warp reads the source of functions from linecache, which must not show later changes of the file
+        # Warp reads the source of functions from linecache: store the text that runs, because the file may change
         text = importlib.util.decode_source(source)
         linecache.cache[file] = (len(text), None, list(io.StringIO(text)), file)
         exec(code, vars(module))

@@ -99,7 +99,7 @@ def is_row(kind: Any) -> bool:
 
 
 def name_of(function: wp.Function) -> str:
-    """Return a function's name in its source."""
+    """Return a function's Python name, or Warp's name if the function is native."""
     return function.func.__name__ if function.func is not None else function.key
 
 
@@ -121,7 +121,7 @@ def _scope(function: Any) -> dict[str, Any]:
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         try:
             scope[name] = cell.cell_contents
-        except ValueError:  # a variable of the enclosing function may not be assigned yet
+        except ValueError:  # the enclosing function has not assigned this variable yet
             scope.pop(name, None)
     return scope
 
@@ -141,6 +141,6 @@ def free_module_name(name: str) -> str:
 
 
 def run_source(text: str, file: str, scope: dict[str, Any]) -> None:
-    """Run generated source in a scope, and add it to linecache, from which Warp reads the source of functions."""
+    """Run generated source in a scope. Store the source in linecache, because Warp reads it from there."""
     linecache.cache[file] = (len(text), None, text.splitlines(keepends=True), file)
     exec(compile(text, file, "exec"), scope)

@@ -16,10 +16,10 @@ from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, ru
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
-"""The arguments of reward terms and metrics, with their names in the generated text."""
+"""Maps each possible argument of a reward term or metric to a variable of the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""The arguments of terminations, with their names in the generated text."""
+"""Maps each possible argument of a termination to a variable of the generated text."""
 
 _OWN = ("weights", "metrics", "total")
 """Names that terms cannot have, because the generated text uses them."""
@@ -80,7 +80,9 @@ class Terms:
                 raise ValueError(f"the weight of {term!r} of the task {self._name!r} must be a number, not {weight!r}")
         self._names("rewards", tuple(rewards))
         if rewards and "dt" not in self._params.vars:
-            raise ValueError(f"rewards of the task {self._name!r} are per second: add dt: float to its Params")
+            raise ValueError(
+                f"rewards of the task {self._name!r} are multiplied by the time step: add dt: float to its Params"
+            )
         if taken := [term for term in rewards if term in self._params.vars]:
             raise ValueError(
                 f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params would not know "

@@ -17,10 +17,12 @@ from lyceum_warp.task import Task
 
 
 class Variant:
-    """Copies of a family's functions that use one task's structs and functions.
+    """Copies of the functions of a task and its parents.
+
+    In the copies, the task's structs and functions replace those of the parents.
 
     Args:
-        modules: The modules of the family. The task's module comes first.
+        modules: The modules of the task and its parents. The task's module comes first.
         functions: The functions with Python source in these modules.
         structs: The replacements of structs.
         replaced: The replacements of functions.
@@ -47,8 +49,8 @@ class Variant:
     def seen(self, value: Any, viewer: str = "") -> Any:
         """Return the replacement of a function, a struct or a module of the family.
 
-        ``viewer`` is the name of the module that uses the value. The module that defines a replacement still gets the
-        original, so that the replacement can call it.
+        ``viewer`` is the name of the module whose code refers to ``value``. The module that defines a replacement still
+        gets the original, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
             while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
@@ -89,7 +91,8 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels. ``own`` is the Params struct
-    that the task declares. If this struct changes only defaults, ``params`` is the struct of the base task instead.
+    that the task declares, and ``params`` is the Params struct that its functions take. The two structs differ only if
+    the task changes nothing but defaults: ``params`` is then the struct of the base task.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]

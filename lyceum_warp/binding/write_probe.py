@@ -163,7 +163,7 @@ class Probe:
     def _check_fields(self, function: str) -> None:
         for name in sorted(self._writes.get(function, ())):
             rows, parts = self._fields[name], self._memory.get(name)
-            if parts:  # check_task finds writes to a wrong element within a row
+            if parts:  # this finds only writes outside of the row; check_task also finds writes to a wrong part
                 self._check_memory(function, rows, parts)
             else:
                 self._check(function, rows, name, f"the model has {rows.size}")

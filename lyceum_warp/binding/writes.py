@@ -35,7 +35,7 @@ class Write:
     replaced: bool = False
     """Whether the write assigns the field itself, as ``s.time = 0.0`` does. Other writes change an element of a row."""
     use: str | None = None
-    """The expression that may write the row, if it cannot be analysed."""
+    """An expression that may write the row, such as a call of a native function. None if the write is certain."""
 
 
 @functools.cache
@@ -52,7 +52,7 @@ def find_writes(function: wp.Function) -> tuple[Write, ...]:
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
-    """Return the fields of struct arguments that a function writes or may write."""
+    """Return the names of the struct fields that a function writes, or may write."""
     return frozenset(write.field for write in find_writes(function) if write.field is not None)
 
 
@@ -134,7 +134,7 @@ class _Reader:
     Args:
         places: The values that the caller passes, one for each argument. A value that cannot be written is None.
         arguments: Names of the arguments of the analysed function.
-        seen: Pairs of a function and its ``places`` that were already read.
+        seen: The calls that were already analysed, each as a function and its ``places``.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class _Reader:
                 self._read(statement)
 
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
-        """Record a write. If ``follows`` is False, record a use of a row that may write it."""
+        """Record a write. ``follows=False`` marks a use of the row that cannot be analysed, and may be a write."""
         use = None if follows else ast.unparse(node).splitlines()[0]
         target = ".".join(filter(None, (self.arguments[place.position], place.field)))
         where = self.source.place(node)

@@ -60,7 +60,7 @@ def candidates(env: Env) -> list[Setting]:
 
 
 def not_tried(env: Env) -> list[str]:
-    """List the settings that are not tried on the environment's engine, with reasons."""
+    """List the settings that the search omits on the environment's engine, each with the reason."""
     found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
     if env.engine.name == "warp":
         if env.task.model.nv > _DENSE_LIMIT:

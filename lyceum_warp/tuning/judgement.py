@@ -23,7 +23,7 @@ _LEAST_SAVING = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Difference of returns from the unchanged task, relative to its mean absolute return."""
+    """Change in return due to a setting, relative to the unchanged task's mean absolute return."""
 
     mean: float
     low: float

@@ -19,7 +19,7 @@ _MOVING_STEPS = (30, 120)
 _FALLING_STEPS, _LYING_STEPS = 200, 10
 _REPLAN_EVERY = 6
 _IMPROVEMENTS = 2
-"""Number of times that a plan is improved before the compared samples are drawn around it."""
+"""How often the planner updates a plan. The compared samples are then drawn around the updated plan."""
 
 
 class Rankings:
@@ -32,14 +32,14 @@ class Rankings:
     - standing: after a random reset;
     - moving: after steps under a planner that uses the plant's physics and replans every 6 steps. The number of steps
       is spread evenly from 30 to 120, because grasps happen late in an episode;
-    - fallen: after random actions until the end of the episode (at most 200 steps), and 10 more steps.
+    - fallen: after random actions. They continue for 10 steps after all episodes have ended, or for 210 steps.
     """
 
     def __init__(
         self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
     ) -> None:
         self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
-        # with several improvements, each planner's samples would fit its own physics
+        # with several iterations, each planner would adapt its samples to its own physics
         self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
@@ -76,7 +76,7 @@ class Rankings:
         return found
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the plans, and the returns (states, samples) of samples around them."""
+        """Return a plan for each state, and the returns of the samples around each plan, (states, samples)."""
         self.exact.reset(self.seed)
         for _ in range(_IMPROVEMENTS):
             self.exact(start, shift=0)
@@ -120,7 +120,10 @@ class Rankings:
 
 
 def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
-    """Compute Spearman's rank correlation of each row of two (rows, n) arrays. Rows of equal numbers are left out."""
+    """Compute Spearman's rank correlation of two arrays, (rows, n), row by row.
+
+    A row is left out if all of its numbers in ``first`` are equal.
+    """
     a, b = (_ranks(values.double()) for values in (first, second))
     a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
     spread = a.square().sum(1) * b.square().sum(1)

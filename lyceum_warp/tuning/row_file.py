@@ -16,7 +16,7 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
-    """Collect everything that affects results, except the setting: task, machine, worlds and versions."""
+    """Describe the conditions of a search: task, machine, worlds and versions."""
     kept, _ = task_copy(env)
     params = {name: json_value(name, value) for name, value in env.given_params.items()}
     task = {"task": kept, "params": params, "physics": env.options.physics.given(), "horizon": env.horizon}
@@ -29,7 +29,10 @@ def identity(env: Env, **more: Any) -> dict[str, Any]:
 
 
 class RowFile:
-    """Stores one row of results per setting in a file, and uses only rows with the given identity."""
+    """Stores one row of results per setting in a file.
+
+    Rows with another ``identity`` stay in the file, but are ignored.
+    """
 
     def __init__(self, path: Path, identity: Mapping[str, Any]) -> None:
         self.path, self.identity = path, json.loads(json.dumps(identity))

@@ -36,10 +36,10 @@ class Tuning:
     rows: list[Row]
     """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
     "same" if the interval of the returns lies within the tolerance. It is "different" if the interval lies outside, and
-    "not shown" otherwise. The verdict is "faults" if there are more than twice as many faults as in the unchanged task.
-    The verdict is "no gain", without a comparison of returns, if the setting is less than 3 % faster and saves no
-    memory. The verdict is "refused" if MuJoCo or the engine refuses the setting, for the reason in the entry
-    ``refused``. A planner's setting may also get the verdict "ranks badly"."""
+    "not shown" if it lies partly outside. The verdict is "faults" if there are more than twice as many faults as in the
+    unchanged task. The verdict is "no gain", without a comparison of returns, if the setting is less than 3 % faster
+    and saves no memory. The verdict is "refused" if MuJoCo or the engine raises an error for the setting. The entry
+    ``refused`` then contains the error. A planner's setting may also get the verdict "ranks badly"."""
     reference: Row
     """Results of a comparison of the unchanged task with itself."""
     not_tried: list[str]
@@ -49,7 +49,7 @@ class Tuning:
 
     @property
     def best(self) -> Row | None:
-        """Return the fastest setting with the same returns, or None."""
+        """Return the fastest setting whose verdict is "same", or None."""
         return next((row for row in self.rows if row["verdict"] == "same"), None)
 
     @property
@@ -59,7 +59,7 @@ class Tuning:
 
     @property
     def task_line(self) -> str:
-        """Write the best setting as a task's line for ``physics="fast"``, or "" if there is none."""
+        """Write the best setting as the class attribute ``physics`` of a task, or "" if there is none."""
         return task_line(self.best["physics"]) if self.best else ""
 
 
@@ -80,9 +80,9 @@ def tune(
     """Find the fastest physics options that do not change a task's returns.
 
     Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults,
-    divergence and returns. Returns are compared over the same episodes, under random actions and under a policy.
-    Settings are first tried alone. Then the best settings of all groups are combined. While the combination changes the
-    returns, its least useful setting is removed.
+    divergence and returns. Returns are compared on pairs of episodes with the same initial states and random numbers.
+    Settings are first tried alone. Then the best settings of all groups are combined. If the combination changes the
+    returns, the setting with the smallest speed-up is removed, and the rest is tried again.
 
     Args:
         task: A task's name, file or class.
@@ -94,10 +94,11 @@ def tune(
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
         episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, there
             are enough for a narrow interval, but they take at most a minute (5 s with ``short``).
-        planning: Whether to find physics options for the worlds of the task's planner. The search then compares
-            planning times, and the rankings of the same samples from standing, moving and fallen states. It suggests a
-            setting if the interval of the mean rank correlation lies above 0.9 ("strict") or 0.8 ("loose"). ``nworld``
-            is then the number of samples, by default 64, and ``episodes`` is the number of states of each kind.
+        planning: Whether to find physics options for the task's planner instead of the plant. The search then compares
+            planning times. It also compares how the planners rank the same samples. The samples start from standing,
+            moving and fallen states. The search suggests a setting if the interval of the mean rank correlation lies
+            above 0.9 ("strict") or 0.8 ("loose"). ``nworld`` is then the number of samples, by default 64, and
+            ``episodes`` is the number of states of each kind.
         out: File of the results. Rows are appended, and settings with a row are not measured again. By default
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.

@@ -19,7 +19,8 @@ from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, differenc
 
 DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
-"""Standard deviation of a perturbation of positions and velocities, which shows how chaotic the task is."""
+"""Standard deviation of a perturbation of positions and velocities. The growth of this perturbation shows how chaotic
+the task is."""
 _HALF_WIDTH = TOLERANCES["strict"] / 2
 """Target half-width of the difference's confidence interval. It determines the number of episodes."""
 _CONTACT_STATES = 64
@@ -108,7 +109,7 @@ class Trials:
         return torch.where(policy_worlds, self.policy(self.reference.obs), random)
 
     def _share_in_contact(self) -> float:
-        """Estimate the fraction of recorded states with contacts, on the CPU."""
+        """Estimate the fraction of recorded states that have contacts."""
         model, size = self.reference.task.model, self.reference.engine.integration_size
         data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
         states = torch.cat(self._starts)[:, :size].cpu().numpy()
@@ -145,10 +146,11 @@ class Trials:
         return row
 
     def _speed(self, env: Env) -> tuple[float, float, float]:
-        """Measure steps per second of all worlds, and the speed-up's median and lower bound.
+        """Measure steps per second, summed over the worlds, and the speed-up over the unchanged task.
 
-        The lower bound is the smaller of two numbers: the blocks' lower quartile, and the speed-up between the fastest
-        blocks. It allows for other processes that slow down blocks.
+        The speed-up is returned as a median over blocks and as a lower bound. The lower bound is the smaller of two
+        numbers: the blocks' lower quartile, and the speed-up between the fastest blocks. It is cautious, because other
+        processes may slow down single blocks.
         """
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
@@ -169,7 +171,7 @@ class Trials:
         return time.perf_counter() - start
 
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Record velocities after the k-th states, (times, nworld, nv) float64. They are NaN after a fault."""
+        """Record the velocities 1, 10 and 50 steps after ``_starts[k]``, (3, nworld, nv) float64; NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
         found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):
@@ -180,7 +182,10 @@ class Trials:
         return torch.stack(found)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Compute the median distance to the unchanged task's velocities after 1, 10 and 50 steps (RMS)."""
+        """Compare velocities with those of the unchanged task after 1, 10 and 50 steps.
+
+        A state's distance is the root mean square over its relative differences. The result is the median over states.
+        """
         exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
@@ -213,7 +218,7 @@ class Trials:
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
         """Run one episode per world, and get the episodes' returns (nworld,), the faults and the steps.
 
-        Equal batches have equal initial states, random streams and random actions.
+        The batch number determines the initial states, the random streams and the random actions.
         """
         seed = self.seed + 1 + batch
         self.reference.rand_reset(seed)
@@ -235,7 +240,7 @@ class Trials:
 
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
-    """Yield uniform random actions, (nworld, nact). Actions without bounds are between -1 and 1."""
+    """Yield uniform random actions, (nworld, nact). Infinite bounds are replaced by -1 and 1."""
     device, low, high = env.obs.device, env.action_space.low, env.action_space.high
     assert low is not None and high is not None
     generator = torch.Generator(device).manual_seed(seed)

@@ -28,7 +28,7 @@ def test_function_with_the_documented_signature_is_found(name: str, tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", MEANT)
-def test_error_of_a_function_with_wrong_arguments_shows_the_signature(name: str, tmp_path: Path) -> None:
+def test_function_with_wrong_arguments_raises_an_error_with_the_signature(name: str, tmp_path: Path) -> None:
     text = tiny_task.TINY if name == "observe" else tiny_task.with_function(MEANT[name])
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
@@ -76,7 +76,7 @@ USERS = {
 
 
 @pytest.mark.parametrize("user", USERS)
-def test_observe_function_of_a_missing_group_raises_an_error_unless_it_is_called(user: str, tmp_path: Path) -> None:
+def test_unused_observe_function_without_a_group_raises_an_error(user: str, tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
     task = find_task(f"{file}:Tiny")
     source = TaskSource(task, task_name(task))

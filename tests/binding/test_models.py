@@ -180,7 +180,7 @@ CORNERS = "".join(f"v {x} {y} {z}\n" for x in (-0.1, 0.1) for y in (-0.1, 0.1) f
 
 
 @pytest.mark.parametrize("as_spec", [False, True])
-def test_model_with_a_relative_path_and_its_meshes_are_found_from_another_folder(
+def test_relative_model_path_still_works_after_a_change_of_folder(
     as_spec: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "elsewhere").mkdir()

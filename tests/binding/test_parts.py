@@ -118,7 +118,7 @@ PART = "x: Row[float] = lw.part()"
 MISTAKES = {
     "a part without a size": (
         [STRUCT, (f"@wp.func\n{OBSERVE}", struct_of("x: Row[float]"))],
-        r"Policy\.x of the task 'tiny' needs a size, as lw\.part\(3\)",
+        r"Policy\.x of the task 'tiny' has no size: for three numbers, write x: Row\[float\] = lw\.part\(3\)",
     ),
     "a part that is a number": (
         [STRUCT, (f"@wp.func\n{OBSERVE}", struct_of("x: float = lw.part()"))],

@@ -141,8 +141,8 @@ MISTAKES = {
     "structs that do not extend": (
         [("class World(parent.World):\n    qvel", "class World:\n    qpos: wp.array[float]\n    qvel"),
          ("\ntripled.replaces = parent.scaled\n", "")],
-        r"takes the World of .*parent\.py, but the task has the World of .*child\.py: .*"
-        r"extend the first by @wp\.struct class World\(module\.World\)",
+        r"takes World from .*parent\.py, but the task uses World from .*child\.py: .*"
+        r"derive the task's struct from the other \(class World\(module\.World\)\)",
     ),
 }  # fmt: skip
 

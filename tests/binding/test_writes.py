@@ -174,7 +174,7 @@ def uses_rows(s: Uses, p: Params):
     poke(s.by_native)
 
 
-def test_array_whose_uses_cannot_be_traced_counts_as_written() -> None:
+def test_untraceable_use_of_an_array_is_reported_as_a_write() -> None:
     assert {write.field for write in find_writes(uses_rows) if write.use is not None} == {*Uses.vars}
 
 

@@ -360,9 +360,9 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
     ),
     "memory with the name of a field": (
-        [field("qvel: Row[float] = lw.memory()")], r"World\.qvel of the task 'tiny' is memory, but qvel is already",
+        [field("qvel: Row[float] = lw.memory()")], r"memory World\.qvel of the task 'tiny' has the name of an existing",
     ),
-    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], "step is already the name"),
+    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], r"World\.step .* has the name of"),
     "memory of size 0": ([field("level: Row[float] = lw.memory(0)")], r"size of World\.level must be a whole number"),
     "memory with the size of no table": (
         [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table in Params",

@@ -68,12 +68,12 @@ MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
     ),
     "a function of another file": (
         (OWN_WORLD, "from other_rewards import World, reward\n"),
-        r"reward of the task 'tiny' takes the Params of .*other_rewards\.py, but the task has the Params of .*tiny\.py"
-        r": import both structs from one module, extend the first by @wp\.struct class Params\(module\.Params\), or",
+        r"reward of the task 'tiny' takes Params from .*other_rewards\.py, but the task uses Params from .*tiny\.py"
+        r": import World and Params from the same file, derive the task's struct from the other \(class Params\(",
     ),
     "a function of another file with its own structs": (
         ("class Tiny", "from other_rewards import reward\n\nclass Tiny"),
-        r"reward of the task 'tiny' takes the World of .*other_rewards\.py, but the task has the World of .*tiny\.py",
+        r"reward of the task 'tiny' takes World from .*other_rewards\.py, but the task uses World from .*tiny\.py",
     ),
 }  # fmt: skip
 

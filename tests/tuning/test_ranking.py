@@ -9,7 +9,7 @@ from lyceum_warp.tuning.ranking import Rankings, rank_correlations
 FAILED = float("-inf")
 
 
-def test_rank_correlations_are_spearman_correlations_with_mean_ranks_for_ties() -> None:
+def test_rank_correlation_gives_tied_values_their_mean_rank() -> None:
     order = [1.0, 2.0, 3.0, 4.0]
     first = torch.tensor([order, [1.0, 2.0, 2.0, 3.0], [0.0, 1.0, 5.0, FAILED], [7.0] * 4, order])
     second = torch.tensor([[1.0, 3.0, 2.0, 4.0], order, [9.0, 4.0, 1.0, 90.0], order, [2.0] * 4])
@@ -37,7 +37,7 @@ def test_sparse_jacobian_keeps_the_ranks_of_samples_but_coarse_physics_change_th
     assert verdict(crude, "strict") in ("ranks badly", "not shown") and verdict(crude, "any") in ("same", "no gain")
 
 
-def test_step_counts_of_standing_moving_and_fallen_start_states(rankings: Rankings) -> None:
+def test_each_kind_of_start_state_comes_from_its_own_range_of_steps(rankings: Rankings) -> None:
     columns = rankings.reference.state_space.parts["step"]
     steps = {kind: start[:, columns] for kind, start in rankings.starts.items()}
     assert (steps["standing"] == 0).all() and steps["moving"].flatten().tolist() == [30, 75, 120]
