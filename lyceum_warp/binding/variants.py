@@ -91,8 +91,8 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels. ``own`` is the Params struct
-    that the task declares, and ``params`` is the Params struct that its functions take. The two structs differ only if
-    the task changes nothing but defaults: ``params`` is then the struct of the base task.
+    that the task declares, and ``params`` is the Params struct that its functions take. If the task changes only
+    defaults, ``params`` is the struct of the base task. Otherwise, the two are identical.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [list(_values(module, owners)) for module in modules]

@@ -23,7 +23,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
     ("line", "message"),
     [
         ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", r"memory of the task 'tiny'  is a row without .* air_time: Row\[float\] = lw\.memory\(4\)"),
+        ("memory = 1", r"memory of the task 'tiny' is a row without .* air_time: Row\[float\] = lw\.memory\(4\)"),
         ("del model", "the task 'tiny' has no model: add one to its class, such as model = \"robot.xml\""),
         ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': make it a field of World, too"),
         ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': make it a field of World, too"),
