@@ -43,7 +43,7 @@ EVERY_VARIANT = ("MPPI", "CEM", "PredictiveSampling", "knots", "plants", "contro
 MANY_PLANNERS = ("point_mass", "reach", "hopper")
 """Tasks on which every planner is compared. On other tasks, only MPPI is compared."""
 LEARNING = {"mujoco": ("point_mass", "hopper", "go1_velocity"), "warp": ("hopper",)}
-"""Tasks on which learners are compared, by engine."""
+"""For each engine, the tasks on which learners are compared."""
 COMMANDS = {"mujoco": ("hopper",), "warp": ("point_mass",)}
 SHORT = ("point_mass", "reach", "hopper", "go1_velocity")
 """Tasks of a comparison with --short."""
@@ -75,8 +75,8 @@ class Options:
     ignore: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="PATTERN")] = ()
     """Names to ignore, such as '*/metrics.csv/*' or 'plans/hopper/*'; may be repeated."""
     short: bool = False
-    """Compare only four tasks. The parts "plans" and "commands" run only on the C engine. With --short, the comparison
-    takes about three minutes instead of sixteen, with a warm kernel cache on two busy cores."""
+    """Compare only four tasks. The parts "plans" and "commands" run only on the C engine. On two cores, a
+    comparison with --short takes about 3 minutes, and a full one about 16, if all kernels are compiled already."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -151,7 +151,7 @@ def differences(
 
 @contextlib.contextmanager
 def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the folder of a checkout and a description; unpack a git revision into the empty ``folder``."""
+    """Yield a checkout's folder and its description. Unpack a git revision into the empty ``folder`` first."""
     if Path(given, PACKAGE, "__init__.py").is_file():
         yield Path(given).resolve(), str(Path(given).resolve())
         return
@@ -277,7 +277,7 @@ class Report:
         return True
 
     def add(self, name: str, found: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
-        """Add the differences of a unit, and print them."""
+        """Add the differences found in a unit of work, and print them."""
         self.found += found
         self.differing += bool(found)
         self.units += 1

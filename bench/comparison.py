@@ -6,7 +6,7 @@ import math
 import numpy as np
 
 MOST_SPLITS = 20_000
-"""Maximum number of splits of the seeds that a test uses."""
+"""Maximum number of permutations in a permutation test."""
 
 
 def permutation_test(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -44,7 +44,7 @@ GPU_QUERY = {
     "driver": "driver_version", "power_limit": "power.limit", "clock_sm": "clocks.sm", "clock_sm_max": "clocks.max.sm",
     "clock_memory": "clocks.mem", "throttled": "clocks_event_reasons.active",
 }  # fmt: skip
-"""Names in stored results, and the fields of nvidia-smi that they hold."""
+"""Maps each name in the stored results to a field of nvidia-smi."""
 
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
 """Results are compared only if the versions of these packages are equal."""
@@ -79,7 +79,7 @@ class Options:
     repeats: int | None = None
     """Number of repeats of each comparison."""
     seeds: tuple[int, ...] = ()
-    """Seeds, for experiments that use seeds."""
+    """Seeds. Some experiments do not use them."""
     jobs: int = 1
     """Number of cases that run at the same time, each on its own cores. Some experiments allow only one."""
 
@@ -256,7 +256,7 @@ def key(case: Mapping[str, Any]) -> str:
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
-    """Divide each value by that of the contestant ``unit`` in the same repeat."""
+    """Divide each contestant's value by the value of the contestant ``unit`` in the same repeat."""
     values: dict[str, dict[int, float]] = {}
     for row in rows:
         values.setdefault(row.case["contestant"], {})[row.case["repeat"]] = row.result[quantity]
@@ -313,7 +313,7 @@ def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
 
 
 def run(experiment: Experiment, options: Options) -> int:
-    """Measure the cases without a stored result; return the exit code."""
+    """Measure the cases that have no stored result yet, and return the exit code."""
     kind, _, number = options.device.partition(":")
     if kind not in ("cpu", "cuda") or (number and not number.isdigit()):
         raise ValueError(f"there is no device {options.device!r}: give cpu, cuda or cuda:1")
@@ -443,5 +443,5 @@ def guarded(program: Callable[[], int], name: str) -> int:
         print(f"{name}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"\n{name}: stopped; the same command continues", file=sys.stderr)
+        print(f"\n{name}: stopped; repeat the command to continue", file=sys.stderr)
         return 130

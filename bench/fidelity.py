@@ -4,8 +4,8 @@
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
 compared with the Warp engine (float32). Because of chaos, any two trajectories diverge. The C engine is therefore also
-compared with itself under rounding. One copy rounds its state to float32 after every step, and another copy once at the
-start.
+compared with two copies of itself. One copy rounds its state to float32 after every step. The other copy starts from a
+state with added noise of the size of a rounding error.
 
 Two states are compared by their observations without contact forces, relative to max(1, |value|).
 """
@@ -79,7 +79,7 @@ def rounded(env: lw.Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def moved(env: lw.Env, state: torch.Tensor, seed: int) -> torch.Tensor:
-    """Perturb each position and velocity x by at most ``EPSILON`` max(1, |x|)."""
+    """Perturb each position and velocity x by at most ``ROUNDING`` * max(1, |x|)."""
     generator, near = torch.Generator().manual_seed(seed), state.clone()
     for name in ("qpos", "qvel"):
         values = near[:, env.state_space.parts[name]]

@@ -30,7 +30,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
 NEVER = 1e6
-"""Seconds until the next push or command, longer than any episode."""
+"""Seconds until the next push or command. No episode lasts this long, so neither happens."""
 NOISES = ("linear_velocity_noise", "angular_velocity_noise", "gravity_noise", "joint_position_noise",
           "joint_velocity_noise")  # fmt: skip
 STEPS = 1000

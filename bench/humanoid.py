@@ -34,7 +34,7 @@ TASKS = {
 }  # fmt: skip
 """Parameters of the plant, in addition to ``STARTS``."""
 FIRST_SEED = 1000
-"""Seed of the first episode's start, pushes and planner noise."""
+"""Seed of the first episode. It determines the initial state, the pushes and the planner's noise."""
 WALKS, UP = {"humanoid_walk": 0.5, "g1_walk": 0.3}, 1.1
 """Minimum mean speed of a walk, m/s, and minimum height of the humanoid's standing torso, m."""
 CONTESTANTS = {

@@ -46,8 +46,8 @@ class Options(experiment.Options):
     own: bool = False
     """Whether to use each task's suggested horizon and number of samples."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: exact, or a name that the task defines. The default is the physics that the task
-    suggests. If this physics has a name, the exact physics is measured, too."""
+    """Names of the planner's physics: "exact", or a name that the task defines. By default, the exact physics
+    and the physics that the task suggests for planning. If the suggested physics has no name, only this one."""
     seconds: float = 10.0
     """Seconds per case. The 99.9 % quantile needs a thousand plans."""
 

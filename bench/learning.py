@@ -37,7 +37,7 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
 SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
 
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
-"""Episodes per evaluation, episodes in a mean return, and (worlds, steps) of the test of tracking and falls."""
+"""Number of episodes in an evaluation, number of episodes in a mean return, and (worlds, steps) of the walking test."""
 
 
 @dataclasses.dataclass(frozen=True)

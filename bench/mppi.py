@@ -4,9 +4,10 @@
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
 The part ``episodes`` measures success and time of episodes of 75 steps, with the paper's settings. The part ``plans``
-measures the planning time from given states. All planners control the same plant, and take turns in blocks of episodes.
-In the contestants "a set at a time", one planner controls the plants of all episodes in a set. The contestant
-``mppi_fast`` plans with the task's "fast" physics, and its plant has the exact physics.
+plans from given states, and measures the time per plan. All planners control the same plant. Each planner runs a block
+of episodes, and then the next planner runs the same block. In the contestants ``mppi_together`` and
+``mppi_warp_together``, one planner controls the plants of all episodes at once. The contestant ``mppi_fast`` plans with
+the task's "fast" physics, and its plant has the exact physics.
 """
 
 import dataclasses
@@ -76,7 +77,10 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    """List the cases of plans, then those of episodes. Compared contestants are adjacent."""
+    """List the cases of plans, and then the cases of episodes.
+
+    Contestants that are compared with each other run one after another.
+    """
     short, cuda = options.short, options.device.startswith("cuda")
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)
     parts = choose(options.parts, ("plans", "episodes"), what="part")
@@ -163,7 +167,7 @@ def run_episodes(case: Case, options: Options) -> dict[str, Any]:
 def episodes_together(
     case: Case, options: Options, seeds: Sequence[int]
 ) -> tuple[list[bool], list[float], list[float]]:
-    """Run episodes with one planner; return successes, returns, and each episode's share of the time."""
+    """Run all episodes with one planner. Return successes, returns, and the wall-clock seconds per episode."""
     made = planner(case.task, case.contestant, case.threads, options.device, case.count)
     env, one = plant(case.task, case.steps, case.count, case.threads), plant(case.task, case.steps)
     starts = []
@@ -241,7 +245,10 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
-    """Return (seed, success, return, seconds or None) of each episode, sorted by set and seed."""
+    """Sort the episodes by set and seed.
+
+    An episode is (seed, success, return, seconds). The seconds are None if the episode was not timed.
+    """
     sets: dict[int, dict[int, list[Any]]] = {}
     for row in rows:
         sets.setdefault(row.case["repeat"], {}).update({episode[0]: episode for episode in row.result["each"]})

@@ -60,7 +60,7 @@ EVERY_100K = tuple(range(100_000, 1_000_001, 100_000))
 LIMITS = dict.fromkeys(YARDSTICKS, 720.0) | dict.fromkeys(ON_GPU, 30.0)
 
 EVALUATIONS, EPISODES = 20, 16
-"""Number of evaluations after the first, and episodes per evaluation."""
+"""Number of evaluations after the initial one, and number of episodes in each evaluation."""
 
 _TUNED_NETWORK = {"log_std_init": -2.0, "ortho_init": False, "activation_fn": torch.nn.ReLU,
                   "net_arch": {"pi": [256, 256], "vf": [256, 256]}}  # fmt: skip
@@ -91,11 +91,11 @@ class Options(experiment.Options):
     """Learning curves of NPG, PPO and TRPO."""
 
     threads: int | None = 2
-    """Cores per case; stable-baselines3's learners and learners on a GPU use only one."""
+    """Cores per case. Learners of stable-baselines3 use only one core, and so do learners on a GPU."""
     samples: int = 1_000_000
     """Number of samples of a run on the CPU."""
     nworld: int = 64
-    """Number of worlds of both NPGs on the CPU."""
+    """Number of worlds of each contestant that runs NPG on the CPU."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -347,7 +347,10 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def ends(found: dict[str, dict[str, list[Row]]]) -> Table:
-    """Make a table of final returns, and of the times until 90 % of the return of NPG on Gymnasium."""
+    """Make a table of final returns, and of the seconds until a target return.
+
+    The target is 90 % of the final return that NPG reaches on Gymnasium's environments.
+    """
     lines = []
     for task, same in found.items():
         ours = {row.case["seed"]: row for row in same.get("npg", ())}

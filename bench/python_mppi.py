@@ -80,7 +80,7 @@ ENVS: dict[str, Callable[[mujoco.MjModel], Any]] = {
 
 
 def smoothed(noise: np.ndarray, smoothing: tuple[float, float, float]) -> np.ndarray:
-    """Smooth the noise, (samples, horizon, nact), over time and in place, except for the first two steps."""
+    """Smooth the noise, (samples, horizon, nact), over time. Change it in place, but keep the first two steps."""
     for t in range(2, noise.shape[1]):
         noise[:, t] = smoothing[0] * noise[:, t] + smoothing[1] * noise[:, t - 1] + smoothing[2] * noise[:, t - 2]
     return noise

@@ -2,10 +2,10 @@
 
     lyceum-warp bench rank_loss half_cheetah hopper
 
-Each line of results/rank-loss.jsonl holds three returns, and the rank correlations of ``lyceum-warp tune --planning``.
-The loss is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return of a planner with the task's physics,
-R_setting that of a planner with the setting, and R_none the return without a planner. The load of the machine does not
-matter, because episodes do not run in real time.
+The loss of a setting is (R_exact - R_setting) / (R_exact - R_none). R_exact is the return of a planner with the task's
+physics. R_setting is the return of a planner with the setting. R_none is the return without a planner. Each line of
+results/rank-loss.jsonl holds these three returns, and the rank correlations that ``lyceum-warp tune --planning``
+computes. The load of the machine does not matter, because episodes do not run in real time.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ def returns(task: str, study: Study, physics: Any, *, planned: bool = True) -> n
 
 
 def main(tasks: tyro.conf.Positional[tuple[str, ...]]) -> None:
-    """Measure the settings of tasks that are not stored yet.
+    """Measure those settings of the given tasks that have no stored result yet.
 
     Args:
         tasks: Names of tasks.

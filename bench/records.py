@@ -4,9 +4,9 @@
     lyceum-warp bench records --tasks hopper --cache cold
 
 The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
-when the run's config.json says that the target is reached. With a cold cache, the command compiles all kernels. With a
-warm cache, the same command has already run one iteration. A run that lasts longer than --seconds is stopped. The same
-command continues it, and the result is the sum of the seconds.
+when the run's config.json says that the target is reached. With a cold cache, the command compiles all kernels. Before
+a measurement with a warm cache, one iteration of the same command fills the cache. A run that lasts longer than
+--seconds is stopped. The same command continues it, and the result is the sum of the seconds.
 """
 
 import contextlib
@@ -30,9 +30,9 @@ from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
-"""Flags for tasks whose threshold is a mean return of training episodes."""
+"""Command-line flags for tasks whose threshold is a mean return of training episodes."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Flags for tasks whose threshold is the mean policy's return in 16 evaluation episodes."""
+"""Command-line flags for tasks whose threshold is the mean policy's return in 16 evaluation episodes."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
 
@@ -49,7 +49,7 @@ RECORDS: dict[str, tuple[float, dict[str, tuple[str, ...]]]] = {
     "humanoid": (4500.0, {"cuda": (*NPG, "--nworld", "8192", "--samples", "131072")}),
     **{name: (900.0, {"cuda": SUITE}) for name in package_task_names() if name.startswith("dm/")},
 }
-"""Each task's threshold, and its flags of `lyceum-warp train` by device."""
+"""Maps each task to its threshold, and to the flags for `lyceum-warp train` on each device."""
 
 COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
 
@@ -112,7 +112,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     total, starts = earlier[0] + seconds, earlier[1] + 1
     if reached is None:
         notes.write_text(json.dumps([total, starts]))
-        raise Skipped(f"{name} has not reached {case.target:g} after {total:.0f} s: the same command continues it")
+        raise Skipped(f"{name} has not reached {case.target:g} after {total:.0f} s: repeat the command to continue")
     notes.unlink(missing_ok=True)
     rows = [row for row in Run.open(folder).rows() if row["iteration"] <= reached["iteration"]]
     learning = sum(row[part] or 0.0 for row in rows for part in row if part.startswith("time_"))
@@ -143,7 +143,10 @@ def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[
 def timed(
     words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
-    """Run the command to its target, or for ``limit`` seconds; return the entry in config.json and the seconds."""
+    """Run the command until it reaches its target return, or for ``limit`` seconds.
+
+    Return the entry "reached" of config.json, or None after the limit, and the seconds.
+    """
     began, reached = time.perf_counter(), None
     process = run(words, environment)
     config = folder / "config.json"

@@ -60,7 +60,7 @@ TASKS = {
 }  # fmt: skip
 """Worlds, steps per chunk, chunks, and seconds per million steps on two cores, for each task."""
 OTHERS = (256, 10**6, 1, 300.0)
-"""The entry of every other task in ``TASKS``."""
+"""The same four numbers for tasks that are not in ``TASKS``."""
 SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
@@ -121,7 +121,7 @@ class Soak({parent}):
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Very long runs with injected faults, memory checks and kills."""
+    """Very long runs: inject faults, measure memory, and kill training runs."""
 
     parts: tuple[str, ...] = ()
     """Parts: faults, random, memory, kills; by default all."""
@@ -202,7 +202,7 @@ def cases(options: Options) -> list[Any]:
             steps = whole_number("--steps", options.steps or sizes[1], low=nworld * SAMPLES)
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
-            # continue from the last stored state, even from another machine's
+            # continue from the last stored state; another machine may have stored it
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
         for task, sizes, _ in runs if "random" in parts else ():
@@ -335,7 +335,7 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
     gc.collect()  # free the environments of the previous chunk
     before = case.state(options.work, case.chunk)
     if case.chunk and not before.exists():
-        raise Skipped(f"there is no {before}: give the folder in which chunk {case.chunk - 1} ran as --work")
+        raise Skipped(f"there is no {before}: pass --work with the folder that chunk {case.chunk - 1} used")
     try:
         file, low, high = variant(case.task, options.work)
     except (FileNotFoundError, ImportError) as error:

@@ -3,10 +3,10 @@
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda
 
-The part ``sampling`` measures many worlds on all threads, relative to native C (``mujoco.rollout``). ``suite`` measures
-dm_control's tasks with equal numbers of worlds, relative to dm_control. ``single`` measures one world on one thread,
-relative to Gymnasium. ``cores`` runs the part ``sampling`` on 1, 2, 4, ... cores. ``worlds`` measures lyceum_warp with
-1 to 131,072 worlds. ``kept`` compares an environment with its bare engine (kept.py).
+The part ``sampling`` runs many worlds on all threads; the reference is native C (``mujoco.rollout``). ``suite`` runs
+dm_control's tasks with equal numbers of worlds; the reference is dm_control. ``single`` runs one world on one thread;
+the reference is Gymnasium. ``cores`` runs the part ``sampling`` on 1, 2, 4, ... cores. ``worlds`` measures lyceum_warp
+with 1 to 131,072 worlds. ``kept`` compares an environment with its bare engine (kept.py).
 """
 
 import dataclasses
@@ -69,7 +69,7 @@ class Case:
     part: str
     task: str
     repeat: int
-    """Number of the repeat. It is also the seed of actions and initial states."""
+    """Index of the repeat, which is also the seed of actions and initial states."""
     contestant: str
     worlds: int
     threads: int

@@ -13,7 +13,7 @@ TEXT = "# tune\n\nFaster physics at equal returns. Written by `lyceum-warp bench
 
 
 def searches(name: str) -> list[list[dict[str, Any]]]:
-    """Read the searches in a file. A search is a list of settings with verdicts, starting with the fastest."""
+    """Read the results of all searches from a file. A search's result is a list of settings, the fastest one first."""
     found: dict[str, list[dict[str, Any]]] = {}
     for line in (RESULTS / name).read_text().splitlines():
         row = json.loads(line)

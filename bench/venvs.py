@@ -38,7 +38,10 @@ def run(python: Path, worker: Path, **arguments: Any) -> dict[str, Any]:
 
 @functools.cache
 def _made(name: str) -> tuple[Path, str]:
-    """Make the virtual environment of a library unless it exists. Return its Python, and an error message or ""."""
+    """Make the virtual environment of a library unless it exists.
+
+    Return the path of its Python interpreter, and an error message, or "" after success.
+    """
     requirements = FOLDER / name / "requirements.txt"
     text = "\n".join([requirements.read_text(), sys.version, platform.machine()])
     root = Path(os.environ.get("LYCEUM_WARP_PEERS") or Path.home() / ".cache" / "lyceum_warp" / "peers")

@@ -120,7 +120,9 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
     assert lw.load_value(six, which="best").discount == CONFIG.gamma
     with pytest.raises(FileNotFoundError, match=r"has no policy 3: it has 'last', 'best', 2, 4, 6"):
         lw.load(six, which=3)
-    with pytest.raises(ValueError, match="which must be 'last', 'best' or the number of an iteration, not 'worst'"):
+    with pytest.raises(
+        ValueError, match="no policy is named 'worst': pass 'last', 'best' or the number of an iteration"
+    ):
         lw.load(six, which="worst")
 
 
@@ -190,7 +192,7 @@ def test_training_ends_after_the_given_minutes(tmp_path: Path, capsys: pytest.Ca
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
     assert len(run.rows()) == 1 and run.read()["iteration"] == 1
     assert cli.main(["train", "--resume", str(folder), "--iterations", "1000", "--minutes", "1e-6", *QUIET]) == 0
-    assert "1e-06 minutes are over after 2 of 1000 iterations; continue with" in capsys.readouterr().out
+    assert "stopped after 2 of 1000 iterations: the limit is 1e-06 minutes; continue with" in capsys.readouterr().out
     with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
     assert not (tmp_path / "other").exists()

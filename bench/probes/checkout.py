@@ -1,4 +1,4 @@
-"""Compute the arrays of one checkout that bench/compare.py compares.
+"""Compute arrays with one checkout; bench/compare.py compares them with another checkout's arrays.
 
 The first answer lists the checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of
 a function in PARTS as JSON), and each line on stdout is an answer. The arrays of a unit are written to the file given

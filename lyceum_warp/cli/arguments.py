@@ -57,14 +57,15 @@ _UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of 
 class OptionFlags:
     """Base class for groups of flags. Each field of the ``options`` dataclasses becomes a flag.
 
-    The field's docstring becomes the flag's help text. A subclass redeclares a field whose type is a union, or whose
-    flag differs from the field. Values are validated later, because the parser would print errors in a multi-line box.
+    The field's docstring becomes the flag's help text. If a flag needs another type, default or help text than its
+    field, the subclass declares this flag. Values are validated later, because the parser would print errors in a
+    multi-line box.
 
     Args:
         options: The dataclasses. If several have the same field, the first one is used.
         omit: Names of fields without a flag.
-        default: The default value that the help shows, for all flags or by field name. The flags themselves default to
-            None.
+        default: The text that the help shows as the default value. A string applies to all flags; a mapping contains
+            a string for each field. The flags themselves default to None.
     """
 
     def __init_subclass__(
@@ -105,8 +106,8 @@ def given(flags: Any) -> dict[str, Any]:
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
 """Options of an environment for which no flag is generated.
 
-Commands declare the flags for nworld, seed and the model themselves. ``Physics`` declares the physics options. The
-others can be set only in Python.
+Each command declares its own flags for nworld, seed and the model. ``Physics`` declares the physics options. The other
+options can be set only in Python.
 """
 
 
@@ -134,7 +135,7 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 
     physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
     """The name of a set of physics options that the task defines (see lyceum-warp tasks), or exact for the task's
-    default physics. Flags of single options, such as --integrator, override the set.
+    default physics. A flag for a single option, such as --integrator, overrides this option of the set.
     """
     solver: Repeated = ()
     """A limit of the constraint solver, such as iterations=4, ls_iterations=10 or noslip_iterations=0; may be repeated.
@@ -144,7 +145,7 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Parse a task's parameters from the values of a repeated flag, each NAME=VALUE.
 
-    If NAME is an option, the error names its flag. ``instead`` maps options to flags with different names.
+    If NAME is an option, the error names its flag. ``instead`` maps an option to its flag if their names differ.
     """
     found: dict[str, Any] = {}
     for text in texts:

@@ -108,7 +108,7 @@ _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skippe
 columns."""
 
 _BAR_WIDTH = 36
-"""Width of the progress bar, the iteration number and the times, in characters."""
+"""Number of characters that the bar, the iteration number and the times take up together."""
 
 
 def counted(number: int, what: str) -> str:

@@ -64,7 +64,7 @@ class Eval:
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
-    """Seed of the initial states. Training with the same seed draws different initial states."""
+    """Seed of the initial states. Training draws different initial states, even with the same seed."""
     nworld: int = 32
     """Maximum number of worlds."""
     video: bool = False

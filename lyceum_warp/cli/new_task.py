@@ -44,8 +44,8 @@ class New:
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
-    """The task's name in snake_case, or a path such as path/to/task.py. A name creates TASK.py in the working
-    directory."""
+    """The task's name in snake_case, or a path such as path/to/task.py. For a name, the command writes the file TASK.py
+    in the working directory."""
     model: Annotated[str, tyro.conf.arg(metavar="FILE")]
     """An MJCF or URDF file, or a model in a package: gymnasium:FILE.xml, gymnasium_robotics:PATH or
     menagerie:ROBOT/FILE.xml. MuJoCo Menagerie comes from the extra "menagerie", from the package mujoco-menagerie, or

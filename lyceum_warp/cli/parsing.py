@@ -78,7 +78,7 @@ def _markers(hint: Any) -> tuple[Any, ...]:
 
 
 def _with_only(command: Any, usual: Sequence[str]) -> type:
-    """Make a subclass of a command, or of a group of its options, whose help shows only the usual options."""
+    """Make a subclass whose help shows only the usual options. ``command`` is a command or a group of its options."""
     own = _options(command)["options"].values()
     body: dict[str, Any] = {"__annotations__": {}, "__doc__": command.__doc__}
     for name, hint in typing.get_type_hints(command, include_extras=True).items():

@@ -78,8 +78,9 @@ class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)
 class Plan:
     """Control a task with a planner that replans at every step, and report rewards, success and planning times.
 
-    The planner is MPPI. --update selects the cross-entropy method (cem) or predictive sampling. The default settings
-    come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's worlds.
+    The default planner is MPPI. --update selects the cross-entropy method (cem) or predictive sampling instead. The
+    default settings come from the task. Physics options (--physics, --integrator, ...) apply only to the planner's
+    worlds.
 
     With --real-time, the world does not wait for plans. The command then measures planning times for a few seconds, and
     chooses the largest number of samples that meets the deadline. If no number meets the deadline, the command tries a
@@ -118,8 +119,8 @@ class Plan:
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder; by default runs/plan-TASK-DATE."""
     value: Annotated[Path | None, tyro.conf.arg(metavar="RUN")] = None
-    """The folder of an NPG or PPO run of the same task. The run's value function estimates the value of each sample's
-    final state, which is added to the sample's return.
+    """The folder of an NPG or PPO run of the same task. The planner evaluates the run's value function at each
+    sample's final state, and adds this value to the sample's return.
     """
     param: ParamWords = ()
     planner_param: Repeated = ()
@@ -280,7 +281,8 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
     try:
         for episode in range(options.episodes):
             if done and time.monotonic() >= end:
-                say(f"{options.minutes:g} minutes are over after {len(done)} of {options.episodes} episodes")
+                limit = f"the limit is {options.minutes:g} minutes"
+                say(f"stopped after {len(done)} of {options.episodes} episodes: {limit}")
                 break
             with PlanDisplay(console, episode, options.episodes, **shown) as display:
                 seed = options.seed + episode

@@ -42,7 +42,7 @@ from lyceum_warp.viz.policy_videos import policy_video
 _FINAL_EPISODES = 32
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
-"""The defaults of the settings that may change when a run is resumed."""
+"""Settings that --resume may change, with their default values."""
 
 _KEPT = {
     "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
@@ -139,7 +139,7 @@ class Train:
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s. If
-    saving is fast, it happens more often, and takes at most 1 % of the time.
+    a save takes less than 0.3 s, the run saves more often, but spends at most 1 % of the time on saves.
     """
     tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
@@ -160,9 +160,9 @@ class Train:
     camera: CameraWords = ()
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
-    cheap comparisons are made. After training on a GPU, the comparison uses the C engine. After training with other
-    physics, the comparison uses the task's default physics. --transfer adds each set of physics options that the task
-    defines. After training on CPU cores, --transfer also adds the Warp engine, whose kernels may take minutes to
+    cheap comparisons are made. A policy that was trained on a GPU is tested on the C engine. A policy that was trained
+    under other physics is tested under the task's default physics. --transfer adds each set of physics options that the
+    task defines. After training on CPU cores, --transfer also adds the Warp engine, whose kernels may take minutes to
     compile.
     """
     trust: Trust = False
@@ -231,7 +231,8 @@ class Train:
             if reached.get("iteration") == learner.iteration < total:
                 say(f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}")
             elif learner.iteration < total and self.minutes is not None:
-                say(f"{self.minutes:g} minutes are over after {learner.iteration} of {total} iterations; {hint}")
+                limit = f"the limit is {self.minutes:g} minutes"
+                say(f"stopped after {learner.iteration} of {total} iterations: {limit}; {hint}")
             return self._report(run, learner)
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
@@ -253,7 +254,7 @@ class Train:
                 try:
                     suggested = ALGORITHMS[suggestion.algorithm][1](**suggestion.settings)
                 except (KeyError, TypeError, ValueError) as error:
-                    raise ValueError(f"the attribute training of the task {self.task} is not valid: {error}") from error
+                    raise ValueError(f"the task {self.task} has an invalid attribute 'training': {error}") from error
             base = Configuration(
                 task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested,
                 iterations=suggestion.iterations,

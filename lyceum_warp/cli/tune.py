@@ -45,13 +45,13 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes for each setting. By default, the number depends on the confidence interval, and the episodes
-    take at most a minute (5 s with --short).
+    """Number of episodes for each setting. By default, tune runs enough episodes for a narrow confidence interval, but
+    for at most a minute (5 s with --short).
     """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
-    samples in the same order. --nworld is then the number of samples. The planner plans from --episodes standing
-    states, and from as many moving and fallen states.
+    samples in the same order. --nworld is then the number of samples. The planner plans from three kinds of states:
+    standing, moving and fallen. --episodes is the number of states of each kind.
     """
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Number of worlds. By default 256, or 4096 on a GPU. With --planning, the number of samples, by default 64."""
@@ -100,8 +100,9 @@ def _report(tuning: Tuning, options: Tune) -> None:
     if not options.planning:
         nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
         say(
-            f"{reference['in_contact']:.0%} of the states are in contact. diverg. is the divergence after 1, 10 and 50 "
-            f"steps, divided by the divergence of the exact physics from states moved by {NUDGE:g}: {nudged}."
+            f"{reference['in_contact']:.0%} of the states are in contact. The columns diverg. show the distance from "
+            "the unchanged task after 1, 10 and 50 steps. The unit is the distance that a perturbation of the initial "
+            f"state by {NUDGE:g} causes: {nudged}."
         )
     for row in tuning.rows:
         if row["verdict"] == "refused":
@@ -115,7 +116,7 @@ def _report(tuning: Tuning, options: Tune) -> None:
     if tuning.best is None:
         unknown = sum(row["verdict"] == "not shown" for row in tuning.rows)
         hint = f" ({unknown} not shown: more --episodes may decide)" if unknown else ""
-        say(f"best within {options.tolerance}: the task as it is{hint}")
+        say(f"no faster setting satisfies --tolerance {options.tolerance}{hint}")
     else:
         say(f"best within {options.tolerance}: {tuning.best['name']}, {tuning.best['speedup']:.2f} times as fast")
         say(f"flags: {tuning.flags}")

@@ -21,7 +21,7 @@ FORMAT = 1
 _FIX = "restore the file from a copy, or train again into another folder"
 
 _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": ValueFunction}
-"""The classes of networks in files that name no class."""
+"""The default class of each network. A file stores the name of any other class."""
 
 
 def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> dict[str, Any]:
@@ -48,7 +48,10 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
 
 
 def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Module | None = None) -> nn.Module:
-    """Make the network "policy" or "value" from a file's content, or load its weights into a given network."""
+    """Make a network from a file's content, or load the file's weights into a given network.
+
+    ``name`` is "policy" or "value".
+    """
     if name not in content:
         raise ValueError(f"{path} has no value function, because the run's algorithm learns none")
     saved = content[name]

@@ -75,7 +75,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration. A missing file of a table parameter is replaced by the run's copy."""
+        """Read a run's configuration. If the file of a table parameter is missing, use the run's copy of this file."""
         config = run.config
         try:
             # earlier releases stored --param options in "params", or wrote no "physics"
@@ -142,9 +142,9 @@ class Configuration:
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
     """Load a learner's initial policy and value function from a run, and the iteration at which they were saved.
 
-    If ``which`` is None, the run is resumed. A resumed learner usually makes its networks from the hyperparameters, so
-    None is returned for both. Networks with a ``limit`` are returned, and so are those of a run that started from
-    another run.
+    If ``which`` is None, the run is resumed. The learner then usually makes its networks from the hyperparameters, and
+    this function returns None for the policy and for the value function. It returns the networks if the policy has a
+    ``limit``, or if the run started from another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))

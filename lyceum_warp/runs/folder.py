@@ -227,7 +227,7 @@ class Run:
                 ) from error
 
     def cut(self, iteration: int) -> None:
-        """Delete the rows after an iteration from the metrics table. Also delete an incomplete last row."""
+        """Delete the rows of all iterations after ``iteration`` from the metrics table, and an incomplete last row."""
         if not self.metrics.exists():
             return
         numbers = [row.get("iteration") or number for number, row in enumerate(self.rows(), 1)]
@@ -262,7 +262,7 @@ class Run:
         elif isinstance(which, int | str) and str(which).isdigit():
             path = self.numbered(int(which))
         else:
-            raise ValueError(f"which must be 'last', 'best' or the number of an iteration, not {which!r}")
+            raise ValueError(f"no policy is named {which!r}: pass 'last', 'best' or the number of an iteration")
         if not path.is_file():
             raise FileNotFoundError(
                 f"the run in {self.folder} has no policy {which!r}: it has {self._known_policies()}"
@@ -282,7 +282,7 @@ class Run:
             content = read_checkpoint(self.best, parts=("iteration", "policy", "score"))
         except ValueError as error:
             cause = str(error).rpartition(": ")[0]
-            log.warning("%s: the next evaluated policy replaces it, whatever its return", cause)
+            log.warning("%s: the next evaluated policy replaces this file", cause)
             return None
         return content["iteration"], content["score"]["value"]
 
@@ -356,7 +356,7 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
     A run of SAC has a ``TwinCritic`` instead: ``value(obs, unit_action)``.
 
     Args:
-        run: A run's folder, or a file with a value function in this folder.
+        run: A run's folder, or a file in a run's folder that contains a value function.
         which: See ``load``.
         device: Device for the parameters.
 

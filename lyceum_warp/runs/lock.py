@@ -47,7 +47,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
             text = file.read()
             if held or (text and _owner(text)[1] != here):
                 raise ValueError(
-                    f"the run in {folder} is being written by {_owner(text)[0]}: end this process first, or take the "
+                    f"the run in {folder} is being written by {_owner(text)[0]}: end that process first, or take the "
                     "run over with --take-over (take_over=True in Python)"
                 )
             if not path.exists() or not os.path.samestat(os.fstat(file.fileno()), path.stat()):

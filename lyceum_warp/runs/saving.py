@@ -12,10 +12,10 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 class Saver:
     """Writes a run's files.
 
-    Metrics, a new best policy, and a policy in a numbered file are written after each iteration. The last policy and
-    the complete state are saved together. The time between two saves depends on the duration of the last save. It is
-    the smaller of 30 s and 100 times this duration, but at least 20 times this duration. For example, saves of 20 ms
-    happen every 2 s and take 1 % of the time. After ``kill -9``, the run resumes from the last save.
+    Each iteration writes its metrics at once. It also writes the policy if this is the best one so far, or if it needs
+    a numbered file. The last policy and the complete state are saved together, usually every 30 s. If a save takes less
+    than 0.3 s, the next one comes after 100 times this duration. If it takes more than 1.5 s, the next one comes after
+    20 times this duration. After ``kill -9``, the run resumes from the last save.
 
     All ranks have a saver and make the same calls. Ranks without a run do not write. ``lw.train`` describes
     ``keep_every`` and ``save_every``.

@@ -27,8 +27,8 @@ Files = dict[Path, Path | bytes]
 
 TABLES = "tables"
 _APART = 2
-"""The largest depth of the task's file below the folder that it shares with the model. If the file is deeper, the task
-and the model are copied into separate folders."""
+"""If the task's file lies more than this number of levels below the folder that contains both the task and the model,
+the two are copied into separate folders."""
 _LARGEST = 512 * 2**20
 """Maximum size of a model that is copied, in bytes."""
 
@@ -112,8 +112,8 @@ def run_env(
 ) -> Env:
     """Make an environment for a run's task, or for another given task.
 
-    A file or a model that has moved or changed since the run started is replaced by the run's copy, with a warning in
-    the log. Tasks of the package are used in their current version. With ``trust``, the task is executed and files are
+    If a file or a model has been moved or changed since the run started, the run's copy is used, and a warning is
+    logged. Tasks of the package are used in their current version. With ``trust``, the task is executed and files are
     read even if this user did not make the run on this machine.
 
     Raises:
@@ -134,9 +134,9 @@ def run_env(
     if chosen is None or kept.get("program"):
         where = "a notebook" if chosen is None else chosen.partition(":")[0]
         raise ValueError(
-            f"the task {run.task_name!r} of the run in {run.folder} was defined in {where}, which started the "
-            "training: pass a file that only defines the task (eval --task my_task.py, train my_task.py --from), or "
-            "resume in that program (resume=True)"
+            f"the run in {run.folder} was started by {where}, which also defines its task {run.task_name!r}: pass a "
+            "file that only defines the task (eval --task my_task.py, train my_task.py --from), or resume the run in "
+            "that program (resume=True)"
         )
     path, colon, attribute = chosen.partition(":")
     copy = run.task_folder / kept.get("file", "")
@@ -187,9 +187,9 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
     # if the task's file is the training script, a change may have nothing to do with the task
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
-        log.warning("%s", f"{change}: it is used as it is now" if "changed" in change else change)
+        log.warning("%s", f"{change}: the new version is used" if "changed" in change else change)
     if model and _model_changed(run, env):
-        log.warning("the model of the task %r has changed since the run began: it is used as it is now", env.task.name)
+        log.warning("the model of the task %r has changed since the run began: the new version is used", env.task.name)
 
 
 def _model_changed(run: Run, env: Env) -> bool:

@@ -24,9 +24,10 @@ def remember(folder: Path, config: Mapping[str, Any]) -> None:
 
 
 def check_trust(folder: Path, config: Mapping[str, Any], named: str | Path, *, runs: bool, trust: bool) -> None:
-    """Check that this user made a run on this machine or trusts it. If ``trust`` is set, record the run as trusted.
+    """Check that this user made a run on this machine, or trusts the run. Record it as trusted if ``trust`` is set.
 
-    The error names the file ``named``. It says whether the command would execute (``runs``) or read this file.
+    ``named`` is the file in the error message. ``runs`` is True if the command would run this file, and False if the
+    command would read it.
     """
     if os.path.exists(_record(folder, config)):
         return

@@ -85,7 +85,7 @@ def test_stopped_experiment_continues_without_repeating_cases(
 ) -> None:
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 13) == 130
-    assert "stopped; the same command continues" in capsys.readouterr().err
+    assert "stopped; repeat the command to continue" in capsys.readouterr().err
     path.write_bytes(path.read_bytes()[:-9])
     toy.measured.clear()
     assert toy.main("--out", path, "--contestants", "ours") == 0

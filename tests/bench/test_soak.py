@@ -42,7 +42,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 9,?600 \|", capsys.readouterr().out)
 
 
-def test_variant_of_a_task_in_a_file_with_several_tasks_uses_its_struct(tmp_path: Path) -> None:
+def test_variant_of_one_of_several_tasks_uses_this_tasks_struct(tmp_path: Path) -> None:
     file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
     own = TaskSource(find_task(file), "soak")
     observe = own.functions["observe"]
@@ -77,7 +77,7 @@ def test_soak_run_continues_on_another_machine_with_the_state_folder(
 
 
 @pytest.mark.long
-def test_missed_faults_and_faults_that_spread_are_reported(
+def test_soak_run_reports_missed_faults_and_faults_in_other_worlds(
     work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(soak, "VARIANT", soak.VARIANT.replace("== 4.0", "== 7.0").replace("== 5.0", "== 6.0"))
@@ -94,7 +94,7 @@ def test_missed_faults_and_faults_that_spread_are_reported(
 
 
 @pytest.mark.long
-def test_killed_training_run_ends_like_an_uninterrupted_run(work: Path, tmp_path: Path) -> None:
+def test_killed_and_resumed_training_equals_uninterrupted_training(work: Path, tmp_path: Path) -> None:
     memory, kills = sorted(run(tmp_path / "soak.jsonl", "--short", "--parts", "kills", "memory", "--work", str(work)),
                            key=len)  # fmt: skip
     assert kills["kills"] == 1 and kills["exit_code"] == 0 and kills["iterations"] == 60

@@ -68,7 +68,7 @@ def test_eval_with_other_physics_prints_no_warning_about_a_changed_model(
     assert "has changed" not in "".join(capsys.readouterr())
 
 
-def test_eval_refuses_zero_episodes_and_folders_without_a_run(
+def test_eval_with_zero_episodes_or_without_a_run_prints_an_error(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(["eval", str(trained), "--episodes", "0"]) == 2

@@ -110,7 +110,7 @@ def test_feet_and_joints_are_found_on_the_legs(folder: Path, capsys: pytest.Capt
     assert issubclass(find_task("sled_walk.py"), lw.Task) and find_task("sled_walk.py").rewards["single_stance"] > 0
 
 
-def test_options_feet_and_joints_select_feet_and_joints(folder: Path) -> None:
+def test_new_task_uses_the_given_feet_and_joints(folder: Path) -> None:
     assert new("sled_stand", "--model", "sled.xml", "--feet", "left_shin", "toe", "--joints", "left_hip") == 0
     params = lw.make("sled_stand.py").task
     assert [params.model.site(i).name for i in params.params["feet"]] == ["left_shin_foot", "toe"]

@@ -33,7 +33,7 @@ def test_command_plan_starts_no_episode_after_the_time_limit(
 ) -> None:
     out = tmp_path / "run"
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
-    assert "1e-09 minutes are over after 1 of 3 episodes" in capsys.readouterr().out
+    assert "stopped after 1 of 3 episodes: the limit is 1e-09 minutes" in capsys.readouterr().out
     assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
 
 

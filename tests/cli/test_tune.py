@@ -10,7 +10,7 @@ from lyceum_warp.tuning.trial import SHORT
 QUICK = ["--short", "--episodes", "8", "--nworld", "8", "--nthread", "1", "--tolerance", "any"]
 
 
-def test_tune_prints_a_table_and_flags_that_other_commands_accept(
+def test_tune_prints_a_table_and_flags_for_other_commands(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(search, "SHORT", dataclasses.replace(SHORT, repeats=2, block_seconds=0.005, steps=40))

@@ -58,7 +58,7 @@ def test_physics_of_a_run_are_read_from_its_configuration(saved: dict[str, objec
         assert found.hyperparameters == lw.NPGConfig(hidden=(8,))
 
 
-def test_parameters_of_earlier_releases_that_are_now_options_are_read_as_options() -> None:
+def test_options_in_params_of_an_old_configuration_are_read_as_options() -> None:
     params = {"mass": 2, "horizon": 9, "nthread": 2, "frame_skip": 3, "graphs": False}
     found = read(BASE | {"engine": "warp", "device": "cuda:0", "params": params, "options": {"horizon": 5}})
     assert found.params == {"mass": 2}

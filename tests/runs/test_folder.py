@@ -66,9 +66,7 @@ def test_creating_a_run_with_an_invalid_configuration_leaves_no_folder(tmp_path:
     assert not (tmp_path / "run").exists()
 
 
-def test_run_can_be_created_in_a_folder_that_a_killed_process_left(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_is_created_over_the_remains_of_a_killed_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def killed(path: Path, text: str) -> None:
         path.write_bytes(text[:9].encode())
         os.kill(os.getpid(), signal.SIGKILL)

@@ -38,7 +38,7 @@ def locked(folder: Path) -> Iterator[str]:
 
 def test_second_writer_raises_an_error_until_the_first_writer_ends(tmp_path: Path) -> None:
     with pytest.raises(KeyError), run_lock(tmp_path):
-        line = rf"the run in {tmp_path} is being written by process {os.getpid()} on {platform.node()}: end this"
+        line = rf"the run in {tmp_path} is being written by process {os.getpid()} on {platform.node()}: end that"
         with pytest.raises(ValueError, match=line), run_lock(tmp_path):
             pass
         raise KeyError

@@ -19,7 +19,7 @@ def old_run(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
-def test_value_function_without_a_scale_gets_the_scale_of_its_release(gamma: float, old_run: Path) -> None:
+def test_value_function_of_an_old_run_gets_the_old_scale(gamma: float, old_run: Path) -> None:
     """The old run lacks the scale, which was 1 / (1 - gamma)."""
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
@@ -51,7 +51,7 @@ def test_run_of_an_early_release_is_loaded_and_evaluated(run: Path, capsys: pyte
     assert "2 episodes of the mean policy" in capsys.readouterr().out
 
 
-def test_run_of_an_early_release_is_resumed_and_new_training_starts_from_it(run: Path, tmp_path: Path) -> None:
+def test_run_of_an_early_release_can_be_resumed_and_can_start_a_new_run(run: Path, tmp_path: Path) -> None:
     before = Run.open(run)
     assert main(["train", "--resume", str(run), "--trust", "--iterations", "4", *QUIET]) == 0
     after = Run.open(run)

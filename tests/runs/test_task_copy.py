@@ -192,20 +192,18 @@ def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplo
     part.write_text(PART.replace('type="slide"', 'type="slide" damping="9"'))
     file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
     train(3, resume=True)
-    changed = "has changed since the run began: it is used as it is now"
+    changed = "has changed since the run began: the new version is used"
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
-def test_run_of_a_task_without_a_file_is_evaluated_with_a_given_task(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_of_a_run_from_a_notebook_needs_a_given_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
     Run.open(tmp_path / "run").amend(task=None)
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
         capsys,
-        "the task 'point_mass'",
-        "was defined in a notebook",
+        "its task 'point_mass'",
+        "was started by a notebook",
         "pass a file that only defines the task (eval --task my_task.py",
     )
     assert cli.main(["eval", str(tmp_path / "run"), "--task", "point_mass", "--episodes", "2"]) == 0

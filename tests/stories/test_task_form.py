@@ -232,7 +232,7 @@ def test_a_rollout_equals_steps_without_events(engine: str) -> None:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_controls_are_clipped_and_draws_of_a_step_differ(engine: str) -> None:
+def test_controls_are_clipped_and_random_numbers_differ(engine: str) -> None:
     env = lw.make(Full, nworld=2, engine=engine, horizon=0)
     env.reset()
     smooth, draws = env.state_space.parts["smooth"], []

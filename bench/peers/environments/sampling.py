@@ -164,9 +164,10 @@ class EnvPool:
         return self.env.step(self.actions[t])[-1]["elapsed_step"]
 
     def transition_share(self) -> float:
-        """Return the fraction of steps that are transitions, measured over 200 additional steps.
+        """Run 200 more steps, and return the fraction of them that simulate physics.
 
-        The step after the end of an episode ignores its action, and returns the next episode's first observation.
+        The step after the end of an episode only resets: it ignores its action, and returns the next episode's first
+        observation.
         """
         first = [np.mean(self.step(t % len(self.actions)) == 0) for t in range(200)]
         return 1.0 - float(np.mean(first))
@@ -190,7 +191,7 @@ PACKAGES = {Gymnasium: ("gymnasium", "mujoco"), DmControl: ("dm_control", "mujoc
 def timed(
     step: Callable[[int], None], period: int, warm: int, seconds: float, wait: Callable[[], None] = lambda: None
 ) -> tuple[int, float]:
-    """Run ``warm`` steps, and then measure. Return the number of measured steps and their seconds.
+    """Run ``warm`` steps, and then measure. Return the number of measured steps, and the seconds they took together.
 
     ``step`` gets the index of the actions, from 0 to ``period`` - 1. ``wait`` waits for the end of asynchronous steps.
     """
