@@ -45,8 +45,8 @@ class Tune:
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
-    """Number of episodes for each setting. By default, tune runs enough episodes for a narrow confidence interval, but
-    for at most a minute (5 s with --short).
+    """Number of episodes for each setting. The default is enough episodes for a narrow confidence interval. These
+    episodes take at most a minute (5 s with --short).
     """
     planning: bool = False
     """Find physics options for the task's planner: compare planning times, and test whether coarser physics rank the
