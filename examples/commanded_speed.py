@@ -14,7 +14,7 @@ GAIT = 0.4 * np.sin(np.pi * np.arange(20)[:, None] / 10 + np.array([0.0, 0.8, 1.
 
 
 def cheetah() -> mujoco.MjSpec:
-    """Add a touch sensor to each foot of Gymnasium's cheetah, and a crouched keyframe."""
+    """Add two touch sensors and a crouched keyframe to Gymnasium's cheetah."""
     spec = lw.gymnasium_model("half_cheetah.xml").spec()
     for foot in ("bfoot", "ffoot"):
         spec.body(foot).add_site(name=foot, pos=[0.0, 0.0, -0.1], size=[0.15, 0.15, 0.15])

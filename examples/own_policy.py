@@ -4,7 +4,7 @@
     python examples/own_policy.py --task half_cheetah --iterations 100
 
 The network is any torch module that maps observations (..., nobs) to mean actions (..., nact). ``lw.GaussianPolicy``
-adds noise, log-probabilities and a normaliser for observations.
+normalises observations, adds noise to the mean actions and computes log-probabilities.
 """
 
 import torch

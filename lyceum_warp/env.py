@@ -105,7 +105,7 @@ class Env:
     episode_metric_sums: torch.Tensor
     """``episode_metrics`` as one tensor, (nworld, number of metrics)."""
     shared: dict[str, torch.Tensor]
-    """The memory that all worlds share, by name. Only ``update_shared`` changes it."""
+    """The memory that all worlds share: a tensor for each field of ``Shared``. Only ``update_shared`` changes it."""
     success: torch.Tensor
     """Whether the goal was met in each of the last ``success_steps`` steps, (nworld,), bool."""
     done: torch.Tensor
@@ -309,7 +309,7 @@ class Env:
         if mask is None:
             return _copied(worlds.state_view, out)
         if out is None:
-            raise ValueError("a mask selects the rows of out that get_state writes: pass out as well")
+            raise ValueError("get_state(mask=...) needs a tensor to write into: pass the tensor as out=...")
         check_tensor(out, "out", worlds.state_view)
         worlds.set_mask(mask)
         return torch.where(worlds.mask_view[:, None], worlds.state_view, out, out=out)
@@ -490,7 +490,7 @@ class Env:
         self.worlds.update_shared()
 
     def get_shared(self) -> torch.Tensor:
-        """Copy the memory that all worlds share, and the sums for its next update.
+        """Copy the memory that all worlds share, and the sums that the next ``update_shared`` uses.
 
         Returns:
             One vector, float64; empty if the task has no shared memory.
@@ -499,7 +499,7 @@ class Env:
         return torch.cat([part.double() for part in parts])
 
     def set_shared(self, state: torch.Tensor) -> None:
-        """Set the memory that all worlds share, and the sums for its next update.
+        """Set the memory that all worlds share, and the sums that the next ``update_shared`` uses.
 
         Args:
             state: A result of ``get_shared`` for the same task.

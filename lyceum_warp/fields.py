@@ -143,11 +143,11 @@ class Field:
     refresh: Stage
     """The stage that updates the field after a step."""
     reset: Stage
-    """The stage that updates the field after a reset; ``Stage.NONE`` if it becomes zero."""
+    """The stage that updates the field after a reset, or ``Stage.NONE`` if the reset itself writes the field."""
     lagged: bool
     """Whether the field keeps the value from ``mj_step``, which is one substep older than the state."""
     snapshot: bool
-    """Whether states store the field in addition to the integration state, which does not determine it."""
+    """Whether a state stores the field in addition to MuJoCo's integration state."""
     written: bool = False
     """Whether the task writes the field before a step."""
 

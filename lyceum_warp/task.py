@@ -45,9 +45,9 @@ class TaskFunction:
     optional: str = ""
     """Last arguments, which a task's function may omit."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """What the function may write into each argument. "lasting" means lasting memory and the model, and "start" means
-    everything that a reset may write. The other values are "inputs" and "memory". Arguments for results, such as
-    ``obs``, are always writable."""
+    """What the function may write into each argument. The values are "inputs", "memory", "lasting" (lasting
+    memory and model fields) and "start" (everything that a reset may write). Arguments for results, such as ``obs``,
+    are always writable."""
 
     @property
     def signature(self) -> str:
@@ -162,37 +162,38 @@ class Part:
 
     kind: str
     size: int | str
-    """Number of elements, or the name of a table in Params with a row per element."""
+    """Number of elements. The name of a table in Params stands for the table's number of rows."""
 
 
 def memory(size: int | str = 1) -> Any:
-    """Declare memory of a task, as a default in World.
+    """Declare a task's memory in World, as in ``air_time: Row[float] = lw.memory(4)``.
 
     ``advance`` or ``substep`` writes the memory, and a reset clears it. The memory is part of the state. The field's
     type is ``Row[float]``, ``Row[wp.vec3]`` or another row of numbers.
 
     Args:
-        size: Number of elements, or the name of a table in Params with a row per element.
+        size: Number of elements. The name of a table in Params stands for the table's number of rows.
     """
     return Part("memory", size)
 
 
 def lasting_memory(size: int | str = 1) -> Any:
-    """Declare memory that outlives episodes, such as a curriculum's level, as a default in World.
+    """Declare memory in World that resets do not clear, as in ``level: Row[float] = lw.lasting_memory()``.
 
-    It is cleared only when a world's random stream starts (``rand_reset(seed=...)``). ``startup`` may then write it.
+    Lasting memory is cleared only when a world's random stream starts (``rand_reset(seed=...)``). ``startup`` may
+    then write it.
 
     Args:
-        size: Number of elements, or the name of a table in Params with a row per element.
+        size: Number of elements. The name of a table in Params stands for the table's number of rows.
     """
     return Part("lasting_memory", size)
 
 
 def part(size: int | str = 1) -> Any:
-    """Declare a part of an observation group, of Shared or of Sums, as a default in the struct.
+    """Declare a field of Shared, of Sums or of an observation struct, as in ``angles: Row[float] = lw.part(6)``.
 
     Args:
-        size: Number of elements, or the name of a table in Params with a row per element.
+        size: Number of elements. The name of a table in Params stands for the table's number of rows.
     """
     return Part("obs", size)
 
@@ -204,69 +205,69 @@ class Element(int):
     name: str
 
     def __new__(cls, field: str, name: str) -> "Element":
-        """Make an element; its value as an integer is not used."""
+        """Make an element. Its integer value is -1, because its index is not known yet."""
         element = super().__new__(cls, -1)
         element.field, element.name = field, name
         return element
 
 
 def site(name: str) -> int:
-    """Make a default for Params: the index of a site in ``site_xpos`` and other ``site_`` fields."""
+    """Set a default in Params to a site's index in ``site_xpos`` and other ``site_`` fields."""
     return Element("site_xpos", name)
 
 
 def sites(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of sites."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of sites."""
     return [site(name) for name in names]
 
 
 def body(name: str) -> int:
-    """Make a default for Params: the index of a body in ``xpos`` and other fields of bodies."""
+    """Set a default in Params to a body's index in ``xpos`` and other fields of bodies."""
     return Element("xpos", name)
 
 
 def bodies(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of bodies."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of bodies."""
     return [body(name) for name in names]
 
 
 def geom(name: str) -> int:
-    """Make a default for Params: the index of a geom in ``geom_xpos`` and other ``geom_`` fields."""
+    """Set a default in Params to a geom's index in ``geom_xpos`` and other ``geom_`` fields."""
     return Element("geom_xpos", name)
 
 
 def geoms(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of geoms."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of geoms."""
     return [geom(name) for name in names]
 
 
 def camera(name: str) -> int:
-    """Make a default for Params: the index of a camera in ``cam_xpos`` and other ``cam_`` fields."""
+    """Set a default in Params to a camera's index in ``cam_xpos`` and other ``cam_`` fields."""
     return Element("cam_xpos", name)
 
 
 def tendon(name: str) -> int:
-    """Make a default for Params: the index of a tendon in ``ten_`` and ``tendon_`` fields."""
+    """Set a default in Params to a tendon's index in ``ten_`` and ``tendon_`` fields."""
     return Element("ten_length", name)
 
 
 def equality(name: str) -> int:
-    """Make a default for Params: the index of an equality constraint in ``eq_active`` and other ``eq_`` fields."""
+    """Set a default in Params to an equality constraint's index in ``eq_active`` and other ``eq_`` fields."""
     return Element("eq_active", name)
 
 
 def actuator(name: str) -> int:
-    """Make a default for Params: the index of an actuator in ``actuator_force`` and other ``actuator_`` fields."""
+    """Set a default in Params to an actuator's index in ``actuator_force`` and other ``actuator_`` fields."""
     return Element("actuator_force", name)
 
 
 def actuators(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of actuators."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of actuators."""
     return [actuator(name) for name in names]
 
 
 def ctrl(actuator: str) -> int:
-    """Make a default for Params: the index of an actuator's first control in ``ctrl``.
+    """Set a default in Params to the index of an actuator's first control in ``ctrl``.
 
     Most actuators have one control.
     """
@@ -274,52 +275,52 @@ def ctrl(actuator: str) -> int:
 
 
 def act(actuator: str) -> int:
-    """Make a default for Params: the index of an actuator's first activation in ``act``."""
+    """Set a default in Params to the index of an actuator's first activation in ``act``."""
     return Element("act", actuator)
 
 
 def joint(name: str) -> int:
-    """Make a default for Params: the index of a joint in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
+    """Set a default in Params to a joint's index in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
     return Element("xanchor", name)
 
 
 def joints(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of joints."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of joints."""
     return [joint(name) for name in names]
 
 
 def qpos(joint: str) -> int:
-    """Make a default for Params: the index of a joint's first coordinate in ``qpos``."""
+    """Set a default in Params to the index of a joint's first coordinate in ``qpos``."""
     return Element("qpos", joint)
 
 
 def qposes(*joints: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of joints' first coordinates in ``qpos``."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of joints' first coordinates in ``qpos``."""
     return [qpos(name) for name in joints]
 
 
 def dof(joint: str) -> int:
-    """Make a default for Params: the index of a joint's first degree of freedom in ``qvel`` and similar fields."""
+    """Set a default in Params to the index of a joint's first degree of freedom in ``qvel`` and similar fields."""
     return Element("qvel", joint)
 
 
 def dofs(*joints: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of joints' first degrees of freedom."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of joints' first degrees of freedom."""
     return [dof(name) for name in joints]
 
 
 def sensor(name: str) -> int:
-    """Make a default for Params: the index of a sensor's first number in ``sensordata``."""
+    """Set a default in Params to the index of a sensor's first number in ``sensordata``."""
     return Element("sensordata", name)
 
 
 def sensors(*names: str) -> Any:
-    """Make a default for a ``wp.array[int]`` in Params: the indices of sensors in ``sensordata``."""
+    """Set the default of a ``wp.array[int]`` in Params to the indices of sensors in ``sensordata``."""
     return [sensor(name) for name in names]
 
 
 def mocap(body: str) -> int:
-    """Make a default for Params: the index of a mocap body in ``mocap_pos`` and ``mocap_quat``."""
+    """Set a default in Params to a mocap body's index in ``mocap_pos`` and ``mocap_quat``."""
     return Element("mocap_pos", body)
 
 
@@ -331,14 +332,15 @@ class FromModel:
 
 
 def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
-    """Make a default for Params that a function computes from the compiled model and other parameters.
+    """Let a function compute a parameter's default from the compiled model and other parameters.
 
     For example, ``mass: float = lw.from_model(lambda model, p: model.body_subtreemass[p.trunk])`` is the mass of the
     robot. The parameter is computed again when another parameter changes, unless the user gave it a value.
 
     Args:
-        function: Function with two arguments: the MjModel, and an object with parameters as attributes. The attributes
-            are all parameters with ordinary defaults, and computed parameters that Params declares earlier.
+        function: Function with two arguments: the MjModel, and an object whose attributes are parameters. The object
+            has every parameter with an ordinary default. It also has the computed parameters that Params declares
+            before this one.
     """
     return FromModel(function)
 
@@ -357,8 +359,8 @@ class Planning:
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """Options of the planner's worlds, by their names in ``lw.make``, such as ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by their names in the task's ``Params``. They are ignored if MPPI has a value
-    function, because it was fitted to the unchanged task's rewards."""
+    """Parameters of the planner's worlds, by their names in the task's ``Params``. MPPI with a value function
+    ignores them, because the value function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -429,7 +431,7 @@ class Task:
       accumulate. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``), because these are computed afterwards.
     - ``startup``: model fields and lasting memory. Resets do not change them.
-    - ``substep``: memory and lasting memory. ``advance``: memory and lasting memory of ``s1``.
+    - ``substep`` and ``advance``: memory and lasting memory. ``advance`` writes the memory of ``s1``.
 
     A reset calls ``reject`` before the substeps of ``settle``. During these substeps, ``substep`` is not called.
 
@@ -487,7 +489,7 @@ class Task:
     keyframe: ClassVar[str | None] = None
     """Name of the keyframe that a reset loads before it calls ``initialize``; None means ``qpos0``."""
     draws: ClassVar[int] = 10
-    """Maximum number of initial states that a reset draws if ``reject`` refuses them. If ``reject`` refuses all, the
+    """Maximum number of initial states that a reset draws until ``reject`` accepts one. If ``reject`` refuses all, the
     reset uses the last one."""
     settle: ClassVar[int] = 0
     """Number of substeps that are simulated before the first observation of an episode, so that objects come to rest.
@@ -519,7 +521,7 @@ class Task:
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-        """Return JSON values by name, such as a robot's gains, which ONNX files store as metadata.
+        """Return metadata for ONNX files, such as a robot's gains. The values must be convertible to JSON.
 
         The argument ``model`` is the compiled model, and ``p`` has the parameters as attributes.
         """

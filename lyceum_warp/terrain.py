@@ -107,9 +107,9 @@ class Terrain:
     """
 
     kinds: Mapping[str | Shape, int]
-    """Kinds of patches, each with a number of columns. A kind is a name from the table or a function ``shape(x, y,
-    difficulty, rng)`` that returns heights, (n, n) in m. Its arguments x and y are the points' coordinates relative to
-    the patch's centre, (n, n)."""
+    """Number of columns for each kind of patch. A kind is a name from the table or a function ``shape(x, y, difficulty,
+    rng)`` that returns heights, (n, n) in m. Its arguments x and y are the points' coordinates relative to the patch's
+    centre, (n, n)."""
     levels: int = 10
     """Number of rows."""
     patch: float = 8.0
@@ -177,9 +177,9 @@ class Terrain:
         """Add the ground to a model in place of the world's plane.
 
         The height field gets the plane's name, friction and material. Without a plane, the model gets a geom called
-        ``name``. A corner between patches in the middle of the field is at the plane's position. Corners have height 0,
-        so a robot that stood on the plane stands on the field. The model's extent, on which cameras depend, does not
-        change.
+        ``name``. One corner of a patch near the middle of the field is at the plane's position. All corners have height
+        0, so a robot at a corner has the same height above the ground as before. The model's extent, on which cameras
+        depend, does not change.
 
         Args:
             spec: The model, which is changed in place, for example in a task's ``edit_model``.
@@ -233,7 +233,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
-        ValueError: There is no such height field, or it does not have exactly one geom, fixed and upright.
+        ValueError: The model has no such height field, or the field's geom moves, is tilted or is not the only one.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:
@@ -245,8 +245,8 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     fixed = (model.body_weldid[model.geom_bodyid[geoms]] == 0).all()
     if len(geoms) != 1 or not fixed or not np.allclose(data.geom_xmat[geoms[0]], np.eye(3).ravel(), atol=1e-9):
         raise ValueError(
-            f"the height field {name!r} must be the shape of one fixed and upright geom: {len(geoms)} geoms have this "
-            "shape"
+            f"exactly one geom must use the height field {name!r}, and this geom must be fixed and upright: "
+            f"{len(geoms)} geoms use the height field"
         )
     position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
     nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
@@ -260,11 +260,11 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """Make a default for Params: the table of a model's height field.
+    """Set a default in Params to the table of a height field.
 
-    Pass it to ``lw.ground_height`` and ``lw.height_scan``. It has the shape (1 + points along y, 1 + points along x).
-    The first row has the points' x coordinates, and the first column has their y coordinates. All other elements are
-    heights. The coordinates are in the world's frame, in m. For example: ``ground: wp.array2d[float] =
+    Pass the table to ``lw.ground_height`` and ``lw.height_scan``. It has the shape (1 + points along y, 1 + points
+    along x). The first row has the points' x coordinates, and the first column has their y coordinates. All other
+    elements are heights. The coordinates are in the world's frame, in m. For example: ``ground: wp.array2d[float] =
     lw.height_field("terrain")``.
 
     Args:
@@ -274,7 +274,7 @@ def height_field(name: str) -> Any:
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """Make a default for Params: a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
+    """Set a default in Params to a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
     ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. For example: ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.

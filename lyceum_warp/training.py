@@ -1,4 +1,4 @@
-"""Train a learner and write its run folder, for the command line and for ``lw.train``."""
+"""Train a learner and write its run folder, as ``lw.train`` and ``lyceum-warp train`` do."""
 
 import contextlib
 import functools
@@ -76,10 +76,10 @@ def train(
     Policies are compared by ``mean_return`` if the learner evaluates the mean policy. Otherwise they are compared by
     ``return_mean``, the return of episodes under the policy before the update.
 
-    The policy and the complete state are saved at the start, at the end, and every 30 s. Both are saved more often if
-    saving takes at most 1 % of the time; see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and
-    produces the same numbers. After Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and
-    ends. A second signal ends it at once.
+    The policy and the complete state are saved at the start, at the end, and every 30 s. Fast saves happen more often;
+    see ``lyceum_warp.runs.saving``. A killed run resumes from the last save and produces the same numbers. After
+    Ctrl-C, SIGTERM or SIGHUP, the run finishes the current iteration, is saved and ends. A second signal ends it at
+    once.
 
     Args:
         learner: The algorithm, such as ``NPG(env)``, or another ``lyceum_warp.algos.learner.Learner``.
@@ -96,10 +96,11 @@ def train(
             none. If a video fails, a warning is logged, and training continues without videos.
         camera: Camera of the videos: the name or index of a camera in the model, a ``viz.cameras.FreeCamera``, or
             "free" for MuJoCo's default camera.
-        transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. The default
-            makes only comparisons that take seconds. After training on a GPU, it compares with the C engine. After
-            training with other physics, it compares with exact physics. ``transfer=True`` also compares with the Warp
-            engine, and with every named physics of the task.
+        transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
+            slow comparisons are omitted. After training on a GPU, the default compares the policy's results on the Warp
+            engine with those on the C engine. After training with other physics than "exact", it compares the results
+            with those in "exact" physics. ``transfer=True`` always compares the two engines and all physics options of
+            the task.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.

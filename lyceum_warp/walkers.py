@@ -174,7 +174,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     found: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
-        "clock": (-1.0, -1.0),  # left and right are half a cycle apart, so the clock moves by half a cycle
+        "clock": (-1.0, -1.0),  # exchanging the legs shifts the clock's sine and cosine by half a cycle
         **dict.fromkeys(("foot_height", "foot_air_time", "foot_contact"), feet), "foot_force": vectors,
         # qpos and qvel also contain joints that the task does not use
         "qpos": ([*range(7), *(partner[hinges] + 6)], [*flip, 1.0, *spin, *sign[hinges]]),
@@ -255,7 +255,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """List the geoms of the feet that can touch the ground (any geom of the world body).
+    """List the feet's geoms that can touch the ground. The ground is every geom of the world body.
 
     Raises:
         ValueError: A foot has no geom that can touch the ground.
@@ -332,7 +332,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Add the contact margin with the ground, minus the gap, to the spheres' radii."""
+    """Increase the radii to the distance at which the ground exerts forces on the geom: margin - gap."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -372,8 +372,8 @@ def prepare_walker(
     """Prepare a model for a velocity task: add force sensors to the feet, and ignore the friction of the ground.
 
     The model's own sensors are removed, because they cost time and the task does not read them. Geoms of the feet get
-    priority in contacts, so their randomized friction applies. Ordinary contacts replace explicit contact pairs of a
-    foot with the ground.
+    priority in contacts, so their randomized friction applies. Explicit contact pairs between a foot and the ground are
+    deleted. Ordinary contacts then take their place.
 
     Args:
         spec: The model, which is changed in place.
@@ -413,10 +413,10 @@ def prepare_walker(
 
 
 def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:
-    """Add sites of feet to a model in place.
+    """Add a site to a model for each foot.
 
     Args:
-        spec: The model.
+        spec: The model, which is changed in place.
         feet: For each new site, a body's name and the site's position in the body, in m. A joint's or geom's name
             stands for its body.
 
@@ -474,8 +474,8 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
 def round_feet(spec: mujoco.MjSpec, feet: Sequence[str], *, radius: float = 0.015) -> None:
     """Replace each colliding box of a foot by two capsules along its longer side, for use on height fields.
 
-    MuJoCo Warp 4.0 finds wrong contacts between boxes and height fields, which throw robots into the air. The capsules
-    lie within the outline of the sole and touch its lowest plane. Masses do not change.
+    MuJoCo Warp 4.0 finds wrong contacts between boxes and height fields. These contacts throw robots into the air. The
+    capsules lie within the outline of the sole and touch its lowest plane. Masses do not change.
 
     Args:
         spec: The model after ``prepare_walker``, which is changed in place.

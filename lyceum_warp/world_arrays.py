@@ -19,7 +19,7 @@ from lyceum_warp.task import MEMORIES
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
-    """Estimate the bytes per world without the engine's arrays."""
+    """Estimate the bytes that each world needs outside the engine's arrays."""
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
@@ -64,7 +64,7 @@ class WorldArrays:
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
         self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of successes in a row; it has no columns if ``success_steps`` is 1."""
+        """Number of consecutive successes, (nworld, 1), or (nworld, 0) if ``success_steps`` is 1."""
         own = ("memory", "lasting_memory", "metric_sums", "success_counts")
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
@@ -96,7 +96,7 @@ class WorldArrays:
         layouts = self.task.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
-        """Shared memory, (1, size of Shared), and sums in units of 1 / ``kernels.steps.UNIT``, (size of Sums,)."""
+        """``shared`` has shape (1, size of Shared). ``sums`` has shape (size of Sums,). It stores 1.0 as ``UNIT``."""
         self._shares = wp.zeros((self.nworld, sums), dtype=float)
         if layouts:
             for batch in (self.after, self.before):

@@ -122,5 +122,5 @@ def test_error_of_an_option_passed_to_set_params_names_it_as_an_option() -> None
 
 def test_get_state_with_a_mask_but_without_out_raises_an_error() -> None:
     env = lw.make("hopper", nworld=2)
-    with pytest.raises(ValueError, match="pass out as well"):
+    with pytest.raises(ValueError, match="pass the tensor as out="):
         env.get_state(mask=torch.tensor([True, False]))

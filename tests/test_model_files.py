@@ -71,8 +71,8 @@ def test_error_of_a_robot_without_a_source_names_three_ways_to_install_it(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(
         FileNotFoundError,
-        match=r"leg/scene\.xml .*: pip install mujoco-menagerie; .*: pip install 'lyceum-warp\[menagerie\]'; .* "
-        r"MENAGERIE_ROOT to a checkout: git clone https",
+        match=r"leg/scene\.xml .*: pip install mujoco-menagerie .*: pip install 'lyceum-warp\[menagerie\]'\. .*: git "
+        "clone https.*, and set MENAGERIE_ROOT to the clone",
     ):
         lw.menagerie_model("leg/scene.xml").spec()
 

@@ -29,7 +29,7 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"cone": "round"}, "cone must be 'pyramidal' or 'elliptic', not 'round'"),
         ({"integrator": "rk5"}, "integrator must be 'euler', 'rk4', 'implicit' or 'implicitfast', not 'rk5'"),
         ({"solver": 4}, r"solver must be a dict of limits, such as solver=\{'iterations': 4\}, not 4"),
-        ({"solver": {"itrations": 4}}, "solver has no limit 'itrations': it takes 'iterations', 'ls_iterations'"),
+        ({"solver": {"itrations": 4}}, "there is no solver limit 'itrations': use 'iterations', 'ls_iterations'"),
         ({"solver": {"iterations": 0}}, "solver's iterations must be a whole number from 1 .*, not 0"),
         ({"deterministic": 0}, "deterministic must be True or False, not 0"),
         ({"nworld": True}, "nworld must be a whole number .*, not True"),

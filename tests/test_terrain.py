@@ -156,7 +156,7 @@ def test_height_table_of_a_missing_or_moving_field_raises_an_error() -> None:
     body = spec.worldbody.add_body(mass=1, inertia=[1, 1, 1])
     body.add_freejoint()
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="plate", mass=0)
-    with pytest.raises(ValueError, match="'plate' must be the shape of one fixed and upright geom"):
+    with pytest.raises(ValueError, match="exactly one geom must use the height field 'plate'"):
         height_table(spec.compile(), "plate")
 
 

@@ -39,7 +39,7 @@ class ControlReport:
     plans: int
     """Number of plans, excluding the first plan of each trajectory."""
     first_plan_ms: float | None
-    """Longest planning time of a first plan, in milliseconds."""
+    """Longest planning time, in milliseconds, among the first plans of all trajectories."""
     plan_mean_ms: float | None
     """Mean planning time, in milliseconds."""
     plan_p50_ms: float | None

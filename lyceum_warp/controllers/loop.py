@@ -48,8 +48,9 @@ def control(
         The trajectory of the episode. Its ``period`` is the plant's time step.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, an
-            action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
+        ValueError: The environment has several worlds or automatic resets, or its episode is already over.
+        ValueError: The environment has no horizon, and ``steps`` is None.
+        ValueError: An action has the wrong shape or is not finite, or a plan is shorter than ``replan_every``.
     """
     every = whole_number("replan_every", replan_every, low=1)
     checked, limit, first = begin_episode(env, controller, steps, seed, reset=reset, on_step=on_step, on_abort=on_abort)

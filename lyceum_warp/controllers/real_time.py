@@ -28,10 +28,10 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number
 
 # all in seconds
-_SPIN = 0.0005  # at the end of a wait, poll the clock for this time instead of sleeping
+_SPIN = 0.0005  # a wait sleeps until its last 0.5 ms, and then polls the clock
 _PATIENCE = 0.2  # timeout for an unfinished plan after an exception
 _EXIT_PATIENCE = 5.0  # timeout for an unfinished plan when the program exits
-_SWITCH_INTERVAL = 0.0005  # shorter than Python's default of 5 ms, which is most of a fast plant's period
+_SWITCH_INTERVAL = 0.0005  # Python's default of 5 ms is too long for plants with a short period
 
 Published: TypeAlias = tuple[int, torch.Tensor, torch.Tensor, torch.Tensor | None]
 """A step's index, the state and the observation before the step, and its action."""
@@ -61,15 +61,15 @@ def control_async(
     step old. If every plan takes less than a period, they are exactly one step old.
 
     With ``predict``, a copy of the plant predicts the state after the current step, and the controller plans from this
-    state. The copy runs no events of the task, such as pushes, and draws other random numbers than the plant. If
-    planning takes less than a period, the plan's first action is applied in the state for which it was planned. Without
+    state. The copy runs no events of the task, such as pushes. Its random numbers differ from the plant's. If planning
+    takes less than a period, the plan's first action is applied in the state for which it was planned. Without
     ``predict``, this action comes too late. If the copy's episode ends in the predicted step, the controller plans from
     the measured state.
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
-    graph while another thread launches kernels. For the same reason, ``on_step`` must not call functions of given
-    states, such as ``env.get_reward(before, action, after)``, which capture graphs.
+    graph while another thread launches kernels. For the same reason, ``on_step`` must not capture graphs.
+    Getters with states as arguments, such as ``env.get_reward(before, action, after)``, capture graphs.
 
     During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
     on time, put it on the CPU. Leave one CPU core free: reduce ``nthread`` of the planner's environment. A plant on the
@@ -99,8 +99,9 @@ def control_async(
         The episode.
 
     Raises:
-        ValueError: The environment has several worlds or automatic resets, the episode is over or may never end, a
-            number is out of range, or an action has the wrong shape or is not finite.
+        ValueError: The environment has several worlds or automatic resets, or its episode is already over.
+        ValueError: The environment has no horizon, and ``steps`` is None.
+        ValueError: A number is out of range, or an action has the wrong shape or is not finite.
         Exception: Any exception that the controller raises.
     """
     check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
@@ -148,7 +149,7 @@ class Clock:
             pass
 
     def wait_for(self, event: threading.Event) -> None:
-        """Wait until an event is set. The loop waits for the first plan with this method."""
+        """Wait until an event is set. The loop uses this method to wait for the first plan."""
         event.wait()
 
 
@@ -255,8 +256,8 @@ class PlannerThread:
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
         """Pass the thread a measured state, and the action that the plant applies in this state.
 
-        The thread plans next from the newest state. The action is None if the plant waits for the plan. The caller must
-        not change the tensors.
+        The next plan of the thread starts in the newest state. The action is None if the plant waits for the plan. The
+        caller must not change the tensors.
         """
         self._states.put((step, state, obs, action))
 
@@ -331,7 +332,7 @@ class PlannerThread:
         actions = controller(state, obs, controller.passed(self._first + last, self._first + start), step)
         plan = TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead)
         self._plans.append(plan)
-        # read the quality only now, because the plant may be waiting for the plan
+        # read the quality after publishing the plan, so that the plant gets the plan sooner
         self._qualities[plan.index] = controller.quality()
 
 

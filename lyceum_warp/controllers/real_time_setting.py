@@ -12,7 +12,7 @@ from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.env import Env
 
 SHARE = 0.8
-"""Maximum planning time (99 % quantile) of a setting that meets a deadline, as a fraction of the deadline."""
+"""A setting meets a deadline if 99 % of its plans take at most this fraction of the deadline."""
 
 _SECONDS = 0.4  # a measurement lasts this long, but at least _STEPS steps
 _STEPS = 12
@@ -44,7 +44,8 @@ class RealTimeChoice:
     planning_time: float
     deadline: float
     larger: tuple[int, float] | None
-    """The smallest measured number of samples that misses the deadline, and its planning time, or None."""
+    """The next larger number of samples, and its planning time, which misses the deadline. None if there is no larger
+    number, or if no setting meets the deadline."""
 
     @property
     def replan_every(self) -> int:

@@ -31,8 +31,8 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
         first, one = next(iter(episodes.items()))
         if other.task != one.task:
             raise ValueError(
-                f"{path} is an episode of the task {other.task!r}, and {first} of the task {one.task!r}: load the "
-                "files separately"
+                f"{path} is an episode of the task {other.task!r}, but {first} is an episode of the task {one.task!r}: "
+                "load the files separately"
             )
         if difference := _difference(one.state_parts, other.state_parts):
             raise ValueError(f"{path} has a different model than {first}: its states have {difference}")

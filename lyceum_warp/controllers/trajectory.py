@@ -50,8 +50,8 @@ class Trajectory:
     """
 
     states: torch.Tensor
-    """States, (steps + 1, state_size) float64. If a fault ended the episode, the last state is the first state of the
-    next episode."""
+    """States, (steps + 1, state_size) float64. If a fault ends the episode, the world restarts in the same step. The
+    last state then belongs to the next episode."""
     obs: torch.Tensor
     """Observations of the states, (steps + 1, nobs) float32. If a fault ended the episode, the last valid observation
     is repeated."""
@@ -104,7 +104,7 @@ class Trajectory:
     seed: int | None
     """Seed of the initial state and of the controller."""
     controller: Mapping[str, Any]
-    """The controller's ``name``, and its settings, ``engine`` and ``device`` if known."""
+    """The controller's ``name``, settings, ``engine`` and ``device``. Unknown values are missing."""
     state_parts: Mapping[str, Sequence[int]]
     """Columns [start, stop] of each part of a state."""
     obs_parts: Mapping[str, Sequence[int]]
@@ -147,7 +147,7 @@ class Trajectory:
         return torch.arange(self.steps) - self.plan_steps[self.plan_of]
 
     def part(self, name: str) -> torch.Tensor:
-        """Get a view of one part of all states, (steps + 1, size), such as ``part("qpos")``.
+        """Get one part of every state as a view, (steps + 1, size). For example, ``part("qpos")`` gets the positions.
 
         Raises:
             ValueError: The states have no part of this name.
@@ -160,9 +160,10 @@ class Trajectory:
     def save(self, path: str | Path) -> Path:
         """Write the trajectory to a file atomically, and return the file's path.
 
-        The file is a compressed ``.npz`` that numpy reads without pickle. Each tensor is an array with the attribute's
-        name. The 0-d array ``info`` is a string with a JSON object. The object has the other attributes, and
-        ``format``, which is 1. For example, the positions are ``states[:, slice(*info["state_parts"]["qpos"])]``.
+        The file is a compressed ``.npz`` that numpy reads without pickle. The array of each tensor has the same name as
+        the tensor. The 0-d array ``info`` is a string with a JSON object. This object has all attributes that are not
+        tensors, and the number ``format``, which is 1. For example, the positions are
+        ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}

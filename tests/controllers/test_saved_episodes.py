@@ -92,7 +92,7 @@ def test_episodes_of_two_tasks_raise_an_error(folder: Path, tmp_path: Path) -> N
     other = lw.control(lw.make("cartpole", autoreset=False, horizon=3), lambda state, obs: torch.zeros(1))
     path = other.save(tmp_path / "other.npz")
     first = min(folder.iterdir())
-    message = f"{path} is an episode of the task 'cartpole', and {first} of the task 'point_mass'"
+    message = f"{path} is an episode of the task 'cartpole', but {first} is an episode of the task 'point_mass'"
     with pytest.raises(ValueError, match=message):
         load_episodes([folder, path])
 
@@ -111,7 +111,7 @@ def test_episode_of_another_model_raises_an_error(folder: Path, env: lw.Env, tmp
         check_episode(plain, lw.Trajectory.load(first), "mine")
 
 
-def test_missing_damaged_and_newer_files_raise_a_one_line_error(folder: Path, tmp_path: Path) -> None:
+def test_files_that_cannot_be_read_raise_a_one_line_error(folder: Path, tmp_path: Path) -> None:
     newer, broken, empty = tmp_path / "newer.npz", tmp_path / "broken.npz", tmp_path / "empty"
     np.savez(newer, info=np.array(json.dumps({"format": 2})))
     broken.write_bytes(min(folder.iterdir()).read_bytes()[:-100])
