@@ -11,7 +11,7 @@ import lyceum_warp as lw
 
 
 def smoothed(noise: np.ndarray, betas: tuple[float, ...]) -> np.ndarray:
-    """Smooth noise of shape (horizon, ...) over time.
+    """Apply a smoothing filter over time to noise of shape (horizon, ...).
 
     From the third step on, each step is mixed with the previous two.
     """

@@ -161,7 +161,7 @@ def test_commands_and_python_blocks_of_a_page_run_in_order(
 
 
 @pytest.mark.long
-def test_tasks_of_the_page_own_task_pass_check_task(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_walkthrough_of_a_new_task_trains_a_good_policy(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         check_video()
     except NoVideoError as error:

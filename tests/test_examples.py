@@ -41,7 +41,7 @@ def test_train_example_improves_and_saves_the_policy(run, tmp_path: Path) -> Non
 
 
 @pytest.mark.long
-def test_own_policy_example_improves_its_policy(run) -> None:
+def test_example_with_a_custom_network_increases_the_return(run) -> None:
     lines = run("own_policy.py", "--iterations", "8")
     returns = numbers(r"return +(-?[\d.]+)", lines)
     assert len(returns) == 9

@@ -30,7 +30,7 @@ def lay_down(env: lw.Env, world: int) -> None:
 
 
 def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
-    """Step an environment with a faulty world, and one without faults. All other worlds must be bitwise equal."""
+    """Step an environment with a faulty world and one without. Their other worlds must be equal, bit for bit."""
     others, found = torch.arange(N) != BAD, Done(0)
     generator = torch.Generator().manual_seed(0)
     for i in range(steps):

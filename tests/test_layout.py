@@ -45,7 +45,7 @@ ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
 """Folders whose tests cover several modules or subpackages."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
-"""Public names that begin with an underscore."""
+"""Methods of namedtuples, which are public although they begin with an underscore."""
 
 
 def module_name(path: Path) -> str:
@@ -103,7 +103,7 @@ def test_no_module_imports_itself_indirectly() -> None:
     def visit(name: str, path: tuple[str, ...]) -> None:
         assert name not in path, " imports ".join([*path[path.index(name) :], name])
         if name not in finished:
-            # only task modules import this module, and no module imports tasks
+            # only tasks import the package itself, so it cannot be part of a cycle
             for other in imports()[name] - {"lyceum_warp"}:
                 visit(other, (*path, name))
             finished.add(name)

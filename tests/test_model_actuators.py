@@ -16,7 +16,7 @@ XML = """
 """
 
 
-def test_velocity_servo_stops_at_the_limits_of_the_former_position_range() -> None:
+def test_target_of_a_velocity_servo_stays_in_the_old_control_range() -> None:
     spec = mujoco.MjSpec.from_string(XML)
     for name in ("free", "motor"):
         spec.delete(spec.actuator(name))

@@ -96,7 +96,7 @@ def test_actions_of_a_task_have_bounds_only_with_an_action_range() -> None:
     np.testing.assert_array_equal([free.low, free.high], [[-np.inf], [np.inf]])
 
 
-def test_state_contains_physics_snapshots_counters_and_memory() -> None:
+def test_state_adds_snapshots_and_counters_and_memory_to_the_integration_state() -> None:
     compiled = model()
     space = state_space(compiled, [describe(compiled, "qacc")], [], {"memory": 4})
     assert space.dtype == torch.float64

@@ -16,7 +16,7 @@ from lyceum_warp.runs.folder import Run
 
 @pytest.fixture
 def env(shared_env: SharedEnv) -> lw.Env:
-    """Tests that compare numbers make their own environment, because each algorithm advances its random streams."""
+    """Tests that compare numbers must not use this environment, because other tests advance its random streams."""
     return shared_env("point_mass", nworld=2)
 
 
@@ -77,7 +77,7 @@ def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.E
             lw.train(algorithm(given), folder, iterations=9, resume=True)
 
 
-def test_training_of_a_learner_after_some_iterations_writes_a_complete_run(six: Path, tmp_path: Path) -> None:
+def test_run_of_a_partly_trained_learner_is_complete(six: Path, tmp_path: Path) -> None:
     npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
     for _ in range(3):
         next(npg)
@@ -126,7 +126,7 @@ def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
         lw.load(six, which="worst")
 
 
-def test_best_policy_without_evaluations_has_the_highest_sampled_return(tmp_path: Path) -> None:
+def test_best_policy_has_the_highest_sampled_return_if_evaluations_are_off(tmp_path: Path) -> None:
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
     returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]

@@ -103,7 +103,7 @@ def test_kinematic_tables_give_the_positions_and_contacts_of_feet(shape: str) ->
 
 @pytest.mark.parametrize("shape", ["cylinder", "ellipsoid"])
 def test_feet_of_other_shapes_touch_the_ground_at_the_corners_of_their_boxes(shape: str) -> None:
-    """The corners of the box are at least as low as the shape of the foot."""
+    """No point of the foot is lower than the lowest corner of its bounding box."""
     model, p = made(shape)
     soles = walkers.soles(model, p)
     for data in random_states(model, 50):
@@ -187,7 +187,7 @@ def test_foot_sites_are_added_at_a_named_element_of_their_body() -> None:
         walkers.add_feet(spec, {"d": ("toe", (0.0, 0.0, 0.0))})
 
 
-def test_round_feet_have_the_lowest_height_and_the_friction_of_their_boxes() -> None:
+def test_round_feet_keep_the_height_and_friction_of_the_boxes() -> None:
     spec = mujoco.MjSpec.from_string(XML.format(shape="box"))
     before = spec.copy().compile()
     walkers.prepare_walker(spec, ["ankle", "peg_end"])

@@ -78,7 +78,7 @@ def predicted_and_measured(env: lw.Env) -> tuple[torch.Tensor, torch.Tensor]:
     return torch.stack(others), measured[episode.plan_steps[1:] + 1]
 
 
-def test_predicted_states_equal_the_next_states_of_the_plant_except_for_the_random_stream(env: lw.Env) -> None:
+def test_predicted_and_measured_states_differ_only_in_the_random_stream(env: lw.Env) -> None:
     predicted, measured = predicted_and_measured(env)
     key = env.state_space.parts["key"]
     assert (predicted[:, key] != measured[:, key]).all()

@@ -116,7 +116,7 @@ def run(env: lw.Env, steps: int) -> list[torch.Tensor]:
 
 
 def test_deleted_torch_graph_does_not_break_a_capture() -> None:
-    """CUDA forbids deleting a graph during a capture, but garbage collection may do so at any time."""
+    """CUDA forbids deleting a graph during a capture. The garbage collector may delete a graph at any time."""
     env = lw.make("hopper", nworld=8, device=CUDA)
     env.step()
     graph, x = torch.cuda.CUDAGraph(), torch.zeros(4, device=CUDA)

@@ -21,7 +21,7 @@ CHOSEN = [0, 3, *range(50, 150)]
 
 
 def draws(model: mujoco.MjModel, turn: int) -> dict[str, np.ndarray]:
-    """Return factors for the model fields. Only the factors of the worlds ``CHOSEN`` depend on ``turn``."""
+    """Return factors for the model fields. ``turn`` changes the factors only in the worlds that ``CHOSEN`` lists."""
     found = {}
     for name in DRAWN:
         size = describe_model_field(model, name).size
