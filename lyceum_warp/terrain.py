@@ -260,7 +260,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """Set a default in Params to the table of a height field.
+    """Set a default in Params to a table of a height field's heights.
 
     Pass the table to ``lw.ground_height`` and ``lw.height_scan``. It has the shape (1 + points along y, 1 + points
     along x). The first row has the points' x coordinates, and the first column has their y coordinates. All other

@@ -98,7 +98,7 @@ def train(
             "free" for MuJoCo's default camera.
         transfer: Whether to run ``lw.transfer`` at the end, and to write ``transfer.json`` into the folder. By default,
             slow comparisons are omitted. After training on a GPU, the default compares the policy's results on the Warp
-            engine with those on the C engine. After training with other physics than "exact", it compares the results
+            engine with those on the C engine. After training with physics other than "exact", it compares the results
             with those in "exact" physics. ``transfer=True`` always compares the two engines and all physics options of
             the task.
         resume: Whether to continue the run in the folder. Make the learner with the same arguments as before.

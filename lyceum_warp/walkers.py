@@ -332,7 +332,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Increase the radii to the distance at which the ground exerts forces on the geom: margin - gap."""
+    """Increase the spheres' radii by margin - gap, the distance at which the ground exerts forces on the geom."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -432,13 +432,13 @@ def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]
 
 
 def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0) -> None:
-    """Turn the motors of joints into position servos in place. Existing servos do not change.
+    """Turn the motors of joints into position servos. Existing servos do not change.
 
     A servo reaches its motor's force limit at a position error of ``reach`` rad, so kp = limit / reach. It is
     critically damped at ``qpos0``: M s^2 + kd s + kp has a double root for the joint's inertia M.
 
     Args:
-        spec: The model.
+        spec: The model, which is changed in place.
         joints: Names of joints with one actuator each.
         reach: Position error at which a servo's force reaches its limit, in rad.
 

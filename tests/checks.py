@@ -47,7 +47,7 @@ def check_normal(samples: np.ndarray) -> None:
 
 
 def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Compute the Kolmogorov-Smirnov distance between column k of ``a`` and column k of ``b``, (columns,)."""
+    """Compute the Kolmogorov-Smirnov distance between each column of ``a`` and the same column of ``b``, (columns,)."""
     order = np.argsort(np.concatenate([a, b]), axis=0)
     ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
     return np.abs(ranks).max(axis=0)

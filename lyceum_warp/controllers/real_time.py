@@ -68,8 +68,8 @@ def control_async(
 
     Before the clock starts, a warm-up calls the controller three times with the first state, steps the plant three
     times, and restores the plant's state. The warm-up loads kernels and captures graphs, because Warp cannot capture a
-    graph while another thread launches kernels. For the same reason, ``on_step`` must not capture graphs.
-    Getters with states as arguments, such as ``env.get_reward(before, action, after)``, capture graphs.
+    graph while another thread launches kernels. For the same reason, ``on_step`` must not capture graphs. Getters
+    with states as arguments, such as ``env.get_reward(before, action, after)``, capture graphs.
 
     During the run, Python switches between threads more often than usual (``sys.setswitchinterval``). To keep the plant
     on time, put it on the CPU. Leave one CPU core free: reduce ``nthread`` of the planner's environment. A plant on the
