@@ -152,10 +152,11 @@ class SAC(Learner):
 
         # samples
         (least,) = team.largest(-default_capacity(env, team.size))
-        self.replay = Replay(env, -least if given.replay is None else -(-given.replay // team.size))
+        capacity = -least * team.size if given.replay is None else given.replay
+        self.replay = Replay(env, -(-capacity // team.size))
         own, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
-            given, replay=self.replay.steps * nworld, hidden=tuple(own["hidden"]), activation=own["activation"],
+            given, replay=capacity, hidden=tuple(own["hidden"]), activation=own["activation"],
             normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
             layer_norm=critics["layer_norm"], quantiles=critics["quantiles"],
             symmetry="exact" if self.policy.mirror is not None else given.symmetry,
@@ -193,8 +194,8 @@ class SAC(Learner):
     @property
     def title(self) -> str:
         """Name of the algorithm, and the size of the replay buffer."""
-        size = self.replay.nbytes * self.team.size / 1e9
-        return f"{self.algorithm} with a replay buffer of {self.config.replay:,d} samples ({size:.2g} GB)"
+        size, samples = self.replay.nbytes * self.team.size / 1e9, self.replay.steps * self._all_worlds
+        return f"{self.algorithm} with a replay buffer of {samples:,d} samples ({size:.2g} GB)"
 
     def __next__(self) -> SACIteration:
         config, rollout, team = self.config, self.rollout, self.team
