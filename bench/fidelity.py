@@ -163,9 +163,11 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         half = [str(pairs[name]["half_apart"] or f"> {steps[-1]}") for name in ("engines", "rounded", "moved")]
         lines.append([row.case["task"], str(row.case["nworld"]), *at, *half, str(pairs["engines"]["faults"])])
     title = (
-        "Differences of observations between the engines under random actions, median and 99 % over worlds after some "
-        f"steps; steps after which half of the worlds are apart by {APART:g}: the Warp engine's, and the C engine's if "
-        "its state is rounded to float32 after every step, or if its start was moved by the rounding of float32."
+        "Differences between the engines' observations under random actions: median and 99 % quantile over the worlds "
+        "after some steps. The three columns from 'half apart' compare copies with the C engine: they give the first "
+        f"step by which half of the worlds have differed by more than {APART:g}. 'Warp' is the Warp engine. 'rounded' "
+        "is a C engine that rounds its state to float32 after every step. 'moved' is a C engine that starts with added "
+        "noise of the size of a rounding error."
     )
     header = ["task", "worlds", "1 step", "10", "100", "last", "half apart: Warp", "rounded", "moved", "faults"]
     return [Table(title, header, lines)]

@@ -279,9 +279,10 @@ def draw(
     pending: wp.array[bool], row: wp.array[int], kind_out: wp.array[int], action_out: wp.array2d[float],
     twin_action_out: wp.array2d[float],
 ):  # fmt: skip
-    """Draw actions, and faults that start in this step, as a function of seed, step and world; launched over (nworld,).
+    """Draw each world's action, and choose the fault that starts in this step, if any; launched over (nworld,).
 
-    Every fourth world gets no fault. A world whose last fault is not reported yet gets no further fault.
+    The random numbers depend on the seed, the step and the world. Every fourth world gets no fault. A world whose last
+    fault is not reported yet gets no further fault.
     """
     w = wp.tid()
     rng = wp.rand_init(int(wp.rand_init(seed, step)), w)

@@ -141,7 +141,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):  # runs at every reset,
 
 
 @wp.func
-def event(s: World, p: Params, rng: Row[wp.uint32]):  # draws a command every 2 s and a push every second, on average
+def event(s: World, p: Params, rng: Row[wp.uint32]):  # mean times: 2 s between commands, 1 s between pushes
     if lw.uniform(rng, 0.0, 2.0) < p.dt:
         s.command[0] = lw.uniform(rng, 0.0, 1.0 + s.level[0] * (p.fastest - 1.0))
     if lw.uniform(rng, 0.0, 1.0) < p.dt:

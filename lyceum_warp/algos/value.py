@@ -151,7 +151,11 @@ class ValueFunction(Normalized):
 
 
 BOUND = 10.0
-"""Returns and advantages are outliers if they differ from their mean by more than this many standard deviations."""
+"""The limit for outliers, in standard deviations of the returns.
+
+A return is an outlier if it is further than this from the mean return. An advantage is an outlier if its absolute value
+is larger than this.
+"""
 
 
 def value_group(env: Env, given: str | None) -> str:

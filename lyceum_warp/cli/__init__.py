@@ -18,7 +18,7 @@ from lyceum_warp.viz import NoVideoError
 _COMMANDS = {
     "tasks": ("list_tasks", "List the tasks of the package, their sizes and the sources of their models."),
     "new": ("new_task", "Write a task file for a model."),
-    "check": ("check", "Check that a task follows every rule of an environment."),
+    "check": ("check", "Check that a task follows the package's rules."),
     "train": ("train", "Train a policy on a task, with NPG, PPO or SAC."),
     "eval": ("evaluate", "Evaluate a run's policy, and print statistics of its episodes."),
     "export": ("export", "Write a run's policy to an ONNX or .pt2 file."),

@@ -1,4 +1,4 @@
-"""Check that a task follows the rules of an environment: lyceum-warp check."""
+"""Check that a task follows the package's rules: lyceum-warp check."""
 
 import dataclasses
 from typing import Annotated
@@ -13,7 +13,7 @@ from lyceum_warp.testing import CHECKS, check_task
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Check:
-    """Check that a task follows every rule of an environment, and print the rules and the time of each check.
+    """Check that a task follows the package's rules, and print each rule and the time of its check.
 
     All tasks of the package follow the rules. For example, steps from a saved state give the same numbers, and a fault
     does not affect other worlds. Functions write only their outputs, and read within bounds. Check a new task on both

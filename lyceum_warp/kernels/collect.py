@@ -58,7 +58,7 @@ def store_outputs(
 ):
     """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
 
-    If ``first_only`` is set, only a world's first episode has a return, and the return of later episodes is NaN.
+    If ``first_only`` is set, every return after a world's first episode is NaN.
     """
     w, i = wp.tid()
     t = index_in[0]

@@ -34,7 +34,7 @@ def faults_of_rows(
     fault_out: wp.array[int],
     first: int,
 ):
-    """Find faults of the C engine in the masked worlds; launched over (nworld,).
+    """Check the masked worlds of the C engine for faults; launched over (nworld,).
 
     The first ``nphysics`` columns of ``state`` are time, qpos, qvel and act. ``warning`` holds counters, (nworld, kind,
     2), which this kernel clears. The kinds are those of mjtWarning: 0 inertia, 1 contacts full, 2 constraints full, 3

@@ -79,7 +79,7 @@ def height_scan(
     base: wp.vec3,
     orientation: wp.vec4,
 ):
-    """Write the heights of a robot's base above the ground at points around it.
+    """Write the height of a robot's base minus the height of the ground at each of the given points.
 
     Args:
         row: A row, such as a part of an observation, with an element for each point.
@@ -107,9 +107,9 @@ def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
 def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
     """Raise, keep or lower the terrain level for the next episode, as in Rudin et al. (2021).
 
-    The level rises if the robot walked more than half a patch. Otherwise the level falls, but not below 0, if the robot
-    walked less than half the commanded distance. After the last level, the next level is random.
-    Source: arXiv 2109.11978, section 3.2.
+    A robot that walked more than half a patch moves up one level. Any other robot that walked less than half the
+    commanded distance moves down one level. Level 0 is the lowest. A robot that moves up from the highest level gets
+    a random level. Source: arXiv 2109.11978, section 3.2.
 
     Args:
         level: The level of the episode that ended, from 0.
@@ -144,10 +144,10 @@ def start_on_terrain(
     later levels.
 
     Args:
-        level: The level, from 0: one number in lasting memory.
-        column: The column, from 0: one number in lasting memory.
-        walked: One number in lasting memory, written by ``follow_walk``.
-        commanded: One number in lasting memory, written by ``follow_walk``.
+        level: The world's level, from 0. Declare it in World with ``lw.lasting_memory()``.
+        column: The world's column, from 0. Declare it in the same way.
+        walked: The walked distance, which ``follow_walk`` writes. Declare it in the same way.
+        commanded: The commanded distance, which ``follow_walk`` writes. Declare it in the same way.
         origins: ``lw.Terrain.origins``, (levels, columns).
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         rng: The world's random numbers.

@@ -41,6 +41,6 @@ def from_end(report: wp.array2d[int], place: int, index: int, size: int) -> int:
 def element(report: wp.array2d[int], place: int, values: Any, index: Any):
     """Return one element of the result of a function call.
 
-    The instrumented source passes the call as the argument ``values``, so that the call runs only once.
+    The instrumented source replaces ``f(x)[i]`` by ``element(report, place, f(x), i)``, which calls ``f`` only once.
     """
     return values[at(report, place, index, len(values))]

@@ -153,7 +153,7 @@ def perturb(
     high_in: wp.array[float],
     action_out: wp.array3d[float],
 ):
-    """Add correlated, smoothed noise to plans and clip the sum to the bounds; launched over (nsample, nact).
+    """Add correlated, smoothed noise to plans, and clip the actions to their bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise covariance: n_t = L z_t for standard normal z_t. Smoothing
     follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). If ``include_plan``
@@ -257,7 +257,7 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
 
 @wp.kernel(enable_backward=False, module=_TILES)
 def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
-    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched as one block per plant.
+    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched with one block for each plant.
 
     If all samples failed, all weights are zero. The summary is the best return, the mean return, the effective sample
     size 1 / sum w^2, and the number of failed samples.
@@ -316,7 +316,7 @@ def weigh_elites(
     weight_out: wp.array[float],
     summary_out: wp.array2d[float],
 ):
-    """Weigh the best samples equally and the others by zero; launched as one block per plant.
+    """Weigh the best samples equally and the others by zero; launched with one block for each plant.
 
     ``weigh`` explains the entries of the summary. Failed samples have zero weight, even if fewer than ``elites``
     samples remain.
@@ -354,11 +354,12 @@ def fit_deviation(
     summary_in: wp.array2d[float],
     deviation_out: wp.array3d[float],
 ):
-    """Fit the standard deviation of the noise to the weighted samples; launched as one block per element of the plans.
+    """Fit the standard deviation of the noise to the weighted samples.
 
-    The plan is the weighted mean of the samples. The result is the samples' standard deviation around this mean,
-    divided by ``spread``, but at least ``smallest``. ``spread`` is the standard deviation that smoothing gives to
-    standard normal noise in each step. If all samples failed, the standard deviation does not change.
+    The launch has one block for each element of the plans. The plan is the weighted mean of the samples. The result is
+    the samples' standard deviation around this mean, divided by ``spread``, but at least ``smallest``. ``spread`` is
+    the standard deviation that smoothing gives to standard normal noise in each step. If all samples failed, the
+    standard deviation does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
@@ -384,7 +385,7 @@ def average(
     summary_in: wp.array2d[float],
     plan_out: wp.array3d[float],
 ):
-    """Average the samples' actions by their weights; launched as one block per element of the plans.
+    """Average the samples' actions by their weights; launched with one block for each element of the plans.
 
     If all samples failed, the plan does not change.
     """

@@ -31,8 +31,8 @@ def substream(base: wp.uint32, number: int) -> wp.uint32:
 def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
     """Draw from U(low, high) and advance the stream. Each element of a vector is drawn from its own range.
 
-    The stream is a row with one element, because Warp passes numbers by value: a function cannot change a number that
-    it gets.
+    Warp passes numbers by value, so a function cannot change a number of its caller. The stream is therefore a row with
+    one element.
     """
     state = rng[0]
     value = wp.randf(state, low, high)

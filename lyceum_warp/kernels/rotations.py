@@ -11,7 +11,7 @@ from lyceum_warp.kernels.random import uniform
 
 @wp.func
 def quat_mul(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """Multiply two quaternions, a b: the rotation b followed by a.
+    """Multiply two quaternions. The product is the rotation by ``b``, followed by the rotation by ``a``.
 
     (w, v) = (a_w b_w - a_v . b_v, a_w b_v + b_w a_v + a_v x b_v), as mju_mulQuat.
     """
@@ -43,7 +43,7 @@ def quat_rotate(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 def quat_rotate_inverse(q: wp.vec4, v: wp.vec3) -> wp.vec3:
     """Rotate a vector from the world frame into the frame with orientation q, such as a body's own frame.
 
-    The result is v - 2 u x (w v - u x v) for q = (w, u), as mju_rotVecQuat computes it with the inverse.
+    The result is v - 2 u x (w v - u x v) for q = (w, u). It equals mju_rotVecQuat for the inverse of q.
     """
     u = wp.vec3(q[1], q[2], q[3])
     return v - 2.0 * wp.cross(u, q[0] * v - wp.cross(u, v))
@@ -73,7 +73,7 @@ def quat_from_rotvec(r: wp.vec3) -> wp.vec4:
 def quat_to_rotvec(q: wp.vec4) -> wp.vec3:
     """Convert a rotation to its rotation vector: axis times angle, at most pi rad.
 
-    The result is 2 atan2(|u|, w) u / |u| for q = (w, u) with w >= 0, or for -q, the same rotation, with w < 0.
+    The result is 2 atan2(|u|, w) u / |u| for q = (w, u). If w < 0, -q replaces q. Both describe the same rotation.
     With dt = 1, mju_quat2Vel computes the same result.
     """
     u = wp.vec3(q[1], q[2], q[3])
@@ -113,10 +113,10 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion: q or -q if mju_mat2Quat returns q.
+    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion.
 
-    The trace and the diagonal show which of w, x, y, z is large enough to divide by (Shepperd 1978,
-    "Quaternion from rotation matrix").
+    The result may have the opposite sign of mju_mat2Quat's result. The trace and the diagonal show which of w, x, y, z
+    is large enough to divide by (Shepperd 1978, "Quaternion from rotation matrix").
     """
     q = wp.vec4()
     if m[0, 0] + m[1, 1] + m[2, 2] > 0.0:

@@ -46,7 +46,7 @@ class Findings:
     terminated: wp.array[bool]
     success: wp.array[bool]
     fault: wp.array2d[int]
-    """Faults that the parts of ``judge`` find, (parts, nworld)."""
+    """Bits of the faults, one row for each part of ``judge``, (parts, nworld)."""
 
 
 OUTCOMES = {name: field.type.dtype for name, field in Outcome.vars.items() if field.type.ndim == 1}

@@ -190,7 +190,7 @@ def tolerance(
 ) -> float:
     """Return 1 within bounds, and a number that falls towards 0 outside them, as dm_control's ``tolerance`` does.
 
-    The number depends on d, the distance from the nearer bound divided by the margin, and v, the value at the margin:
+    In this table, v is ``value_at_margin``, and d is the distance from the nearer bound divided by the margin:
 
     ============  =======================================  =================
     GAUSSIAN      exp(-(d s)^2 / 2), s = sqrt(-2 log v)    0 < v < 1
@@ -205,11 +205,11 @@ def tolerance(
 
     Args:
         x: The number.
-        bounds: The lowest and the highest number with value 1; both may be infinite.
-        margin: The distance from the bounds at which the value is ``value_at_margin``. If it is 0, the value is 0
+        bounds: The result is 1 if x lies between these two numbers. Both may be infinite.
+        margin: The distance from the bounds at which the result is ``value_at_margin``. If it is 0, the result is 0
             everywhere outside the bounds.
-        sigmoid: The shape of the fall, an ``lw.Sigmoid``.
-        value_at_margin: The value at the margin.
+        sigmoid: The shape of the curve outside the bounds, an ``lw.Sigmoid``.
+        value_at_margin: The result at the margin.
     """
     outside = wp.max(bounds[0] - x, x - bounds[1])
     if outside <= 0.0:
@@ -249,8 +249,8 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
     Args:
         distance: Distance from the point between the fingers to the target, m.
         finger: Position of a finger, m; it is 0 if the fingers meet.
-        closed: Largest position at which the fingers count as closed, m. The fingers count as open if each finger is at
-            least 2 cm further out.
+        closed: Largest position at which the fingers count as closed, m. If the position is more than 2.2 cm larger,
+            the fingers count as open.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

@@ -140,11 +140,11 @@ def judge_kernels(task: TaskCode) -> None:
 
         The kernel writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and
         the observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and
-        the last good observations. A transition with a fault counts as truncated, so that learners bootstrap from those
-        observations.
+        the last good observations. Such a transition counts as truncated, so that learners bootstrap from the
+        last good observations.
 
-        Only a transition ends an episode. If a state is evaluated without a transition, ``found.terminated`` is the
-        result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
+        If ``transition`` is not set, the kernel evaluates a state and ends no episode. ``found.terminated`` then holds
+        the result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
         """
         k, lane = wp.tid()
         w = first + k
@@ -213,7 +213,7 @@ def judge_kernels(task: TaskCode) -> None:
         parts: int,
         first: int,
     ):
-        """Observe the masked worlds, and find the groups that are finite; launched over (parts, nworld).
+        """Observe each world whose mask is set, and mark finite observation groups; launched over (parts, nworld).
 
         If ``parts`` is 1, this kernel also replaces observations that are not finite. Otherwise,
         ``replace_observations`` must be launched next.

@@ -1,10 +1,10 @@
 """AdroitDoor: turn a latch with the hand and pull the door open (Gymnasium-Robotics' AdroitHandDoor-v1).
 
 Install the extra "hand" to get the hand's model. The door's frame is a mocap body, because its position is part of the
-state. The original model lists the contact pair of ring and little fingertip twice. This model lists it once. As in
-Gymnasium-Robotics, site positions are one substep old after ``mj_step``. Because of a mistake in gymnasium-robotics
-1.2.1 to 1.4.2, the reward grows with the palm's distance from the handle. ``palm_weight=-0.1`` restores the reward of
-version 1.2.0.
+state. The original model contains one contact pair twice: the tips of ring finger and little finger. This model
+contains it once. As in Gymnasium-Robotics, site positions are one substep old after ``mj_step``. Because of a mistake
+in gymnasium-robotics 1.2.1 to 1.4.2, the reward grows with the palm's distance from the handle. ``palm_weight=-0.1``
+restores the reward of version 1.2.0.
 """
 
 import mujoco

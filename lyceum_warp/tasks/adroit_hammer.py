@@ -37,7 +37,7 @@ class Params:
     head: int = lw.site("tool")
     palm: int = lw.site("S_grasp")
     nail: int = lw.site("S_target")
-    goal: int = lw.site("nail_goal")  # the goal of the nail's head
+    goal: int = lw.site("nail_goal")  # target position of the nail's head
     board: int = lw.mocap("nail_board")
     nail_force: int = lw.sensor("S_nail")
 

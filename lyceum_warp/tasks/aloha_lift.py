@@ -55,8 +55,8 @@ def evaluate(s: World, p: Params) -> float:  # the height of the pot above the t
 @wp.func
 def arm(s: World, grip: int, handle: int, finger: int) -> wp.vec4:
     near, reach, grasp = lw.grasp_terms(wp.length(s.site_xpos[grip] - s.site_xpos[handle]), s.qpos[finger], 0.015)
-    # the grip is best if the gripper's y axis, along which the fingers slide, is perpendicular to the handle's bar,
-    # which is parallel to the pot's x axis
+    # the fingers slide along the gripper's y axis, and the handle's bar is parallel to the pot's x axis;
+    # the grip is best if these two axes are perpendicular
     orient = 1.0 - wp.abs(wp.dot(s.site_xmat[grip][:, 1], s.site_xmat[handle][:, 0]))
     return wp.vec4(reach, orient, grasp, near)
 

@@ -29,7 +29,7 @@ class World:
 
 @wp.struct
 class Params:
-    far: float = 0.5  # m; larger distances count as this distance
+    far: float = 0.5  # m; larger distances are clipped to this value
     near: float = 0.03  # m; the goal is rewarded only while the palm is closer to the ball
     finger_weight: float = 0.1
     success_distance: float = 0.05

@@ -15,7 +15,7 @@ from lyceum_warp import Row
 
 @wp.struct
 class World:
-    qpos: Row[float]  # 15 joints of the left arm and hand, then of the right
+    qpos: Row[float]  # 15 joints of the left arm and hand, 15 of the right arm and hand
     qvel: Row[float]
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]

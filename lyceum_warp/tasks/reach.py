@@ -22,7 +22,7 @@ class World:
     site_xpos: Row[wp.vec3]
     mocap_pos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
-    distances: Row[float] = lw.memory(REMEMBERED)  # distances, m, with the latest last
+    distances: Row[float] = lw.memory(REMEMBERED)  # distances in m, from the oldest to the latest
 
 
 @wp.struct

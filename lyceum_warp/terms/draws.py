@@ -31,7 +31,7 @@ def chosen(rng: Row[wp.uint32], share: float) -> bool:
 
 @wp.func
 def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
-    """Draw every element of a row from U(low, high), for example the biases of encoders."""
+    """Draw every element of a row, such as the encoder biases, from U(low, high)."""
     for i in range(row.shape[0]):
         row[i] = uniform(rng, low, high)
 

@@ -152,7 +152,7 @@ def soft_landing(
 ) -> float:
     """Return the sum of |force| over the feet that have just landed, times ``active``, N.
 
-    The sensors hold the forces at the start of the last substep, so a foot counts if it had ``landed`` at that time.
+    The sensors hold the forces at the start of the last substep. Only feet that had ``landed`` at that time count.
     Source: mjlab 1.6.0, ``soft_landing``.
     """
     total = float(0.0)
@@ -164,7 +164,7 @@ def soft_landing(
 
 @wp.func
 def feet_in_air(air_time: Row[float], least_air_time: float, most_air_time: float, active: float) -> float:
-    """Return the number of feet with least < air time < most, times ``active``.
+    """Return ``active`` times the number of feet whose air time is between the two bounds.
 
     Source: mjlab 1.6.0, ``feet_air_time``.
     """

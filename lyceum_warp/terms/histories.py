@@ -28,7 +28,7 @@ def push_history(history: Row[float], value: Row[float]):
 
 @wp.func
 def read_history(history: Row[float], width: int, age: int, i: int) -> float:
-    """Get element i of the value of a given age in a history.
+    """Read the value with the given age, and return its element i.
 
     The last value has age 0, the value before it has age 1, and so on. If the history has no value of this age, the
     result is taken from its oldest value, or 0 if the history is empty.
@@ -54,7 +54,7 @@ def put_history(target: Row[float], history: Row[float], width: int):
 def delayed_action(action: Row[float], history: Row[float], delay: Row[float], i: int) -> float:
     """Get element i of the action that was chosen ``delay`` steps ago; call this in ``control``.
 
-    In the first ``delay`` steps of an episode, the result is from the episode's first action. ``advance`` must append
+    In the first ``delay`` steps of an episode, this function uses the episode's first action. ``advance`` must append
     every action: ``terms.push_history(s1.history, action)``.
     """
     age = int(delay[0])

@@ -34,10 +34,10 @@ def pose(
     walking_pose_std: wp.array[float],
     least_command: float,
 ) -> float:
-    """Compute ``posture`` with separate standard deviations of each joint for standing and for walking.
+    """Compute ``posture`` with one table of standard deviations for standing, and another one for walking.
 
-    The values for standing apply if ``command_size`` is below ``least_command``. Source: mjlab 1.6.0,
-    ``variable_posture``, with the same values for walking and running.
+    The table for standing applies if ``command_size`` is below ``least_command``. Source: mjlab 1.6.0,
+    ``variable_posture``, with the same table for walking and running.
     """
     if command_size(command) < least_command:
         return posture(qpos, joint_qpos, default_pose, standing_pose_std)
@@ -78,7 +78,7 @@ def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[
 def joint_limits(
     qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
 ) -> float:
-    """Sum by how much joints exceed their soft limits: max(|q - middle| - soft_limit * half range, 0), rad.
+    """Return the sum of max(|q - middle| - soft_limit * half range, 0) over the joints, rad.
 
     Source: mjlab 1.6.0, ``joint_pos_limits``.
     """

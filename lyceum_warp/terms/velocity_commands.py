@@ -101,5 +101,5 @@ def command_size(command: wp.vec3) -> float:
 
 @wp.func
 def active(command: wp.vec3, least_command: float) -> float:
-    """Return 1 if the robot should move, at a ``command_size`` above ``least_command``, and 0 otherwise."""
+    """Return 1 if the robot should move: its ``command_size`` exceeds ``least_command``. Otherwise, return 0."""
     return wp.where(command_size(command) > least_command, 1.0, 0.0)

@@ -70,7 +70,7 @@ class Context:
             env.rand_reset(self.seed if seed is None else seed)
 
     def actions(self, steps: int, salt: int = 0) -> torch.Tensor:
-        """Draw random actions, (steps, nworld, nact). Actions without bounds are between -1 and 1."""
+        """Draw random actions, (steps, nworld, nact). Infinite bounds are replaced by -1 and 1."""
         env = self.a
         assert env.action_space.low is not None and env.action_space.high is not None
         low = torch.as_tensor(np.where(np.isfinite(env.action_space.low), env.action_space.low, -1.0))

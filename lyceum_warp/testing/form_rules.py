@@ -90,7 +90,7 @@ def check_success_steps(ctx: Context) -> None:
             full = state.clone()
             full[:, column] = float(needed)
             b.set_state(full)
-            calm = ctx.calm(a) & good  # an event changes the state after the step is evaluated
+            calm = ctx.calm(a) & good  # after the evaluation of the step, an event may change the state
             count = torch.where(calm & b.success, (count + 1).clamp(max=needed), 0.0)
             ctx.equal(found[calm], count[calm], f"the count of steps in a row after step {i}")
             ctx.equal(a.success[good], found[good] == needed, f"success of step {i} with the counts {found.tolist()}")

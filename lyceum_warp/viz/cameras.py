@@ -35,8 +35,8 @@ class FreeCamera:
 CameraChoice: TypeAlias = str | int | FreeCamera | mujoco.MjvCamera | None
 """A camera of the model by name or index, a free camera ("free" for MuJoCo's default), or None for a video's default.
 
-The default is the model's first tracking camera. A model without a tracking camera gets its first camera that is fixed
-to the world. If no camera is fixed to the world, a new camera follows the first body.
+The default is the model's first tracking camera. If the model has no tracking camera, the default is its first camera
+that is fixed to the world. If it has no such camera either, a new camera follows the first body.
 """
 
 FREE = "free"

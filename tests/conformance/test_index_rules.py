@@ -23,7 +23,7 @@ class World:
     ten_length: Row[float]  # empty
     count: Row[float] = lw.memory()
     kept: Row[wp.vec3] = lw.memory(2)
-    more: Row[float] = lw.memory(9)  # writes out of range go here
+    more: Row[float] = lw.memory(9)  # the writes that are out of range change these numbers
 
 
 @wp.struct
@@ -75,7 +75,7 @@ def doubled(v: wp.vec3) -> wp.vec3:
 @wp.func
 def right(s: World, p: Params, obs: Row[float], rng: Row[wp.uint32]):
     total = 0.0
-    for i in range(3):  # Warp unrolls this loop, because the loop changes a constant
+    for i in range(3):  # Warp unrolls this loop; otherwise it would reject the constant total
         total += s.qpos[i] * p.gains[i]
     obs[0] = total
     obs[1] = s.qpos[-1] + s.xpos[1][2] + s.xpos[-1].x + s.xmat[0][1, 2] + s.xmat[0][-1][0]

@@ -97,7 +97,7 @@ def gather_contacts(
 
 @wp.struct
 class Rows:
-    """The fields of constraint rows, (nworld, njmax or more); the third axis of the Jacobian has its columns."""
+    """The fields of constraint rows, (nworld, njmax or more). ``J`` has a third axis, the columns of the Jacobian."""
 
     type: wp.array2d[int]
     id: wp.array2d[int]

@@ -57,7 +57,7 @@ def rank_worlds(mask_in: wp.array[bool], rank_out: wp.array[int], count_inout: w
 
 @wp.kernel(enable_backward=False)
 def next_group(count_in: wp.array[int], step: int, first_inout: wp.array[int], left_out: wp.array[int]):
-    """Advance to the next group of ``step`` worlds, and count the worlds that remain; launched over (1,)."""
+    """Skip ``step`` worlds to start the next group, and count the worlds that remain; launched over (1,)."""
     first = first_inout[0] + step
     first_inout[0] = first
     left_out[0] = wp.max(0, count_in[0] - first)
@@ -77,7 +77,7 @@ def choose_group(mask_in: wp.array[bool], rank_in: wp.array[int], first_in: wp.a
 def take_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy into a group the rows of its worlds, from the rows of all worlds; launched over (group size, row length)."""
+    """Copy the rows of a group's worlds into the group; launched over (group size, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[place, i] = source_in[world_in[place], i]
@@ -87,7 +87,7 @@ def take_rows(
 def return_rows(
     world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array2d[float], target_out: wp.array2d[float]
 ):
-    """Copy rows of a group back into the rows of all worlds; launched over (group size, row length)."""
+    """Copy the rows of a group back to its worlds; launched over (group size, row length)."""
     place, i = wp.tid()
     if place < left_in[0]:
         target_out[world_in[place], i] = source_in[place, i]
@@ -95,7 +95,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Add the bits of a group's rows to the bits of the same worlds, by bitwise or; launched over (group size,)."""
+    """Add each row's bits to the bits of its world with a bitwise or; launched over (group size,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]

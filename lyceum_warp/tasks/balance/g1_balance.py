@@ -37,7 +37,7 @@ class Params(balancing.Params):
 
 @wp.func
 def target(joint: int, time: float, p: Params) -> float:
-    """Return a joint's target without an action, in rad."""
+    """Return the target angle of a joint if its action is 0, in rad."""
     cycles = time * p.gait_frequency + 0.5 * float(joint // 6)  # the feet are half a cycle apart
     progress = (cycles - wp.floor(cycles) - p.stance_share) / (1.0 - p.stance_share)
     lift = wp.where(progress > 0.0, wp.sin(wp.pi * progress), 0.0)

@@ -1,4 +1,4 @@
-"""Reimplement dm_control's suite, with one domain in each module."""
+"""Reimplement dm_control's suite. Each module holds one domain."""
 
 TASKS = {
     "dm/acrobot_swingup": "dm_acrobot",

@@ -55,10 +55,10 @@ def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
 @wp.struct
 class Params:
     margin: float = 1.0  # m
-    energy_weight: float = 0.0  # for planners
-    energy_margin: float = 40.0  # J, from hanging to upright
-    balance_weight: float = 0.0  # for planners
-    balance_margin: float = 0.02  # s of the largest torque
+    energy_weight: float = 0.0  # only planners set this weight
+    energy_margin: float = 40.0  # J; lifting the arms from hanging to upright takes 39 J
+    balance_weight: float = 0.0  # only planners set this weight
+    balance_margin: float = 0.02  # s; the effort of the largest torque, applied for 0.02 s
     tip: int = lw.site("tip")
     target: int = lw.site("target")
     target_size: float = lw.from_model(lambda model, p: model.site_size[p.target, 0])
@@ -77,7 +77,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def missing_energy(s: World, p: Params) -> float:
-    """Return the energy at rest in the upright pose minus the energy, J."""
+    """Subtract the arms' present energy from their energy at rest in the upright pose, J."""
     v1, v2, cosine = s.qvel[0], s.qvel[1], wp.cos(s.qpos[1])
     inertia_upper, coupling = p.inertia[0] + 2.0 * p.inertia[2] * cosine, p.inertia[1] + p.inertia[2] * cosine
     kinetic = 0.5 * (inertia_upper * v1 * v1 + p.inertia[1] * v2 * v2) + coupling * v1 * v2
@@ -92,7 +92,7 @@ def turned(angle: float) -> float:  # between -pi and pi
 @wp.func
 def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
     upper, lower = s1.qpos[0], s1.qpos[0] + s1.qpos[1]
-    # the tip relative to the target, which is the tip in the upright pose
+    # vector from the target to the tip; in the upright pose, the tip is at the target
     x = p.lengths[0] * wp.sin(upper) + p.lengths[1] * wp.sin(lower)
     z = p.lengths[0] * (wp.cos(upper) - 1.0) + p.lengths[1] * (wp.cos(lower) - 1.0)
     total = lw.tolerance(wp.sqrt(x * x + z * z), wp.vec2(0.0, p.target_size), p.margin)

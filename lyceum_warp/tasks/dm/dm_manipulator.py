@@ -50,7 +50,7 @@ class Params:
 
 
 @wp.func
-def pose(s: World, body: int) -> wp.vec4:  # x, z, and w, y of the quaternion
+def pose(s: World, body: int) -> wp.vec4:  # x and z of the position, w and y of the quaternion
     return wp.vec4(s.xpos[body][0], s.xpos[body][2], s.xquat[body][0], s.xquat[body][2])
 
 

@@ -49,7 +49,7 @@ class World:
     body_ipos: Row[wp.vec3]
     jnt_range: Row[wp.vec2]
     geom_friction: Row[wp.vec3]
-    drawn_velocity: Row[wp.vec3] = lw.memory()  # the drawn forward velocity, lateral velocity and yaw rate
+    drawn_velocity: Row[wp.vec3] = lw.memory()  # random forward velocity, lateral velocity and yaw rate
     heading_target: Row[float] = lw.memory()  # commanded heading, rad
     heading_controlled: Row[float] = lw.memory()  # 1 if the yaw rate follows the heading
     standing: Row[float] = lw.memory()  # 1 if the robot should stand
@@ -108,7 +108,7 @@ class Params:
     heading_share: float = 0.3  # fraction of commands that give a heading
     heading_gain: float = 0.5  # 1/s
     standing_share: float = 0.1
-    forward_share: float = 0.2  # fraction of commands that are straight forward
+    forward_share: float = 0.2  # fraction of commands to walk straight ahead
     least_forward_velocity: float = 0.3
     # bounds of the uniform noise on the policy's observations
     linear_velocity_noise: float = 0.5
@@ -118,8 +118,8 @@ class Params:
     joint_velocity_noise: float = 1.5
     # pushes
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
-    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest push in the world's axes, m/s
-    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest push in the world's axes, rad/s
+    push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest change of velocity, in the world's axes, m/s
+    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest change of angular velocity, rad/s
     # differences between robots
     encoder_bias: float = 0.015  # largest, rad
     trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the centre of mass, m
@@ -369,7 +369,7 @@ def foot_slip(foot_clearance_and_slip: wp.vec2) -> float:
 
 @wp.func
 def single_stance(contact_time: Row[float], air_time: Row[float], longest_step: float, active: float) -> float:
-    """Return the shortest time (s) for which a foot has been in contact or in the air, at most ``longest_step``.
+    """Reward standing on one foot: min(its contact time, the air time of the other feet, ``longest_step``), s.
 
     The result is 0 unless exactly one foot is in contact. Source: Isaac Lab, ``feet_air_time_positive_biped``.
     """
