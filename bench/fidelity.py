@@ -164,10 +164,10 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         lines.append([row.case["task"], str(row.case["nworld"]), *at, *half, str(pairs["engines"]["faults"])])
     title = (
         "Differences between the engines' observations under random actions: median and 99 % quantile over the worlds "
-        "after some steps. The three columns from 'half apart' compare copies with the C engine: they give the first "
-        f"step by which half of the worlds have differed by more than {APART:g}. 'Warp' is the Warp engine. 'rounded' "
-        "is a C engine that rounds its state to float32 after every step. 'moved' is a C engine that starts with added "
-        "noise of the size of a rounding error."
+        "after some steps. The columns from 'half apart' to 'moved' compare other simulations with the C engine. They "
+        f"give the first step by which half of the worlds have differed by more than {APART:g}. 'Warp' is the Warp "
+        "engine. 'rounded' is a C engine that rounds its state to float32 after every step. 'moved' is a C engine that "
+        "starts with added noise of the size of a rounding error."
     )
     header = ["task", "worlds", "1 step", "10", "100", "last", "half apart: Warp", "rounded", "moved", "faults"]
     return [Table(title, header, lines)]

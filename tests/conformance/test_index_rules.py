@@ -23,7 +23,7 @@ class World:
     ten_length: Row[float]  # empty
     count: Row[float] = lw.memory()
     kept: Row[wp.vec3] = lw.memory(2)
-    more: Row[float] = lw.memory(9)  # the writes that are out of range change these numbers
+    more: Row[float] = lw.memory(9)  # space for the writes that are out of range
 
 
 @wp.struct

@@ -119,7 +119,7 @@ class Params:
     # pushes
     push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
     push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest change of velocity, in the world's axes, m/s
-    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest change of angular velocity, rad/s
+    push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest change of angular velocity, in the world's axes, rad/s
     # differences between robots
     encoder_bias: float = 0.015  # largest, rad
     trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the centre of mass, m
