@@ -241,6 +241,7 @@ def test_training_from_another_run_starts_with_its_policy(
         (["hopper"], ["takes 6 observations", "'hopper' has 11"]),
         (["--hidden", "9"], ["have hidden (8,), not (9,)", "omit --hidden"]),
         (["--value-group", "critic"], ["have value_group policy, not critic", "omit --value-group"]),
+        (["--algorithm", "sac"], [f"{six} was trained by npg", "omit --algorithm sac"]),
         (["--which", "5"], ["has no policy '5': it has 'last', 'best', 2, 4, 6"]),
         (["--resume", str(six)], ["--from has no effect with --resume"]),
     ]:

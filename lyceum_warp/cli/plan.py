@@ -153,10 +153,16 @@ class Plan:
                 "break: omit one of them"
             )
         task = task_name(find_task(self.task))
-        if self.value is not None and (found := Run.open(self.value).task_name) != task:
-            raise ValueError(
-                f"--value {self.value} is a run of the task {found!r}, not of {task!r}: use a run of {task}"
-            )
+        if self.value is not None:
+            run = Run.open(self.value)
+            if run.task_name != task:
+                raise ValueError(
+                    f"--value {self.value} is a run of the task {run.task_name!r}, not of {task!r}: use a run of {task}"
+                )
+            if run.config.get("algorithm") == "sac":
+                raise ValueError(
+                    f"--value {self.value} is a run of SAC, whose critics need an action: use a run of NPG or PPO"
+                )
         out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
         Run.check_free(out)
         # check all options before the folder is created

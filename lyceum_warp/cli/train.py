@@ -14,6 +14,7 @@ from lyceum_warp.algos.distributed import Team, join
 from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.learner import Learner
 from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.squashed_policy import SquashedPolicy
 from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -292,6 +293,12 @@ class Train:
         entries: dict[str, Any] = {}
         if source is not None:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
+            chosen = configuration.algorithm
+            if policy is not None and isinstance(policy, SquashedPolicy) != (chosen == "sac"):
+                raise ValueError(
+                    f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit {chosen}: "
+                    f"omit --algorithm {chosen}"
+                )
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
         learner = configuration.learner(team, run=source, networks=(policy, value), task=self.task, trust=self.trust)

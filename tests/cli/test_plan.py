@@ -20,6 +20,7 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
+from lyceum_warp.runs.folder import Run
 
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 
@@ -169,6 +170,9 @@ def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytes
     assert not (tmp_path / "none").exists()
     assert plan(tmp_path / "none", "--value", str(run), task="reach") == 2
     refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
+    Run.open(run).amend(algorithm="sac")
+    assert plan(tmp_path / "none", "--value", str(run)) == 2
+    refused(capsys, f"--value {run} is a run of SAC, whose critics need an action")
 
 
 def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_envs: list[lw.Env]) -> None:
