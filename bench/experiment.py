@@ -110,7 +110,7 @@ class Table:
 class Experiment:
     """An experiment. A case is a frozen dataclass with everything that affects the result, except machine and versions.
 
-    The list of cases is ordered by repeat, so that compared contestants take turns.
+    Contestants take turns: the cases of the first repeat come first, then those of the second repeat, and so on.
     """
 
     name: str
@@ -273,7 +273,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Run this thread on the first ``number`` cores only. Threads and processes that it starts inherit this."""
+    """Run this thread on the first ``number`` cores only. Its child threads and processes do so, too."""
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
         raise Skipped(f"{number} threads need {number} cores, and this process has {len(before)}")

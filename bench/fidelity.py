@@ -3,8 +3,8 @@
     lyceum-warp bench fidelity --device cuda --jobs 4
 
 Worlds of both engines start in the same float32 states and get the same random actions. The C engine (float64) is
-compared with the Warp engine (float32). Because of chaos, any two trajectories diverge. The C engine is therefore also
-compared with two copies of itself. One copy rounds its state to float32 after every step. The other copy starts from a
+compared with the Warp engine (float32). Because of chaos, rounding errors alone make two trajectories diverge. Two more
+simulations on the C engine show how fast. One rounds its state to float32 after every step. The other starts from a
 state with added noise of the size of a rounding error.
 
 Two states are compared by their observations without contact forces, relative to max(1, |value|).

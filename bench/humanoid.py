@@ -1,4 +1,4 @@
-"""Measure MPPI in real time on humanoids that stand or walk under pushes, or get up.
+"""Measure how well MPPI makes humanoids stand, walk and get up in real time, despite pushes.
 
     lyceum-warp bench humanoid
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20

@@ -125,7 +125,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.step()
 
     whole, alone = [], []
-    # not counted: the first steps capture graphs, and a robot takes two seconds to start walking
+    # the first blocks are not counted: they capture graphs, and a robot takes two seconds to start walking
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
         choose_actions()

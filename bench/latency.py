@@ -28,7 +28,7 @@ COST = {
     ("point_mass", "own"): 2.0, ("reach", "own"): 6.0, ("cartpole_swingup", "own"): 2.0, ("half_cheetah", "own"): 15.0,
     ("humanoid", "fast"): 9.0, ("humanoid", "exact"): 120.0, ("adroit_pen", "own"): 95.0,
 }  # fmt: skip
-"""Microseconds per simulated step of a sample on two cores, for each task and planning physics."""
+"""Microseconds on two cores for one step of one sample, by task and by the planner's physics."""
 LONGEST = 0.2
 """Maximum seconds per plan, unless samples or horizons are given."""
 SAMPLES, HORIZONS = (16, 64, 256, 1024), (16, 32, 64)
@@ -46,8 +46,9 @@ class Options(experiment.Options):
     own: bool = False
     """Whether to use each task's suggested horizon and number of samples."""
     physics: tuple[str, ...] = ()
-    """Names of the planner's physics: "exact", or a name that the task defines. By default, the exact physics
-    and the physics that the task suggests for planning. If the suggested physics has no name, only this one."""
+    """Names of the planner's physics: "exact", or a name that the task defines. The default is the exact physics and
+    the physics that the task suggests for planning. If the suggested physics has no name, the exact physics is
+    omitted."""
     seconds: float = 10.0
     """Seconds per case. The 99.9 % quantile needs a thousand plans."""
 

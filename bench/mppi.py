@@ -4,10 +4,10 @@
     lyceum-warp bench mppi --parts episodes --threads 1 --jobs 16
 
 The part ``episodes`` measures success and time of episodes of 75 steps, with the paper's settings. The part ``plans``
-plans from given states, and measures the time per plan. All planners control the same plant. Each planner runs a block
-of episodes, and then the next planner runs the same block. In the contestants ``mppi_together`` and
-``mppi_warp_together``, one planner controls the plants of all episodes at once. The contestant ``mppi_fast`` plans with
-the task's "fast" physics, and its plant has the exact physics.
+measures planning times from given states. All planners control the same plant. Each planner runs a block of episodes,
+and then the next planner runs the same block. In the contestants ``mppi_together`` and ``mppi_warp_together``, one
+planner controls the plants of all episodes at once. The contestant ``mppi_fast`` plans with the task's "fast" physics,
+and its plant has the exact physics.
 """
 
 import dataclasses
@@ -79,7 +79,7 @@ class Case:
 def cases(options: Options) -> list[Case]:
     """List the cases of plans, and then the cases of episodes.
 
-    Contestants that are compared with each other run one after another.
+    All contestants of a comparison run one after another.
     """
     short, cuda = options.short, options.device.startswith("cuda")
     threads = options.threads or len(os.sched_getaffinity(0)) // max(options.jobs, 1)

@@ -12,10 +12,10 @@ def main() -> None:
         times = (sum(map(found.estimate, found.cases(found.options(short=short)))) for short in (True, False))
         table.add_row(name, found.summary, *map(experiment.duration, times))
     Console(width=120).print(table)
-    print("\nlyceum-warp bench NAME --help     options of an experiment or of another program in bench/")
-    print("lyceum-warp bench compare OLD     every bitwise difference between a revision and this working tree")
-    print("lyceum-warp bench plot [NAME]     figures from stored results: bench/results/NAME-MACHINE.png")
-    print("lyceum-warp bench tables [NAME]   tables from stored results: bench/results/NAME.md")
+    print("\nlyceum-warp bench NAME --help     # list the options of an experiment or of another program in bench/")
+    print("lyceum-warp bench compare OLD     # compare this working tree with a revision, bit for bit")
+    print("lyceum-warp bench plot [NAME]     # draw figures of stored results: bench/results/NAME-MACHINE.png")
+    print("lyceum-warp bench tables [NAME]   # write tables of stored results: bench/results/NAME.md")
 
 
 if __name__ == "__main__":

@@ -124,7 +124,7 @@ class PythonMPPI:
 def _roll_out(
     pipe: Connection, task: str, samples: int, horizon: int, scale: Any, smoothing: tuple[float, float, float], own: int
 ) -> None:
-    """Roll out this subprocess's samples of every plan that it receives."""
+    """Receive plans in a subprocess, roll out samples of each plan, and send their returns and actions."""
     env = ENVS[task](lw.make(task, nthread=1).model)
     random = np.random.default_rng((own, 0))
     pipe.send("ready")

@@ -1,4 +1,4 @@
-"""Measure how coarser physics affect a planner's ranking of samples and its return.
+"""Measure how much return a planner with coarser physics loses, and how well it ranks samples.
 
     lyceum-warp bench rank_loss half_cheetah hopper
 

@@ -1,4 +1,4 @@
-"""Test very long runs with injected faults, memory use, and training runs that are killed and resumed.
+"""Test that faults are reported in very long runs, that memory does not leak, and that killed runs resume.
 
     lyceum-warp bench soak --threads 2
     lyceum-warp bench soak --parts random --tasks dm/walker_walk dm/fish_swim --engine mujoco
@@ -249,7 +249,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
-    # in a module with several tasks, functions and structs may have other names
+    # if a module defines several tasks, their functions and structs have different names
     names = {name: function.func.__name__ for name, function in functions.items() if function and function.func}
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"

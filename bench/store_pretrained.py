@@ -1,6 +1,7 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
-The folder lyceum_warp/pretrained/TASK stores the run's settings, and the policy's float16 weights and return.
+The folder lyceum_warp/pretrained/TASK then contains the run's settings, the policy with its network weights in float16,
+and the policy's return.
 """
 
 import argparse

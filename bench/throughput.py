@@ -1,4 +1,4 @@
-"""Compare environment steps per second with native C and other libraries (the paper's figure 1).
+"""Measure environment steps per second of lyceum_warp, native C and other libraries (the paper's figure 1).
 
     lyceum-warp bench throughput --short
     lyceum-warp bench throughput --parts worlds kept --device cuda

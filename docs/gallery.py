@@ -200,7 +200,7 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 
 def written(flags: dict[str, Any]) -> str:
-    """Format flags, each preceded by a space."""
+    """Write settings as command-line flags, each preceded by a space."""
     words = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")

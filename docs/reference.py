@@ -87,7 +87,7 @@ def is_public(cls: type) -> bool:
 
 
 def members(cls: type) -> list[str]:
-    """Return a class's public members with docstrings, including those of private base classes."""
+    """Return the names of a class's public members that have docstrings; include members of private base classes."""
     found: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):

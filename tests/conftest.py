@@ -136,7 +136,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def _mark_long(items: list[pytest.Item]) -> None:
-    """Add the mark ``long`` to every case that the test's mark ``quick`` does not list."""
+    """Mark a test's cases as ``long``, except the cases that the arguments of ``pytest.mark.quick`` name."""
     cases: dict[tuple[str, ...], set[str]] = {}
     for item in items:
         if (mark := item.get_closest_marker("quick")) is not None:

@@ -52,7 +52,7 @@ def step_both(env: lw.Env, clean: lw.Env, steps: int) -> Done:
 
 
 def test_exhausted_memory_of_the_c_engine_is_reported_as_a_fault() -> None:
-    """With less memory, MuJoCo first drops constraints, then raises an error, and finally drops contacts."""
+    """Depending on the size of its memory, MuJoCo drops constraints, raises an error, or drops contacts."""
     found = Done(0)
     for memory in range(3000, 14_000, 1000):
         spec = lw.gymnasium_model("hopper.xml").spec()

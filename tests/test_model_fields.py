@@ -63,7 +63,7 @@ def test_randomizing_a_field_that_all_worlds_share_raises_an_error(name: str, re
         describe_model_field(ANT, name)
 
 
-def test_task_may_read_numbers_of_a_model_field_that_all_worlds_share() -> None:
+def test_task_may_read_shared_model_fields_that_have_rows_of_floats() -> None:
     assert describe_model_field(ANT, "actuator_ctrlrange", varies=False).dtype is wp.vec2
     for name, reason in (("nq", "make it a parameter"), ("opt", "rows"), ("timestep", "dt"), ("geom_type", "rows")):
         with pytest.raises(ValueError, match=f"{name!r} cannot be read in World: .*{reason}"):

@@ -39,7 +39,7 @@ from lyceum_warp.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions
         ({"physics": 3}, "physics must be of type PhysicsOptions, as lw.PhysicsOptions.*, not int 3"),
     ],
 )  # fmt: skip
-def test_error_of_an_option_out_of_range_names_its_value(options: dict[str, object], message: str) -> None:
+def test_option_out_of_range_raises_an_error_that_names_the_value(options: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         EnvOptions.split(options)
     with pytest.raises(ValueError, match=message):

@@ -5,7 +5,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def test_wheel_contains_every_module_model_and_pretrained_policy() -> None:
+def test_wheel_contains_every_file_of_the_package() -> None:
     wheel = pytest.importorskip("hatchling.builders.wheel")
     builder = wheel.WheelBuilder(str(ROOT))
     packed = {file.distribution_path for file in builder.recurse_included_files()}

@@ -60,7 +60,7 @@ ALLOWED = (
     r'"record": list\(self\.rows\)',  # an argument of MuJoCo's Batch.rollout
     r'self\.control, record=\["qpos", "qvel"\]',
     r"\bRecorder\b",  # the class Recorder of viz/video.py
-    r'"record": "graphs"',  # a hint for users of earlier releases, and its tests
+    r'"record": "graphs"',  # a hint for users of earlier releases; the next two patterns allow the tests of this hint
     r'\("record", "did you mean graphs\?"\)',
     r'\(\{"record": False\}, "no parameter \'record\': did you mean graphs"\)',
 )
@@ -70,7 +70,7 @@ QUOTING = {
     "CHANGELOG.md": (r"`[^`]*`",),  # old names
     "CONTRIBUTING.md": (r"(?ms)^```.*?^```", r"\|[^|\n]*\|$", r'"[^"\n]*"'),  # examples of bad style
 }
-"""Documents, each with patterns of its quotations, which may contain excluded words."""
+"""Documents that quote excluded words, each with patterns that match the quotations."""
 
 DOCUMENTS = ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "bench/README.md")
 OTHERS = ("Makefile", "pyproject.toml", ".ci/run", "CITATION.cff", "constraints.txt")

@@ -1,4 +1,4 @@
-"""Compute arrays with one checkout; bench/compare.py compares them with another checkout's arrays.
+"""Run a checkout of the package and write its results as arrays; bench/compare.py compares two checkouts.
 
 The first answer lists the checkout's tasks and learners. Each further line on stdin is a unit (the keyword arguments of
 a function in PARTS as JSON), and each line on stdout is an answer. The arrays of a unit are written to the file given
@@ -144,7 +144,7 @@ def without_clocks(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def environment(numbers: Numbers, *, task: str, engine: str, device: str, steps: int) -> None:
-    """Compare the model, resets, steps with short episodes, getters, a fault, and a rollout of given actions."""
+    """Add arrays of an environment: model, resets, short episodes, getters, a fault, and a rollout of given actions."""
     import lyceum_warp as lw
 
     env = make(task, engine, device, nworld=4, horizon=max(2, steps // 3))
@@ -313,7 +313,7 @@ def failure(error: Exception) -> dict[str, Any]:
 
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Compute a unit and write its arrays. After a failure, write the arrays that are complete."""
+    """Call the function that the unit names, and write its arrays. If it fails, write the arrays that are complete."""
     numbers, answer = Numbers(), {}
     try:
         PARTS[unit.pop("part")](numbers, **unit)

@@ -1,4 +1,4 @@
-"""Make the kernels that evaluate a task's transitions: rewards, ends of episodes, metrics, observations."""
+"""Make the kernels that compute rewards, metrics and observations, and decide whether an episode ends."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Compare planners with different physics options by planning time and by how they rank the same samples."""
+"""Measure how fast a planner with coarser physics is, and how well it ranks samples."""
 
 import statistics
 import time

@@ -1,4 +1,4 @@
-"""Compare MPPI with a plain implementation, and use it to control tasks.
+"""Compare MPPI with a plain implementation, and control tasks with MPPI.
 
 The planner computes in float32, and the plain implementation in float64, so rounding errors accumulate.
 """

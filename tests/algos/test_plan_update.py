@@ -12,7 +12,7 @@ ENGINES = ["mujoco", "warp"]
 
 
 class EliteMean(lw.PlanUpdate):
-    """Plan the mean of the best samples, and leave the noise unchanged."""
+    """Replace the plan with the mean of the best samples, and leave the noise unchanged."""
 
     def __init__(self, elites: int) -> None:
         self.elites = elites
@@ -111,7 +111,7 @@ def test_update_with_warp_launches_is_captured_in_the_graph(engine: str) -> None
     assert plan.summary["best_return"] == plan.returns[0]
 
 
-def test_plan_of_a_user_written_update_does_not_change_if_all_samples_fail() -> None:
+def test_user_written_update_keeps_the_plan_if_all_samples_fail() -> None:
     plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
     plan.actions.fill_(0.25)
     plan(plan.state_of(), shift=0)

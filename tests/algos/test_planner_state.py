@@ -35,7 +35,7 @@ def test_missing_parts_of_a_state_get_their_reset_values(reach: lw.MPPI) -> None
     reach(state)
 
 
-def test_step_is_computed_from_the_time_by_default(reach: lw.MPPI) -> None:
+def test_state_of_computes_the_step_count_from_the_time(reach: lw.MPPI) -> None:
     step = reach.env.state_space.parts["step"]
     assert reach.state_of(time=0.2)[step] == 10
     assert reach.state_of(time=0.2, step=3)[step] == 3

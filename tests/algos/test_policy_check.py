@@ -120,7 +120,7 @@ def test_policy_check_accepts_usual_layers_and_changes_nothing(shared_env: Share
     assert all(parameter.grad is None for parameter in policy.parameters())
 
 
-def test_user_network_learns_the_same_as_an_equal_default_network() -> None:
+def test_npg_gives_equal_results_with_equal_user_and_default_networks() -> None:
     config = lw.NPGConfig(samples=200, hidden=(8,))
     own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
     policies = (

@@ -55,7 +55,7 @@ def test_rollouts_through_gymnasium_equal_rollouts_of_the_package() -> None:
 
 
 @pytest.mark.parametrize("mode", ["sync", "async"])
-def test_first_episodes_in_gymnasium_start_at_the_step_counts_of_the_worlds(mode: str) -> None:
+def test_gymnasium_rollout_continues_the_step_counts_of_the_worlds(mode: str) -> None:
     env = lw.make("swimmer", nworld=2, nthread=1)
     state = env.get_state()
     state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)

@@ -63,7 +63,7 @@ def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path
 
 
 @pytest.mark.long
-def test_soak_run_continues_on_another_machine_with_the_state_folder(
+def test_soak_run_continues_on_another_machine_from_stored_states(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = (*FAULTS, "--steps", "1600", "--work", str(work))

@@ -60,7 +60,7 @@ def test_dm_control_tasks_are_measured_with_equal_numbers_of_worlds_by_every_lib
 
 
 @pytest.mark.parametrize("task", ["cartpole", "herb_reach"])
-def test_gymnasium_versions_of_tasks_return_the_same_observations_and_rewards(
+def test_gymnasium_tasks_return_the_observations_and_rewards_of_lyceum_warp(
     task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(BENCH / "peers" / "environments"))

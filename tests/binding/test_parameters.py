@@ -311,7 +311,7 @@ class Uncomputable:
     body: int = lw.from_model(lambda model, p: model.body_mas[0])
 
 
-def test_error_of_a_parameter_that_cannot_be_computed_names_it(model: mujoco.MjModel) -> None:
+def test_error_names_the_parameter_that_cannot_be_computed(model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match="parameter body of 'arm' can't be computed from .*: Attri.* 'body_mas'"):
         parameters(model, Uncomputable)
     assert parameters(model, Uncomputable, body=1).values["body"] == 1

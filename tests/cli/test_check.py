@@ -7,7 +7,7 @@ from lyceum_warp import cli
 from lyceum_warp.testing import CHECKS
 
 
-def test_command_check_lists_all_rules_with_their_durations(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_command_lists_all_rules_with_their_durations(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "point_mass", "--nworld", "2", "--steps", "5", "--param", "success_distance=0.1"]) == 0
     head, *lines = capsys.readouterr().out.splitlines()
     assert head == "point_mass on the mujoco engine (cpu, 2 worlds) keeps the rules:"
@@ -15,14 +15,14 @@ def test_command_check_lists_all_rules_with_their_durations(capsys: pytest.Captu
     assert all(float(line.split()[1]) >= 0 and line.endswith(" s") for line in lines)
 
 
-def test_command_check_runs_only_the_named_rules(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_command_runs_only_the_named_rules(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "point_mass", "--rule", "spaces", "--rule", "time"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == ["spaces", "time"]
     assert cli.main(["check", "point_mass", "--rule", "space"]) == 2
     refused(capsys, "no rule 'space'", "did you mean spaces")
 
 
-def test_command_check_prints_a_violated_rule_and_exits_with_1(
+def test_check_command_prints_a_violated_rule_and_exits_with_1(
     task_file: TaskFile, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fixed = "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] = 0.5"

@@ -34,7 +34,7 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out.replace("│", " ")  # some terminals draw boxes without sides
 
 
-def test_help_describes_the_usual_options_and_help_all_describes_all(
+def test_help_all_describes_more_options_than_help(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")

@@ -301,7 +301,9 @@ def test_every_planner_setting_has_a_flag() -> None:
     assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=[0.5, 1], horizon=4)
 
 
-def test_flag_param_sets_a_task_parameter_that_has_the_name_of_a_setting(task_file: TaskFile, tmp_path: Path) -> None:
+def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(
+    task_file: TaskFile, tmp_path: Path
+) -> None:
     origin = Path(inspect.getfile(find_task("point_mass")))
     source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
     source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")

@@ -211,7 +211,7 @@ def test_task_with_every_feature_passes_check_task(task: type[lw.Task]) -> None:
 @pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 @pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
-def test_task_that_observes_lasting_memory_passes_check_task(task: type[lw.Task], engine: str) -> None:
+def test_check_task_accepts_tasks_that_observe_lasting_memory(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
 

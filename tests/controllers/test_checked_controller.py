@@ -22,7 +22,7 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_planners_satisfy_the_protocol_of_planning_controllers() -> None:
+def test_mppi_satisfies_the_protocol_planning_controller() -> None:
     assert isinstance(lw.MPPI("point_mass", horizon=2, samples=1), lw.PlanningController)
 
 

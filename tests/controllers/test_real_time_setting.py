@@ -41,7 +41,7 @@ def test_message_names_the_chosen_and_the_next_larger_number_of_samples() -> Non
     )
 
 
-def test_shorter_horizons_are_tried_before_other_physics_options() -> None:
+def test_shorter_horizons_are_tried_before_faster_physics() -> None:
     physics = ["exact", "fast"]
     assert choose_setting(SAMPLES, [32, 16], physics, Machine(10.0, fast=10.0), deadline=0.015).setting == (
         RealTimeSetting(32, 32, "exact")

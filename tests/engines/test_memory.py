@@ -36,7 +36,7 @@ def test_memory_check_frees_the_gpu_memory_cached_by_torch(monkeypatch: pytest.M
         check_fit(100, 46, gpu)  # type: ignore[arg-type]
 
 
-def test_memory_estimate_of_the_warp_engine_covers_its_arrays() -> None:
+def test_memory_estimate_of_the_warp_engine_agrees_with_the_size_of_its_arrays() -> None:
     for task in ("hopper", "ant"):
         env = lw.make(task, engine="warp", nworld=64)
         engine: Any = env.engine

@@ -63,7 +63,7 @@ def test_open_engine_makes_the_named_engine(model: mujoco.MjModel) -> None:
             open_engine(engine, model, 2, cpu, [])  # type: ignore[arg-type]
 
 
-def test_engine_options_are_read_from_its_signature(model: mujoco.MjModel) -> None:
+def test_options_of_an_engine_are_read_from_its_signature(model: mujoco.MjModel) -> None:
     cpu = wp.get_device("cpu")
 
     class Curious(ToyEngine):

@@ -129,7 +129,7 @@ def test_step_with_any_two_model_features_equals_that_of_mujoco_warp(case: Case,
 
 @pytest.mark.long
 @pytest.mark.parametrize("part", range(PARTS))
-def test_step_with_any_three_model_features_equals_that_of_mujoco_warp(part: int, device: wp.Device) -> None:
+def test_steps_with_all_triples_of_model_features_equal_those_of_mujoco_warp(part: int, device: wp.Device) -> None:
     for case in table.covering(3)[part::PARTS]:
         try:
             check_or_refuse(case, device)

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[2]
 
 @dataclasses.dataclass
 class Outcome:
-    """The result of a case: "refused", "worked", "interrupted", or a one-line problem."""
+    """The result of a case: "refused", "worked", "interrupted", or one line that describes a problem."""
 
     case: str
     did: str

@@ -1,6 +1,6 @@
 """Damage files, command lines and arguments at random.
 
-The damaged input must work or raise a documented error. A failure prints the case and the command that repeats it.
+A damaged input must either work or cause a documented error. A failure prints the case and the command that repeats it.
 """
 
 import functools

@@ -67,7 +67,7 @@ def test_call_that_waits_for_the_device_raises_an_error() -> None:
 
 
 @pytest.mark.parametrize("task", ["hopper", "half_cheetah", "humanoid", "reach"])
-def test_steps_do_not_wait_for_the_device_or_allocate_memory(task: str) -> None:
+def test_steps_neither_wait_for_the_device_nor_allocate_memory(task: str) -> None:
     env = lw.make(task, nworld=256, device=CUDA)
     generator = torch.Generator(CUDA).manual_seed(0)
     actions = 2 * torch.rand(16, *env.action.shape, generator=generator, device=CUDA) - 1

@@ -159,6 +159,6 @@ def test_terrain_level_changes_with_the_walked_distance(
     assert (next_levels(level, walked, commanded) == wanted).all()
 
 
-def test_terrain_level_is_random_after_the_highest_level() -> None:
+def test_robot_that_completes_the_highest_level_gets_a_random_level() -> None:
     counts = np.bincount(next_levels(4, 4.1, 10.0), minlength=5)
     assert len(counts) == 5 and (abs(counts - 400) < 90).all()

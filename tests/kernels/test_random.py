@@ -69,7 +69,7 @@ def test_different_counters_give_different_random_numbers() -> None:
 
 
 @pytest.mark.parametrize("counter", ["seed", "world", "episode", "step"])
-def test_random_numbers_are_independent_along_every_counter(counter: str) -> None:
+def test_random_numbers_of_consecutive_counters_are_independent(counter: str) -> None:
     counters = np.zeros((4000, 4), dtype=int)
     counters[:, ["seed", "world", "episode", "step"].index(counter)] = np.arange(4000)
     values = draws(counters)

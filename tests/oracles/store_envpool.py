@@ -1,4 +1,4 @@
-"""Store steps of EnvPool's versions of dm_control's tasks for the tests: observations, actions and rewards.
+"""Run dm_control's tasks in EnvPool, and store observations, actions and rewards for test_envpool.py.
 
 EnvPool computes in float64 with its own copies of the models and its own rewards. Run this script in a separate
 virtual environment:

@@ -70,7 +70,7 @@ QPOS: Mapping[str, Callable[[Parts], np.ndarray]] = {
     "acrobot": acrobot, "cartpole": cartpole, "cheetah": without_x, "finger": finger, "hopper": without_x,
     "pendulum": pendulum, "walker": walker,
 }  # fmt: skip
-"""Functions that compute positions from observations, for domains that do not observe positions."""
+"""Functions that compute joint positions from observations. Other domains observe the joint positions themselves."""
 
 
 def set_states(env: lw.Env, domain: str, observation: np.ndarray) -> None:

@@ -106,7 +106,7 @@ def test_writer_stops_writing_after_its_lock_was_taken_over(tmp_path: Path) -> N
     assert not (folder / "lock").exists()
 
 
-def test_only_one_of_many_writers_gets_a_free_lock(tmp_path: Path) -> None:
+def test_exactly_one_of_eight_concurrent_writers_gets_the_lock(tmp_path: Path) -> None:
     for content in 10 * ["", f'{{"host": "{platform.node()}", "pid": 1}}']:
         (tmp_path / "lock").write_text(content)
         ready, got = threading.Barrier(8), []

@@ -26,7 +26,7 @@ SOURCE = tiny_task.changed(
 
 @pytest.fixture(scope="module")
 def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make the runs at a constant path, so that Warp reuses compiled kernels."""
+    """Make the runs in a folder with a constant path, so that Warp reuses compiled kernels."""
     cache = getattr(pytestconfig, "cache", None)
     folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
     shutil.rmtree(folder)

@@ -43,7 +43,7 @@ def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
 
 @pytest.mark.quick("go1_velocity")
 @pytest.mark.parametrize(("task", "steps"), [("go1_velocity", 25), ("spot_velocity", 25), ("g1_velocity", 10)])
-def test_control_loop_in_the_documentation_equals_the_environment(
+def test_control_loop_in_the_documentation_reproduces_steps_of_the_environment(
     page: dict[str, Any], task: str, steps: int, tmp_path: Path
 ) -> None:
     torch.manual_seed(0)

@@ -81,7 +81,7 @@ def test_terminal_initial_state_does_not_end_an_episode(autoreset: bool, engine:
     assert not env.done.any()
 
 
-def test_step_that_only_resets_a_world_does_not_count_as_an_episode() -> None:
+def test_reset_in_a_separate_step_does_not_increase_the_episode_count() -> None:
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(
         GymnasiumVectorEnv(Leave, N, autoreset_mode=AutoresetMode.NEXT_STEP)
     )

@@ -133,7 +133,7 @@ def test_invalid_randomized_model_field_causes_a_fault_in_its_world(engine: str)
     assert env.fault_counts["model"] == 2
 
 
-def test_state_assembled_from_its_parts_has_the_nominal_model_by_default() -> None:
+def test_state_of_uses_nominal_model_fields_by_default() -> None:
     plan = lw.MPPI(Faulty, samples=2, horizon=2)
     columns = plan.env.state_space.parts["body_mass"]
     assert plan.state_of(qpos=[0.0])[columns].tolist() == [0.0, 1.0]

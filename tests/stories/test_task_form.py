@@ -116,7 +116,7 @@ def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
         assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
-def test_startup_randomizes_lasting_memory_once_per_world() -> None:
+def test_startup_draws_lasting_memory_once_per_world_and_seed() -> None:
     env = lw.make(Gifted, nworld=8, seed=3)
     drawn = env.obs[:, 1].clone()
     assert drawn.unique().numel() == 8 and (drawn >= 1).all() and (drawn < 2).all()

@@ -33,7 +33,7 @@ def tuned(brief: None, tmp_path_factory: pytest.TempPathFactory) -> lw.Tuning:
     return lw.tune("half_cheetah", out=tmp_path_factory.mktemp("tune") / "rows.jsonl", tolerance="loose", **QUICK)
 
 
-def test_rows_are_sorted_by_speed_and_the_best_is_the_fastest_with_unchanged_returns(tuned: lw.Tuning) -> None:
+def test_best_setting_is_the_fastest_row_with_unchanged_returns(tuned: lw.Tuning) -> None:
     speeds = [row["speedup"] for row in tuned.rows]
     assert speeds == sorted(speeds, reverse=True)
     assert tuned.reference["divergence"] == [0.0, 0.0, 0.0]
@@ -51,7 +51,7 @@ def test_a_stopped_search_resumes_from_its_file(tuned: lw.Tuning, no_measuring: 
 
 
 @pytest.mark.parametrize("change", [{"nworld": 4}, {"seed": 1}, {"ctrl_cost_weight": 0.2}, {"integrator": "rk4"}])
-def test_results_of_another_task_or_number_of_worlds_are_not_reused(
+def test_stored_results_are_not_reused_for_other_options(
     change: dict[str, Any], tuned: lw.Tuning, no_measuring: None
 ) -> None:
     with pytest.raises(AssertionError, match="was measured"):

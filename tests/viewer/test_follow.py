@@ -18,7 +18,7 @@ def test_viewer_of_a_run_loads_the_newest_policy(tmp_path: Path) -> None:
         if not followers:
             run = Run.open(folder)
             followers.append(Follower(run, lw.load(run)))
-        # a run saves only some of its iterations if they are short
+        # this run saves only some policies, because its iterations are short
         write_content(folder / "policy.pt", policy_content(npg.iteration, npg.policy, npg.value))
         assert followers[0]() == [f"policy of iteration {iteration.iteration}"]
 

@@ -129,7 +129,7 @@ def test_error_of_a_missing_package_names_the_install_command(tmp_path: Path, mo
     assert not (tmp_path / "run").exists()
 
 
-def test_train_writes_the_numbers_of_metrics_csv_before_and_after_resuming(tmp_path: Path) -> None:
+def test_tensorboard_contains_all_rows_of_metrics_csv_after_a_resume(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert train(run, "--tensorboard", "--iterations", "2") == 0
     assert main(["train", "--resume", str(run), "--tensorboard", "--iterations", "3", *QUIET]) == 0

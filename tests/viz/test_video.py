@@ -152,7 +152,9 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_video_shows_the_model_fields_ghosts_and_lines_of_each_shot(model: mujoco.MjModel, tmp_path: Path) -> None:
+def test_shots_of_a_video_may_have_ghosts_lines_and_different_model_fields(
+    model: mujoco.MjModel, tmp_path: Path
+) -> None:
     small, red = {"geom_size": np.array([[0.1, 0, 0], [0.1, 0, 0]])}, (1.0, 0.0, 0.0, 1.0)
     usual = {"geom_size": model.geom_size.copy()}
     mp4 = video_of(model, tmp_path / "video.mp4", fps=25)

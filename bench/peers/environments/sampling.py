@@ -1,4 +1,4 @@
-"""Measure environment steps per second of other libraries, as a worker of bench/venvs.py.
+"""Measure environment steps per second of another library; bench/venvs.py starts this program.
 
 The program reads a JSON object (contestant, task, envs, threads, seconds, warm, seed) and prints a JSON object. Actions
 are uniform within their bounds. They are drawn before the clock starts.

@@ -41,7 +41,7 @@ def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch
     assert not pushed(env, 0)
 
 
-def test_push_ends_in_the_newest_state_if_released_after_steps_back(shared_env: SharedEnv) -> None:
+def test_push_released_after_steps_back_lasts_until_the_newest_state(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
     for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):

@@ -41,7 +41,7 @@ def test_dragged_body_is_pushed_until_the_release(bench: Bench) -> None:
     assert not end.forces.any()
 
 
-def test_dragged_body_is_placed_only_while_paused_and_only_when_it_moves(bench: Bench) -> None:
+def test_drag_while_paused_places_the_body_only_when_the_mouse_moves(bench: Bench) -> None:
     (place,) = drag(bench, "ball", paused=True)
     np.testing.assert_allclose(place.qpos[0], 0.5)
     assert not place.forces.any()

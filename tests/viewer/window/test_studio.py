@@ -7,7 +7,7 @@ from mujoco.studio.web import web_server
 from lyceum_warp.viewer.window import studio
 
 
-def test_screen_does_not_listen_on_a_public_socket_of_studio(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_viewer_raises_an_error_if_studio_listens_on_every_address(monkeypatch: pytest.MonkeyPatch) -> None:
     """Simulate a later version of Studio that does not call ``bind_public_socket``."""
 
     def start(config: object, endpoint: object, plugins: list[object]) -> None:
