@@ -273,7 +273,7 @@ def median_and_range(values: Sequence[float], form: str = ".2f") -> str:
 
 @contextlib.contextmanager
 def cores(number: int | None) -> Iterator[None]:
-    """Run this thread on the first ``number`` cores only. Its child threads and processes do so, too."""
+    """Run this thread on the first ``number`` cores only. Its child threads and processes inherit this limit."""
     before = sorted(os.sched_getaffinity(0))
     if number is not None and number > len(before):
         raise Skipped(f"{number} threads need {number} cores, and this process has {len(before)}")

@@ -578,7 +578,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = Experiment(
     name="soak",
-    summary="Very long runs with and without injected faults, memory growth, and killed and resumed trainings.",
+    summary="Very long runs: injected faults, memory growth, and training runs that are killed and resumed.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 
