@@ -457,7 +457,7 @@ class Env:
             fields: Values by name, as in ``body_mass=masses``, with one row per world or one row for all worlds.
 
         Raises:
-            ValueError: A field is unknown or shared by all worlds, or a value has the wrong size or is invalid.
+            ValueError: A field is not a model field that differs between worlds, or a value is invalid.
         """
         state = self.get_state()
         put_rows(self.task.model, fields, self._columns_of_dynamics(state))

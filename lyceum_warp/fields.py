@@ -76,7 +76,7 @@ ON_DEMAND = {
     "subtree_linvel": mujoco.mjtSensor.mjSENS_SUBTREELINVEL,
     "subtree_angmom": mujoco.mjtSensor.mjSENS_SUBTREEANGMOM,
 }
-"""Fields that MuJoCo computes only if a sensor needs them, each with the type of such a sensor."""
+"""Maps each field that MuJoCo computes only for sensors to the type of a sensor that needs it."""
 
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields that are computed only if the model's sensors are enabled."""

@@ -12,7 +12,7 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     range.
 
     Args:
-        actuator: A position servo with a control range, which is changed in place.
+        actuator: A position servo with a control range. The function changes the servo in place.
         speed: Controls range from -speed to speed, in m/s or rad/s.
 
     Raises:

@@ -211,7 +211,8 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
-"""Fields that cannot differ between worlds if a body's inertial frame is its body frame ("simple" in MuJoCo)."""
+"""Fields that move a body's inertial frame. They cannot differ between worlds for bodies that MuJoCo compiled as
+"simple": there, the inertial frame is the body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:

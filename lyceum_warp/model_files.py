@@ -39,7 +39,7 @@ class ModelFile:
     source: str
     """Where the file comes from: the name of a package, or "MuJoCo Menagerie"."""
     place: Callable[[], tuple[Path, str]] = dataclasses.field(compare=False)
-    """Function that returns the models' folder, and the file's path relative to this folder."""
+    """Function that returns two paths: the models' folder, and the file relative to this folder."""
     install: str = ""
     """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""
 

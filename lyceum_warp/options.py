@@ -105,8 +105,8 @@ class PhysicsOptions:
     """Capacity of the Warp engine for constraints in each world. The default is twice the peak in random rollouts,
     plus the inactive equality constraints."""
     deterministic: bool | None = _for_engine(None)
-    """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, this
-    takes 5 to 18 times as much time and 5 to 7 times as much memory."""
+    """Make runs on a CUDA device reproducible bit for bit, as on the CPU. For hopper, half_cheetah and humanoid, a
+    reproducible run takes 5 to 18 times the usual time and 5 to 7 times the usual memory."""
 
     def __post_init__(self) -> None:
         check_kind("base", self.base, str | None, "the name of one of the task's physics, as 'exact'")

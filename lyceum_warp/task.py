@@ -136,7 +136,7 @@ RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
 """Arguments for results: each is one world's row of an array."""
 
 MEMORIES = ("memory", "lasting_memory")
-"""Kinds of memory that World declares. Each world has one row of floats for each kind."""
+"""Kinds of memory in World. Every world has a row of floats for ``memory``, and another for ``lasting_memory``."""
 
 GROUP_PREFIX = "observe_"
 """Prefix of functions that write a group of observations: ``observe_critic`` writes the group ``critic``."""
@@ -212,62 +212,62 @@ class Element(int):
 
 
 def site(name: str) -> int:
-    """Set a default in Params to a site's index in ``site_xpos`` and other ``site_`` fields."""
+    """Return a default for ``Params``: a site's index in ``site_xpos`` and other ``site_`` fields."""
     return Element("site_xpos", name)
 
 
 def sites(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of sites."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: site indices."""
     return [site(name) for name in names]
 
 
 def body(name: str) -> int:
-    """Set a default in Params to a body's index in ``xpos`` and other fields of bodies."""
+    """Return a default for ``Params``: a body's index in ``xpos`` and other fields of bodies."""
     return Element("xpos", name)
 
 
 def bodies(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of bodies."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: body indices."""
     return [body(name) for name in names]
 
 
 def geom(name: str) -> int:
-    """Set a default in Params to a geom's index in ``geom_xpos`` and other ``geom_`` fields."""
+    """Return a default for ``Params``: a geom's index in ``geom_xpos`` and other ``geom_`` fields."""
     return Element("geom_xpos", name)
 
 
 def geoms(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of geoms."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: geom indices."""
     return [geom(name) for name in names]
 
 
 def camera(name: str) -> int:
-    """Set a default in Params to a camera's index in ``cam_xpos`` and other ``cam_`` fields."""
+    """Return a default for ``Params``: a camera's index in ``cam_xpos`` and other ``cam_`` fields."""
     return Element("cam_xpos", name)
 
 
 def tendon(name: str) -> int:
-    """Set a default in Params to a tendon's index in ``ten_`` and ``tendon_`` fields."""
+    """Return a default for ``Params``: a tendon's index in ``ten_`` and ``tendon_`` fields."""
     return Element("ten_length", name)
 
 
 def equality(name: str) -> int:
-    """Set a default in Params to an equality constraint's index in ``eq_active`` and other ``eq_`` fields."""
+    """Return a default for ``Params``: an equality constraint's index in ``eq_`` fields."""
     return Element("eq_active", name)
 
 
 def actuator(name: str) -> int:
-    """Set a default in Params to an actuator's index in ``actuator_force`` and other ``actuator_`` fields."""
+    """Return a default for ``Params``: an actuator's index in ``actuator_`` fields."""
     return Element("actuator_force", name)
 
 
 def actuators(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of actuators."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: actuator indices."""
     return [actuator(name) for name in names]
 
 
 def ctrl(actuator: str) -> int:
-    """Set a default in Params to the index of an actuator's first control in ``ctrl``.
+    """Return a default for ``Params``: the index in ``ctrl`` of an actuator's first control.
 
     Most actuators have one control.
     """
@@ -275,52 +275,52 @@ def ctrl(actuator: str) -> int:
 
 
 def act(actuator: str) -> int:
-    """Set a default in Params to the index of an actuator's first activation in ``act``."""
+    """Return a default for ``Params``: the index in ``act`` of an actuator's first activation."""
     return Element("act", actuator)
 
 
 def joint(name: str) -> int:
-    """Set a default in Params to a joint's index in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
+    """Return a default for ``Params``: a joint's index in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
     return Element("xanchor", name)
 
 
 def joints(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of joints."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: joint indices."""
     return [joint(name) for name in names]
 
 
 def qpos(joint: str) -> int:
-    """Set a default in Params to the index of a joint's first coordinate in ``qpos``."""
+    """Return a default for ``Params``: the index in ``qpos`` of a joint's first coordinate."""
     return Element("qpos", joint)
 
 
 def qposes(*joints: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of joints' first coordinates in ``qpos``."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``qpos`` index of each joint."""
     return [qpos(name) for name in joints]
 
 
 def dof(joint: str) -> int:
-    """Set a default in Params to the index of a joint's first degree of freedom in ``qvel`` and similar fields."""
+    """Return a default for ``Params``: the index of a joint's first degree of freedom, as in ``qvel``."""
     return Element("qvel", joint)
 
 
 def dofs(*joints: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of joints' first degrees of freedom."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``qvel`` index of each joint."""
     return [dof(name) for name in joints]
 
 
 def sensor(name: str) -> int:
-    """Set a default in Params to the index of a sensor's first number in ``sensordata``."""
+    """Return a default for ``Params``: the index in ``sensordata`` of a sensor's first number."""
     return Element("sensordata", name)
 
 
 def sensors(*names: str) -> Any:
-    """Set the default of a ``wp.array[int]`` in Params to the indices of sensors in ``sensordata``."""
+    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``sensordata`` index of each sensor."""
     return [sensor(name) for name in names]
 
 
 def mocap(body: str) -> int:
-    """Set a default in Params to a mocap body's index in ``mocap_pos`` and ``mocap_quat``."""
+    """Return a default for ``Params``: a mocap body's index in ``mocap_pos`` and ``mocap_quat``."""
     return Element("mocap_pos", body)
 
 
@@ -355,12 +355,12 @@ class Planning:
     """
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner, by their names in ``lw.MPPIConfig``."""
+    """Settings of the planner by name: fields of ``lw.MPPIConfig``."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the planner's worlds, by their names in ``lw.make``, such as ``{"physics": "fast"}``."""
+    """Options of the planner's worlds by name: arguments of ``lw.make``, as in ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds, by their names in the task's ``Params``. MPPI with a value function
-    ignores them, because the value function was fitted to the rewards of the unchanged task."""
+    """Parameters of the planner's worlds by name: fields of the task's ``Params``. MPPI with a value function
+    ignores these parameters, because the value function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -402,8 +402,8 @@ class Task:
 
     ``World`` lists fields of MjData and MjModel by MuJoCo's names, such as ``qpos``, ``site_xpos`` and ``body_mass``. A
     model field differs between worlds, and is part of the state, if ``startup``, ``initialize``, ``randomize`` or
-    ``event`` writes it. Otherwise all worlds share it. ``World`` also declares memory: ``air_time: Row[float] =
-    lw.memory(4)``, or ``lw.lasting_memory(4)``.
+    ``event`` writes it. Otherwise all worlds share it. ``World`` also declares memory, as in ``air_time: Row[float] =
+    lw.memory(4)``. Resets clear this memory, but not the lasting memory of ``lw.lasting_memory(4)``.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``. Functions get the
     element's index. There are also ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,
@@ -431,7 +431,7 @@ class Task:
       accumulate. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
       ``sensordata``), because these are computed afterwards.
     - ``startup``: model fields and lasting memory. Resets do not change them.
-    - ``substep`` and ``advance``: memory and lasting memory. ``advance`` writes the memory of ``s1``.
+    - ``substep`` and ``advance``: both kinds of memory. ``advance`` writes the memory of ``s1``.
 
     A reset calls ``reject`` before the substeps of ``settle``. During these substeps, ``substep`` is not called.
 
@@ -517,7 +517,10 @@ class Task:
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
-        """Change the task's model, or the model passed to ``make``, before it is compiled."""
+        """Change the model's spec in place, before MuJoCo compiles it.
+
+        The spec describes the task's model, or the model passed to ``make``.
+        """
 
     @staticmethod
     def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:

@@ -233,7 +233,8 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     """Make the table of a model's height field, (1 + points along y, 1 + points along x) in m; see ``height_field``.
 
     Raises:
-        ValueError: The model has no such height field, or the field's geom moves, is tilted or is not the only one.
+        ValueError: The model has no such height field. Exactly one geom must use the height field, and this geom must
+            be fixed and upright.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_HFIELD, name)
     if number < 0:
@@ -260,7 +261,7 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def height_field(name: str) -> Any:
-    """Set a default in Params to a table of a height field's heights.
+    """Return a default for ``Params``: a table with the heights of a height field.
 
     Pass the table to ``lw.ground_height`` and ``lw.height_scan``. It has the shape (1 + points along y, 1 + points
     along x). The first row has the points' x coordinates, and the first column has their y coordinates. All other
@@ -274,7 +275,7 @@ def height_field(name: str) -> Any:
 
 
 def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarray:
-    """Set a default in Params to a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
+    """Return a grid of points around a robot, (n, 2) in m, for ``lw.height_scan``.
 
     The first point is at the rear right. Points are ordered by x (forwards), then by y (to the left).
     ``lw.scan_grid(1.6, 1.0)`` has 17 x 11 points. For example: ``scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)``.

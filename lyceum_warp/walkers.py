@@ -167,7 +167,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     places = data.site_xpos[np.asarray(p.feet)]
     distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
     if distances.min(1).max() > 0.005:
-        raise ValueError("the feet are not symmetric: give each foot a site on the other side")
+        raise ValueError("the feet's sites are not symmetric: place left and right sites as mirror images")
     order = distances.argmin(1)
     feet = order, np.ones(len(order))
     vectors = (3 * order[:, None] + np.arange(3)).ravel(), np.tile(flip, len(order))
@@ -234,9 +234,9 @@ def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
 def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Compute spheres that touch a plane if and only if the foot does.
 
-    The result, (feet, spheres, 4), has each sphere's centre relative to the foot's last joint, and its radius, in m. A
-    capsule becomes a sphere at each end, and a box becomes a sphere at each corner. Any other geom becomes a sphere at
-    each corner of its bounding box. Radii include the margin at which a contact starts to exert force.
+    The result, (feet, spheres, 4), has each sphere's centre relative to the foot's last joint, and its radius, in m.
+    Spheres lie at the ends of a capsule and at the corners of a box. For any other geom, they lie at the corners of its
+    bounding box. Radii include the margin at which a contact starts to exert force.
 
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
@@ -255,7 +255,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
-    """List the feet's geoms that can touch the ground. The ground is every geom of the world body.
+    """List the feet's geoms that can touch the ground. The ground consists of all geoms of the world body.
 
     Raises:
         ValueError: A foot has no geom that can touch the ground.
@@ -332,7 +332,7 @@ def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
-    """Increase the spheres' radii by margin - gap, the distance at which the ground exerts forces on the geom."""
+    """Increase the spheres' radii by the distance at which a contact with the ground starts to exert force."""
     ground = np.flatnonzero(model.geom_bodyid == 0)
     margin = model.geom_margin[geom] + model.geom_margin[ground].max()
     gap = model.geom_gap[geom] + model.geom_gap[ground].max()
@@ -413,7 +413,7 @@ def prepare_walker(
 
 
 def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:
-    """Add a site to a model for each foot.
+    """Add one site per foot to a model.
 
     Args:
         spec: The model, which is changed in place.

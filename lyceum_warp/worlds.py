@@ -28,7 +28,7 @@ from lyceum_warp.world_arrays import WorldArrays
 
 @dataclasses.dataclass(frozen=True)
 class Programs:
-    """The phases of an environment as callables, for one choice of horizon, autoreset and graphs."""
+    """The callables of an environment's phases. Each combination of horizon, autoreset and graphs has its own."""
 
     graphs: Graphs
     step: Calls

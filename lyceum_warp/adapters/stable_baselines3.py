@@ -28,8 +28,8 @@ class StableBaselines3VecEnv(VecEnv):
     ``l`` and the seconds since the start ``t``. A task with a goal adds ``is_success``, and a task with metrics adds
     ``episode_metrics``. The info dicts of all other worlds are empty.
 
-    Observations are by default only the group ``policy``, because Stable-Baselines3 would feed all groups to the
-    policy.
+    By default, observations contain only the group ``policy``. Stable-Baselines3 would feed any other group to the
+    policy, too.
 
     Args:
         task: A task, as in ``lw.make``, or an ``Env``.

@@ -20,7 +20,7 @@ _MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_
 
 
 def evaluation_seed(seed: int) -> int:
-    """Derive a seed for evaluation from the seed of training, so that their initial states differ."""
+    """Derive a seed for evaluation from the training seed. The two seeds give different initial states."""
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 

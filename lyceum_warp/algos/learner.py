@@ -171,7 +171,7 @@ class Learner(abc.ABC):
         return dataclasses.asdict(self.config)
 
     def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state except ``replay``; the state includes the worlds of all processes.
+        """Copy the learner's state. It includes the worlds of all processes, but not ``replay``.
 
         The state consists of tensors, numbers, strings, dicts and lists. All processes must call this method. Any
         number of processes can resume from the state.

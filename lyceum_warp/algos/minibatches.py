@@ -23,9 +23,9 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. A process therefore has a different number of samples in
-    each mini-batch. It copies them into a buffer of fixed size, padded with samples of weight 0. Samples that do not
-    fit are dropped.
+    The mini-batches do not depend on the number of processes. The number of a process's samples therefore varies from
+    one mini-batch to the next. The process copies its samples into a buffer of fixed size, padded with samples of
+    weight 0. Samples that do not fit are dropped.
 
     ``learn`` gets this process's samples and their weights, (samples,). The weights of all processes sum to 1. On a
     GPU, an epoch runs as a CUDA graph, so ``learn`` must update tensors in place.

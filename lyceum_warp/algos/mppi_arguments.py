@@ -59,8 +59,8 @@ def planner_arguments(
         plants: Number of plants to plan for.
 
     Returns:
-        The settings, and the options and the parameters of the planner's worlds. The options include an engine and a
-        device that suit the number of samples.
+        The planner's settings, the options of its worlds, and the task's parameters. The options include an engine and
+        a device that suit the number of samples.
 
     Raises:
         ValueError: A keyword is unknown or ambiguous, or a value is not valid.

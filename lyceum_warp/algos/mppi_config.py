@@ -78,8 +78,8 @@ class MPPIConfig:
     """Action that fills the end of a shifted plan: "zero" (the action nearest to zero), "repeat" (the last action), or
     a given action (a single number, or a number for each element of the action)."""
     termination: Literal["stop", "ignore"] = "stop"
-    """How to treat a sample whose episode ends before the horizon. "stop" counts no rewards after the end. "ignore"
-    ignores the end: all rewards up to the horizon count, as in Lyceum and trajopt."""
+    """How to treat a sample whose episode ends before the horizon. With "stop", rewards after the end do not count.
+    With "ignore", all rewards up to the horizon count, as in Lyceum and trajopt."""
     nominal_model: bool = False
     """Whether samples use the nominal values of per-world model fields instead of the values in the given state."""
     models: int = 1
@@ -109,12 +109,14 @@ class MPPIConfig:
             raise ValueError(f"risk={self.risk!r} compares models: give the number of models, such as models=4")
         if self.models > 1 and self.nominal_model:
             raise ValueError(
-                f"models={self.models} draws model fields, but nominal_model=True does not: omit one of the two "
-                "settings"
+                f"models={self.models} needs random model fields, but nominal_model=True uses nominal values: omit one "
+                "of the two settings"
             )
 
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
-        """Return a copy with changed settings; a new ``update`` resets the old update's settings to defaults.
+        """Return a copy with changed settings.
+
+        If ``update`` changes, settings that only the old update uses return to their defaults.
 
         Raises:
             ValueError: A value is of the wrong type or out of range.

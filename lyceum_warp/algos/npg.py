@@ -384,7 +384,10 @@ class NPG(OnPolicyLearner):
 
 
 def prediction_sums(returns: torch.Tensor, predicted: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Compute means and sums of squared deviations of returns and of prediction errors, as scalar tensors."""
+    """Compute statistics of the returns and of the prediction errors, as scalar tensors.
+
+    The statistics are the mean and the sum of squared deviations from the mean.
+    """
     target, error = returns.double(), (returns - predicted).double()
     return {
         "target_mean": (target_mean := target.mean()),

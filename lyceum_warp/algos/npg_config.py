@@ -96,7 +96,7 @@ class NPGConfig:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
             raise ValueError(
-                f"log_std must not be below min_log_std, which is {self.min_log_std}, but is {self.log_std}"
+                f"log_std={self.log_std} is below min_log_std={self.min_log_std}: raise log_std, or lower min_log_std"
             )
 
 

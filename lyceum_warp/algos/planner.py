@@ -85,9 +85,9 @@ class Planner:
 
     With ``plants=n``, the planner plans for n plants at a time, as in ``env.step(plan(env.get_state()))`` with n
     worlds. Plant i uses the seed ``seed + i`` for its noise. On the same engine, the plan of plant i equals the plan of
-    a single-plant planner with this seed. With ``models``, all plants share the same models; the first plant's seed
-    determines their random fields. With several plants, all buffers except ``model_fields`` have an axis for the
-    plants. This axis follows the axis for steps or knots, if there is one.
+    a single-plant planner with this seed. With ``models``, all plants share the same models. The first plant's seed
+    determines the random fields of these models. With several plants, all buffers except ``model_fields`` have an axis
+    for the plants. This axis follows the axis for steps or knots, if there is one.
 
     A task's ``planning`` (see ``lw.Planning``) provides default settings of the planner, and options and parameters of
     its worlds. Arguments override them.
@@ -193,7 +193,7 @@ class Planner:
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
-        # use nominal values for a robot, not values that startup drew
+        # `state_of` must return nominal values, not the random values that `startup` wrote
         for name, row in self.env.engine.nominal.items():
             self._initial[parts[name]] = torch_view(flat(row))[0].double()
         if "lasting_memory" in self.env.task.writes.get("startup", ()):
@@ -369,7 +369,7 @@ class Planner:
             parts = self.env.state_space.parts.items()
             part = next(name for name, part in parts if part.start <= column < part.stop)
             which = "the state" if like.ndim == 1 else f"the state of plant {plant}"
-            raise ValueError(f"{which} to plan from has {values[where]} in its {part!r}: states must be finite")
+            raise ValueError(f"{which} has {values[where]} in its {part!r}: pass finite states to the planner")
         return state
 
     def _warn_of_failed_samples(self) -> None:
@@ -388,7 +388,7 @@ class Planner:
         )  # fmt: skip
 
     def _program(self, *, first: bool) -> Calls:
-        """List the functions that improve the plan once. If ``first`` is set, they also shift the plan in time."""
+        """Return the calls of one iteration. If ``first`` is set, they also shift the plan in time."""
         parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
@@ -428,7 +428,7 @@ class Planner:
         self._interpolate(self._samples, self._world_actions)
 
     def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
-        """Copy the rows of a plan; the first improvement also shifts the rows in time."""
+        """Copy the rows of a plan. If ``first`` is set, also shift them in time."""
         if first:
             shifted = [rows, self._passed, fill, repeat, target]
             wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
@@ -504,8 +504,8 @@ class Planner:
         Args:
             seed: A new seed. With several plants, plant i gets the seed ``seed + i``; a list gives one seed per plant.
                 The planner draws new models with the first seed.
-            where: Mask of the plants to reset, (plants,) bool; by default all plants are reset. With a mask, the other
-                plants keep their seeds, and the planner keeps its models.
+            where: Mask of the plants to reset, (plants,) bool; by default all plants are reset. With a mask, all plants
+                outside the mask keep their seeds, and the planner keeps its models.
 
         Raises:
             ValueError: A seed is not a non-negative whole number, or ``where`` has the wrong shape or type.
@@ -533,7 +533,7 @@ class Planner:
         return [int(seed) for seed in self._seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
-        """Draw the planner's models with the task's functions, from random streams that no plant uses."""
+        """Randomize the planner's models with the task's functions. No plant uses the same random streams."""
         self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
         states = self.env.get_state()[: self.config.models]
         for name, rows in self.model_fields.items():

@@ -35,8 +35,8 @@ class PPOConfig:
     lam: float = 0.95
     """Lambda of the generalised advantage estimate."""
     clip: float = 0.2
-    """Clipping range of the probability ratio around 1. With clip_value_loss, predicted values are clipped to the same
-    range around the old predictions."""
+    """PPO clips the probability ratio to the range from 1 - clip to 1 + clip. With clip_value_loss, it also clips the
+    change of a predicted value to the range from -clip to clip."""
     clip_value_loss: bool = True
     """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
     value_coef: float = 1.0

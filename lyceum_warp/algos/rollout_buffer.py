@@ -27,7 +27,7 @@ _LARGE = 1e18
 
 @document_attributes
 class Rollout:
-    """Preallocated buffer for the samples of a fixed number of steps of every world.
+    """Preallocated buffer that holds the samples from a fixed number of steps in every world.
 
     Args:
         env: The environment.

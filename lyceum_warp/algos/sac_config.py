@@ -43,7 +43,8 @@ class SACConfig:
     """
 
     num_steps: int | None = None
-    """Number of steps of every world per iteration. The default is enough steps for 1,000 samples, but at least 50."""
+    """Number of steps of every world per iteration. The default is 50, or more if 50 steps make fewer than 1,000
+    samples."""
     replay: int | None = None
     """Capacity of the replay buffer in samples. The default is 1,024 steps of every world, but at least a million
     samples. The default buffer takes at most 30 % of the device's free memory."""
@@ -69,7 +70,7 @@ class SACConfig:
     """Number of quantiles that each critic predicts; with 1, it predicts the mean. TQC (Kuznetsov et al., 2020) uses
     25."""
     dropped_quantiles: int = 2
-    """Number of quantiles per critic that the targets drop, as in TQC. SAC pools the quantiles of both critics, and
+    """Number of dropped quantiles per critic, as in TQC. For each target, SAC pools the quantiles of both critics, and
     drops the largest. With one quantile, the targets use ``critic_bound`` instead."""
     critic_bound: Literal["min", "mean"] | None = None
     """Value of an action if ``quantiles`` is 1: the minimum or the mean of the two critics' predictions. The default is

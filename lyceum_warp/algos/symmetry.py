@@ -28,7 +28,7 @@ class Reflected(nn.Module):
         return self.swapped(rows) * self.signs
 
     def swapped(self, rows: torch.Tensor) -> torch.Tensor:
-        """Compute the mirror image of numbers that keep their sign, such as standard deviations."""
+        """Reorder columns as in the mirror image, without changing signs, for example of standard deviations."""
         return rows.index_select(-1, self.order)
 
 

@@ -60,8 +60,8 @@ def beside(function: Callable[[], Result], *, allowed: bool) -> Iterator[Callabl
     """Run a function and the ``with`` block in parallel if torch has exactly two threads.
 
     Each then uses one thread. This is faster than running one after the other with two threads each. Mini-batches do
-    not benefit from a second thread, and large products speed up by less than a factor of two. With any other number of
-    threads, or if ``allowed`` is False, the function runs when the ``with`` block asks for its result.
+    not benefit from a second thread, and large products speed up by less than a factor of two. If torch has more or
+    fewer threads, the function runs when the ``with`` block asks for its result. ``allowed=False`` has the same effect.
     """
     if not allowed or torch.get_num_threads() != 2:
         yield function

@@ -45,8 +45,8 @@ class Difference:
     def verdict(self) -> str:
         """Compare the confidence interval with the range from -margin to margin.
 
-        "same" means that the interval lies inside this range. "different" means that it lies outside. "not shown" means
-        that it crosses an end of the range.
+        "same" means that the interval lies inside this range. "different" means that the interval lies outside. "not
+        shown" means that the interval contains -margin or margin.
         """
         if -self.margin <= self.low and self.high <= self.margin:
             return "same"
@@ -78,7 +78,11 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """Return "different" if any quantity differs, "same" if all are the same, and otherwise "not shown"."""
+        """Combine the verdicts of all quantities.
+
+        The result is "different" if any verdict is "different". It is "same" if all verdicts are "same". In all other
+        cases, it is "not shown".
+        """
         verdicts = {difference.verdict for difference in self.differences}
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 

@@ -329,7 +329,7 @@ class BoundTask:
             )
         if steps > task.horizon > 0:
             raise ValueError(
-                f"{name} is {steps}, but its episodes have {task.horizon} steps, so no episode can succeed: lower "
+                f"{name} is {steps}, but an episode has only {task.horizon} steps, so no episode can succeed: lower "
                 "success_steps, or raise horizon"
             )
 
@@ -337,8 +337,8 @@ class BoundTask:
         metrics = self.metrics
         if bad := [name for name in metrics if not name.isprintable() or not set(name).isdisjoint(",'\"")]:
             raise ValueError(
-                f"the task {self.name!r} has the metric {bad[0]!r}: a metric's name, which is a column of metrics.csv, "
-                "must have no comma, quote or line break"
+                f"the task {self.name!r} has the metric {bad[0]!r}: a metric's name heads a column of metrics.csv, so "
+                "it must have no comma, quote or line break"
             )
         if twice := [name for name in metrics if metrics.count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")

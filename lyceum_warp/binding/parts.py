@@ -14,7 +14,7 @@ from lyceum_warp.task import Part
 
 @dataclasses.dataclass(frozen=True)
 class Slice:
-    """The slice of a row of floats that holds a part."""
+    """Locates one part in a row of floats."""
 
     start: int
     count: int
@@ -80,7 +80,7 @@ def _floats(dtype: Any) -> int:
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:
-    """Return a size as a number. The name of a table in ``params`` stands for the table's number of rows."""
+    """Resolve a declared size, which is a number or a table's name. A name becomes the table's number of rows."""
     if not isinstance(size, str):
         return whole_number(what, size, low=1)
     table = params.get(size)

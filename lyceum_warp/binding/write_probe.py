@@ -1,4 +1,4 @@
-"""Run a task's functions once in one world, on rows with guard memory around them, to find faulty writes."""
+"""Find faulty writes of a task's functions: call each once in one world, with guard memory around every row."""
 
 import math
 from collections.abc import Mapping, Sequence

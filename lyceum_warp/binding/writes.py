@@ -162,7 +162,7 @@ class _Reader:
         self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
-        """Record the writes in an expression or a statement. Return the place to which an expression refers."""
+        """Record the writes of a syntax node. If the node is an expression, return its ``_Place``."""
         if isinstance(node, ast.Name):
             for name, place in self.places.items():
                 if place is not None and name.startswith(f"{node.id}."):  # a local struct of rows, used as a whole
@@ -187,7 +187,7 @@ class _Reader:
         return None
 
     def _read_all(self, parent: ast.AST, nodes: Any, *, elements: bool = False) -> None:
-        """Analyse the children of a syntax node, and record each row that a child uses without an index."""
+        """Read the children of a syntax node. A child that uses a row as a whole counts as a write."""
         for node in nodes:
             place = self._read(node)
             if place is not None and (elements or place.kind is not None):

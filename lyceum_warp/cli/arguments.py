@@ -85,7 +85,7 @@ class OptionFlags:
                     setattr(cls, name, field.default if default is None else None)
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the default is None, but the user may not pass None
+                if value is None and flag is hints[name]:  # the user may omit the flag, but cannot pass None
                     (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
                     flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
@@ -143,7 +143,7 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
 
 
 def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Parse a task's parameters from the values of a repeated flag, each NAME=VALUE.
+    """Parse a task's parameters. Each text has the form NAME=VALUE.
 
     If NAME is an option, the error names its flag. ``instead`` maps an option to its flag if their names differ.
     """

@@ -18,7 +18,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "bench"
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Bench:
-    """Run an experiment or another program in the folder bench/ of a checkout. Without a name, list the experiments.
+    """Run an experiment or another program from the folder bench/ of a checkout. Without a name, list the experiments.
 
     All arguments after the name are passed to the program. With --help, the program explains its arguments.
 

@@ -196,7 +196,10 @@ class Plan:
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
-    """Make the controlled world, and a function that makes a planner from a ``RealTimeSetting`` or from flags."""
+    """Make the controlled world, and a function that makes a planner.
+
+    The function takes a ``RealTimeSetting``, which overrides the flags, or None.
+    """
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:

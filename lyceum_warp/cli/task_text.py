@@ -62,7 +62,7 @@ def _lengths(model: mujoco.MjModel) -> list[str]:
 
 
 def _has_other_ranges(model: mujoco.MjModel) -> bool:
-    """Whether every control has a range, and at least one range is not -1 to 1."""
+    """Return True if every control has a range and some range differs from -1 to 1."""
     limited, ranges = model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange
     return bool(limited.all() and (ranges[:, 0] < ranges[:, 1]).all() and (ranges != (-1.0, 1.0)).any())
 

@@ -117,7 +117,7 @@ class View:
         watchers: list[Watcher] = []
         if kind == "run":
             if self.follow and self.which != "last":
-                raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit one of them")
+                raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
             run, nworld = Run.open(self.what[0]), self.nworld or _RUN_WORLDS
             env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
             policy = load(run, which=self.which, device=env.obs.device)

@@ -119,8 +119,8 @@ def _steps(plant: float, plan: float) -> tuple[int, int]:
     many = round(max(plant, plan) / min(plant, plan))
     if not math.isclose(many * min(plant, plan), max(plant, plan), rel_tol=1e-6):
         raise ValueError(
-            f"the controller's step of {plan:g} s must be a whole multiple or a whole fraction of the plant's step "
-            f"of {plant:g} s: choose the planner's frame_skip and timestep accordingly"
+            f"the controller's step is {plan:g} s and the plant's step is {plant:g} s, but one must be a multiple of "
+            "the other: change the planner's frame_skip or timestep"
         )
     return (many, 1) if plant > plan else (1, many)
 

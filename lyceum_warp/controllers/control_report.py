@@ -164,8 +164,8 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
             period.
 
     Raises:
-        ValueError: There is no trajectory, the trajectories differ in task, engine, mode or controller, or the rate is
-            not positive.
+        ValueError: There is no trajectory, or the rate is not positive. Trajectories must also agree in task, engine,
+            mode and controller.
     """
     episodes = [trajectories] if isinstance(trajectories, Trajectory) else list(trajectories)
     if not episodes:

@@ -78,9 +78,7 @@ def begin_episode(
             f"nworld={env.nworld}, autoreset={env.autoreset}: make(..., nworld=1, autoreset=False)"
         )
     if steps is None and env.horizon == 0:
-        raise ValueError(
-            f"episodes of {env.task.name!r} may never end without a horizon: pass steps, or give make() a horizon"
-        )
+        raise ValueError(f"an episode of {env.task.name!r} has no time limit: pass steps, or give make() a horizon")
     limit = env.horizon if steps is None else whole_number("steps", steps, low=1)
     if reset:
         env.rand_reset(seed)

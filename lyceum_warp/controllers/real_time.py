@@ -256,7 +256,7 @@ class PlannerThread:
     def publish(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
         """Pass the thread a measured state, and the action that the plant applies in this state.
 
-        The next plan of the thread starts in the newest state. The action is None if the plant waits for the plan. The
+        The thread starts its next plan from the newest state. The action is None if the plant waits for the plan. The
         caller must not change the tensors.
         """
         self._states.put((step, state, obs, action))
@@ -280,8 +280,8 @@ class PlannerThread:
         """End the thread after its current plan.
 
         Args:
-            patience: Maximum time to wait for the thread, in seconds; None for no limit. A slower thread ends after its
-                current plan, or when the program exits.
+            patience: Maximum time to wait for the thread, in seconds; None for no limit. If the thread takes longer,
+                it continues until its current plan is complete or the program exits.
         """
         self._states.put(None)
         self._thread.join(patience)

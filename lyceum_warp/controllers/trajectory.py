@@ -161,8 +161,8 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. The array of each tensor has the same name as
-        the tensor. The 0-d array ``info`` is a string with a JSON object. This object has all attributes that are not
-        tensors, and the number ``format``, which is 1. For example, the positions are
+        the tensor. The 0-d array ``info`` is a string with a JSON object. The JSON object holds all other attributes of
+        the trajectory, and ``"format": 1``. For example, the positions are
         ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)

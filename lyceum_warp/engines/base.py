@@ -21,13 +21,13 @@ from lyceum_warp.support.docstrings import document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 
-    The fields of an engine are Warp arrays with a leading ``nworld`` axis, whose addresses never change. A mask,
-    (nworld,) bool, selects the worlds to which a method applies.
+    An engine's fields are Warp arrays with a leading ``nworld`` axis. The addresses of these arrays never change. A
+    mask, (nworld,) bool, selects the worlds to which a method applies.
 
     In each step, the caller writes ``ctrl`` and other inputs, calls ``step`` and ``find_faults``, and reads fields and
-    ``fault``. To restart worlds, the caller first calls ``reset``, and writes state fields and model fields. Then it
-    calls ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state, so reset all
-    worlds first. Model fields start at the model's values, and resets do not change them.
+    ``fault``. To restart worlds, the caller first calls ``reset``. Then it writes state fields and model fields.
+    Finally, it calls ``commit``, ``apply_model``, optionally ``settle``, and ``refresh``. A new engine holds no state,
+    so reset all worlds first. Model fields start at the model's values, and resets do not change them.
 
     Args:
         model: The compiled model, which the engine does not change.
@@ -65,7 +65,7 @@ class Engine(abc.ABC):
     initial: np.ndarray
     """The initial state of worlds after ``reset``, (integration_size,), float64."""
     arrays: dict[str, wp.array]
-    """The arrays of the fields and model fields, (nworld, ...), by name, filled by the engine's constructor."""
+    """Maps the name of each field and model field to its array, (nworld, ...). The engine's constructor fills it."""
     ctrl: wp.array
     """The controls of the next step, (nworld, nu), float32. They are ``arrays["ctrl"]`` and part of the state."""
     fault: wp.array

@@ -30,7 +30,7 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""The choice of a planner's engine counts at most this many CPU cores. More cores were not measured."""
+"""A machine with more CPU cores is treated like one with this number, because larger machines were not measured."""
 
 _NOSLIP = 6
 """The noslip solver, which is slow on a GPU, raises the break-even point by this factor."""
@@ -134,7 +134,7 @@ def place_samples(
     engine: str | EngineFactory, device: str | None, *, nthread: int | None, samples: int,
     spec: Callable[[], mujoco.MjSpec], solver: Mapping[str, int | float] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Choose the engine for a planner's samples, and return the options to change.
+    """Choose the engine for a planner's samples, and return the options that this choice changes.
 
     With engine="auto" on a GPU, the choice depends on the number of samples, and on whether the noslip solver runs.
 

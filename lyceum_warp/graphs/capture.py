@@ -49,7 +49,7 @@ class Graphs:
     Args:
         device: Device of the launches; Warp can also capture graphs on the CPU.
         enabled: Whether to capture graphs.
-        capture_engine: Whether calls of the engine consist of launches, so that graphs can include them.
+        capture_engine: Whether graphs include the engine's calls. These calls must then only launch kernels.
         workers: Threads that replay the graphs of phases with ``by_world``. By default, the caller's thread is used.
     """
 

@@ -25,7 +25,7 @@ def rehearse() -> Iterator[dict[tuple[Any, int | None], None]]:
     modules: dict[tuple[Any, int | None], None] = {}
 
     def launch(kernel: Any, dim: Any = None, *args: Any, block_dim: int | None = None, **kwargs: Any) -> None:
-        # empty launches load no module, and generic kernels are compiled for argument types
+        # a launch of size 0 loads no module; the module of a generic kernel depends on the argument types
         if np.prod(dim) and not kernel.is_generic:
             modules[kernel.module, block_dim] = None
 

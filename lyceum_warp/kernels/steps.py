@@ -23,7 +23,7 @@ STARTUP = wp.constant(-1)
 
 
 def act_kernels(task: TaskCode) -> None:
-    """Make the kernels that map actions to controls, and advance the task's memory."""
+    """Make the kernels that map actions to controls, and the kernels that advance the task's memory."""
     Batch, Params = task.Batch, task.Params  # noqa: N806
     view, copy_state, valid_model = task.view, task.copy_state, task.valid_model
     control, advance, substep = (task.functions[name] for name in ("control", "advance", "substep"))

@@ -140,7 +140,9 @@ class Configuration:
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
-    """Load a learner's initial policy and value function from a run, and the iteration at which they were saved.
+    """Load a learner's initial policy and value function from a run.
+
+    The third result is the iteration at which they were saved.
 
     If ``which`` is None, the run is resumed. The learner then usually makes its networks from the hyperparameters, and
     this function returns None for the policy and for the value function. It returns the networks if the policy has a

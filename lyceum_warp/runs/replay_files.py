@@ -49,7 +49,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
     """Restore the buffer of a checkpoint."""
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
-        # ignore later steps of a save that was interrupted
+        # an interrupted save may have left a longer file: ignore its additional steps
         longer = sorted(path for path in folder.glob(f"{start:012d}-*.pt") if path.name >= _name(start, end))
         if not longer:
             raise ValueError(f"{folder} lacks steps {start} to {end} of the replay buffer")

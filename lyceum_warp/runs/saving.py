@@ -12,10 +12,11 @@ from lyceum_warp.runs.replay_files import clean_replay, write_replay
 class Saver:
     """Writes a run's files.
 
-    Each iteration writes its metrics at once. It also writes the policy if this is the best one so far, or if it needs
-    a numbered file. The last policy and the complete state are saved together, usually every 30 s. If a save takes less
-    than 0.3 s, the next one comes after 100 times this duration. If it takes more than 1.5 s, the next one comes after
-    20 times this duration. After ``kill -9``, the run resumes from the last save.
+    The saver writes metrics after each iteration. It also writes the policy if the policy is the best so far, or if
+    ``keep_every`` requires a numbered file. The last policy and the complete state are saved together, usually every
+    30 s. If a save takes less than 0.3 s, the next save follows after 100 times this duration. If a save takes more
+    than 1.5 s, the next save follows after 20 times this duration. After ``kill -9``, the run resumes from the last
+    save.
 
     All ranks have a saver and make the same calls. Ranks without a run do not write. ``lw.train`` describes
     ``keep_every`` and ``save_every``.

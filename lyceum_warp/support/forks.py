@@ -25,7 +25,7 @@ def leave_in_parent(thing: Any, *attributes: str) -> None:
 
 
 def call_once_gone(thing: Any, function: Callable[[], object]) -> None:
-    """Call a function when an object is deleted, but neither in forked children nor at the end of the process."""
+    """Call a function when an object is deleted. Forked children and an ending process do not call the function."""
     weakref.finalize(thing, _call_in, os.getpid(), function).atexit = False
 
 

@@ -55,7 +55,7 @@ def signals(handler: Callable[[int, Any], None] = _interrupt, *, replaces: Any =
 
 
 def obeyed() -> contextlib.AbstractContextManager[object]:
-    """Let the next Ctrl-C, SIGTERM or SIGHUP raise Interrupted again, after ``signals`` has raised it once."""
+    """Raise Interrupted at the next Ctrl-C, SIGTERM or SIGHUP, even if an earlier signal has already raised it."""
     return signals(replaces=_ignore)
 
 

@@ -45,15 +45,16 @@ def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """Compute the difference of two paired proportions, with its 95 % confidence interval.
 
-    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". Half an
-    observation is added to each of the four outcomes of a pair. The width is thus positive even if all pairs agree.
+    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". A pair has
+    four possible outcomes. The method adds 0.5 to the count of each. The width is thus positive even if all pairs
+    agree.
 
     Args:
         first: First outcome of each pair, (pairs,) bool.
         second: Second outcome of each pair, (pairs,) bool.
 
     Returns:
-        The centre and the half-width of the interval. The centre estimates the second proportion minus the first.
+        The estimated difference, second minus first, and the half-width of the interval.
     """
     gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
     pairs = len(first) + 2.0

@@ -10,7 +10,7 @@ class LongWork(Progress):
     """Shows the progress of long work: a temporary bar on a terminal, otherwise a line every 10 s.
 
     Args:
-        text: The name of the work.
+        text: A description of the work, such as "compiling kernels".
         unit: The name of the counted units, such as "frames".
         console: The output; by default stderr.
         wait: Seconds until the first line.

@@ -15,7 +15,10 @@ import warp as wp
 
 
 def builtin_functions() -> Mapping[str, Any]:
-    """Return Warp's built-in functions by name. Some of them, such as ``wp.tid``, are not attributes of ``warp``."""
+    """Return a mapping from names to Warp's built-in functions.
+
+    Some of these functions, such as ``wp.tid``, are not attributes of ``warp``.
+    """
     functions: Mapping[str, Any] = wp._src.context.builtin_functions
     return functions
 
@@ -45,7 +48,7 @@ def extend_structs() -> None:
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Return whether Warp has loaded a module for a block size, or has it in its cache.
 
-    If Warp's internals have changed, the result is False, which only costs time.
+    If Warp's internals have changed, the result is always False. A wrong False only costs time.
     """
     if (device.context, block) in module.execs:
         return True

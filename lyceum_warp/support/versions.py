@@ -1,4 +1,4 @@
-"""Collect the versions of packages and data about the machine, which both affect a run's numbers."""
+"""Collect package versions and data about the machine."""
 
 import contextlib
 import functools

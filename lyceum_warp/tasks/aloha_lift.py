@@ -1,8 +1,8 @@
 """AlohaLift: lift a pot by its two handles with two arms (robot and pot from mujoco_warp's test data).
 
 Meshes are visual only. Collisions use simple shapes in the task's MJCF file, and capsules fitted to the arms. The arms
-do not collide with each other. Actions are velocities of the position servos' targets. Success: the pot has been above
-the goal height for ten consecutive steps.
+do not collide with each other. Actions are the velocities at which the targets of the position servos move. Success:
+the pot has been above the goal height for ten consecutive steps.
 """
 
 import mujoco

@@ -1,9 +1,9 @@
 """PandaLift: grasp a cube on a table and lift it (a Franka Panda with its gripper, as in robosuite's Lift).
 
 The arm's model, which the extra "robots" installs, has no gripper. The hand, the table and the cube are in MJCF files
-of the package. Actions are velocities of the position servos' targets. The arm compensates gravity, as the real robot
-does. Collisions use capsules fitted to the arm, and meshes are visual only. Success: the cube has been above the goal
-height for ten consecutive steps.
+of the package. Actions are the velocities at which the targets of the position servos move. The arm compensates for
+gravity, as the real robot does. Collisions use capsules fitted to the arm, and meshes are visual only. Success: the
+cube has been above the goal height for ten consecutive steps.
 """
 
 import mujoco

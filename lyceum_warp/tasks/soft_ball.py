@@ -10,7 +10,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row
 
-NODE = 4  # the ball's first index in qpos and qvel, where each of 8 corners has 3 numbers
+NODE = 4  # first of the ball's indices in qpos and qvel: 8 flex nodes with 3 coordinates each
 
 
 @wp.struct

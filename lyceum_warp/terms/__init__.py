@@ -1,4 +1,4 @@
-"""Offer reward terms, commands, contact clocks, noise, random draws and motors for any task.
+"""Provide reward terms, commands, contact times, noise, random draws and motors that all tasks can use.
 
 Every function is a ``wp.func``. Its arguments are numbers, vectors, rows of ``World`` and tables of ``Params``. An
 argument's name has the same meaning in all functions; see ``ARGUMENTS``.

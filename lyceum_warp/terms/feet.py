@@ -131,7 +131,7 @@ def foot_swing_height(
 ) -> float:
     """Return the sum of (height / target - 1)^2 over the feet that have ``landed``, times ``active``.
 
-    The height is the greatest height of the swing that ended. Source: mjlab 1.6.0, ``feet_swing_height``.
+    The height is the foot's peak height during the last swing. Source: mjlab 1.6.0, ``feet_swing_height``.
     """
     total = float(0.0)
     for foot in range(contact_time.shape[0]):

@@ -80,7 +80,7 @@ def check_task(
         A report that can be printed.
 
     Raises:
-        AssertionError: The task breaks rules, which the message lists.
+        AssertionError: The task breaks at least one rule. The message lists all broken rules.
 
     Example:
         >>> print(check_task("hopper", engine="mujoco"))

@@ -9,7 +9,7 @@ from lyceum_warp.world_arrays import memory_columns
 
 
 def check_noise(ctx: Context) -> None:
-    """Noise depends only on the state, and differs between worlds, episodes and steps."""
+    """Equal states give equal noise. Worlds, episodes and steps have different noise."""
     env = ctx.a
     if not env.task.noisy_groups:
         return

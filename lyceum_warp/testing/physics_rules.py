@@ -60,7 +60,7 @@ def predicted(
 def closer(
     ctx: Context, state: torch.Tensor, wanted: np.ndarray, without: np.ndarray, mask: torch.Tensor, what: str
 ) -> None:
-    """Fail unless the coordinates of selected worlds are closer to ``wanted`` than to ``without``."""
+    """Fail if ``qpos`` of a selected world is nearer to the values ``without`` than to the values ``wanted``."""
     found = state[:, ctx.a.state_space.parts["qpos"]].cpu().numpy()
     effect = np.abs(wanted - without).max(axis=1)
     error = np.abs(found - wanted).max(axis=1)

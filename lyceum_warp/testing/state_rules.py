@@ -143,7 +143,7 @@ def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
 
 
 def _lasting_columns(env: Env) -> list[slice]:
-    """Return the columns that resets preserve: lasting memory, and model fields that no reset randomizes."""
+    """Return the state columns of ``lasting_memory`` and of model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
     return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]

@@ -88,14 +88,14 @@ def combined(settings: Iterable[Setting]) -> Setting | None:
 
 
 def flags(physics: Mapping[str, Any]) -> str:
-    """Write a setting as flags of lyceum-warp train and plan."""
+    """Write a setting as command-line flags."""
     words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
     words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
     return " ".join(words)
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
-    """Write a setting as the line of Python that defines a task's physics options "fast"."""
+    """Write a setting as Python code for a task: the attribute ``physics`` with one entry, "fast"."""
     words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
     return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
 

@@ -23,7 +23,7 @@ _LEAST_SAVING = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """Change in return due to a setting, relative to the unchanged task's mean absolute return."""
+    """How much a setting changes the return, as a fraction of the unchanged task's mean absolute return."""
 
     mean: float
     low: float

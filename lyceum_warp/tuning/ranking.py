@@ -32,7 +32,8 @@ class Rankings:
     - standing: after a random reset;
     - moving: after steps under a planner that uses the plant's physics and replans every 6 steps. The number of steps
       is spread evenly from 30 to 120, because grasps happen late in an episode;
-    - fallen: after random actions. They continue for 10 steps after all episodes have ended, or for 210 steps.
+    - fallen: after random actions. These continue until all episodes have ended, for at most 200 steps. Ten more steps
+      follow.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class Tuning:
 
     @property
     def flags(self) -> str:
-        """Write the best setting as flags of lyceum-warp train and plan, or "" if there is none."""
+        """Write the best setting as flags for the commands ``train`` and ``plan``, or "" if there is none."""
         return flags(self.best["physics"]) if self.best else ""
 
     @property
@@ -92,10 +92,10 @@ def tune(
         tolerance: Bound on the 95 % interval of the difference of returns, relative to the mean absolute return. It is
             "strict" (2 %), "loose" (5 %) or "any" (only faults count).
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
-        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. By default, there
-            are enough for a narrow interval, but they take at most a minute (5 s with ``short``).
-        planning: Whether to find physics options for the task's planner instead of the plant. The search then compares
-            planning times. It also compares how the planners rank the same samples. The samples start from standing,
+        episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. The default gives a
+            narrow interval, unless the episodes would take more than a minute (5 s with ``short``).
+        planning: If True, find physics options for the worlds of the task's planner. The search then compares planning
+            times. It also compares how the planners rank the same samples. The samples start from standing,
             moving and fallen states. The search suggests a setting if the interval of the mean rank correlation lies
             above 0.9 ("strict") or 0.8 ("loose"). ``nworld`` is then the number of samples, by default 64, and
             ``episodes`` is the number of states of each kind.

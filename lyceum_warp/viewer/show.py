@@ -32,8 +32,8 @@ def view(
     controller, all actions are 0. With the panel and its keys, the user chooses the mode, the world, the speed, ghosts
     and the camera.
 
-    The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. A
-    controller of one world acts in a copy of the displayed world. The copy runs in real time, as in
+    The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. Any other
+    controller acts in a single world, a copy of the displayed world. The copy runs in real time, as in
     ``lw.control_async``, and all other worlds wait. Afterwards, the displayed world gets the copy's state. If ``env``
     is one world on the CPU without automatic resets, it is not copied.
 
@@ -50,8 +50,8 @@ def view(
         port: The port of the page; by default the first free port from 8080.
         watchers: Functions that are called about twice a second, and return a sequence of new messages.
         block: Whether the call returns only when the user quits. If False, a thread steps the worlds. The caller must
-            not use them until the view is closed. The default is False in a notebook, which then shows the page and
-            a link to it.
+            not use them until the view is closed. The default is False in a notebook, and True elsewhere. Notebooks
+            show the page and a link to it.
 
     Returns:
         The running view, or None if the call blocks.

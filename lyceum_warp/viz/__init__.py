@@ -1,4 +1,7 @@
-"""Draw plots and videos, which need the extra ``viz``, and write curves for TensorBoard."""
+"""Draw plots, render videos, and write curves for TensorBoard.
+
+Plots and videos need the extra ``viz``.
+"""
 
 EXTRA = "pip install 'lyceum-warp[viz]'"
 """The command that installs the packages for plots and videos."""

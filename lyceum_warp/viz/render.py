@@ -1,10 +1,10 @@
-"""Draw states into a video, or as single pictures: ``python render.py folder``.
+"""Draw states as a video or as single pictures: ``python render.py folder``.
 
 ``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
 ``size``, ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, and None at the end. If stdin closes
 before None arrives, the parent process has died. The folder holds the model, ``model.mjb``. The program writes
-``video.mp4``, or each picture into ``picture.raw`` if ``fps`` is None. The program prints "ready" once it can draw, and
-"frame" after each picture.
+``video.mp4``. If ``fps`` is None, it writes each picture to ``picture.raw`` instead. The program prints "ready" once it
+can draw, and "frame" after each picture.
 
 MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
 therefore starts a process for each library that it tries. Exit code 3 means that the machine cannot draw with this

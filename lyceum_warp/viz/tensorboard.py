@@ -75,7 +75,7 @@ class TensorBoard:
         self.close()
 
     def __call__(self, iteration: Iteration) -> None:
-        """Add an iteration. Non-finite numbers are omitted, such as the return if no episode has ended."""
+        """Add an iteration without its non-finite numbers. The return is NaN if no episode has ended."""
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         values = []
@@ -108,7 +108,7 @@ class TensorBoard:
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
         self._add(Event(file_version="brain.Event:2"))
-        if number:  # from this step on, TensorBoard then discards the points of earlier files
+        if number:  # this event makes TensorBoard discard the points of earlier files from `step` on
             self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
 
     def _add(self, event: Any) -> None:

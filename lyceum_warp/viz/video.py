@@ -90,10 +90,11 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
 
 
 class Recorder:
-    """Makes a video of shots that arrive one by one, or a picture of one shot.
+    """Renders a video from shots that arrive one by one, or a picture from a single shot.
 
-    Shots wait in a queue for a low-priority subprocess, which renders them. If the queue is full, further shots are
-    dropped, and the last shot in the queue is displayed longer. The file is written when the video is complete.
+    A ``Shot`` is the content of one or several frames. Shots wait in a queue for a low-priority subprocess, which
+    renders them. If the queue is full, further shots are dropped, and the last shot in the queue is displayed longer.
+    The file is written when the video is complete.
 
     Args:
         model: The model.
@@ -112,7 +113,7 @@ class Recorder:
         self.added = 0
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
-        """The number of frames that show an earlier shot, because their own shot was dropped."""
+        """The number of frames that repeat an earlier picture, because the queue was full."""
         self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: deque[Shot] = deque()
@@ -125,7 +126,7 @@ class Recorder:
 
     @property
     def finished(self) -> bool:
-        """Whether the video is complete, or has failed with an error that ``close`` raises."""
+        """Whether the work on the video has ended. After a failure, ``close`` raises the error."""
         return self._done.is_set()
 
     def add(self, shot: Shot) -> None:
@@ -158,7 +159,7 @@ class Recorder:
         return self.out
 
     def cancel(self) -> None:
-        """Cancel the video without writing a file, unless the video is complete."""
+        """Cancel the video, and write no file. A complete video is kept."""
         if not self.finished:
             self._cancelled = True
             self._shots.clear()

@@ -49,7 +49,7 @@ def test_error_of_a_setting_out_of_range_names_the_setting(name: str, wrong: lis
 
 
 def test_random_models_and_nominal_model_together_raise_an_error() -> None:
-    with pytest.raises(ValueError, match="models=4 draws model fields, but nominal_model=True does not: omit one"):
+    with pytest.raises(ValueError, match="models=4 needs random model fields, but nominal_model=True uses nominal"):
         MPPIConfig(models=4, nominal_model=True)
 
 

@@ -129,7 +129,7 @@ def test_invalid_states_and_masks_raise_a_one_line_error() -> None:
     with pytest.raises(ValueError, match=r"the states .* of shape \(2, .*: call .* or stack one .* for each plant"):
         plan(states[0])
     states[1, 1] = torch.nan
-    with pytest.raises(ValueError, match="the state of plant 1 to plan from has nan in its "):
+    with pytest.raises(ValueError, match="the state of plant 1 has nan in its "):
         plan(states)
     with pytest.raises(ValueError, match=r"where must be a bool tensor of shape \(2,\), not a float32 tensor"):
         plan.reset(where=torch.zeros(2))

@@ -147,7 +147,7 @@ def test_success_steps_longer_than_an_episode_raise_an_error(tmp_path: Path) -> 
     source = tiny_task.with_function("def success(s: World, p: Params) -> bool:\n    return True")
     for horizon, steps in ((0, 6), (6, 6), (6, 1)):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = {horizon}, {steps}\n"))
-    with pytest.raises(ValueError, match="success_steps of the task 'tiny' is 7, but its episodes have 6 steps"):
+    with pytest.raises(ValueError, match="success_steps of the task 'tiny' is 7, but an episode has only 6 steps"):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = 6, 7\n"))
 
 

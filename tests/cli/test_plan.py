@@ -77,7 +77,7 @@ def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: p
     assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
     refused(
         capsys,
-        "the controller's step of 0.013 s must be a whole multiple or a whole fraction of the plant's step of 0.02 s",
+        "the controller's step is 0.013 s and the plant's step is 0.02 s, but one must be a multiple of the other",
     )
     assert not (tmp_path / "other").exists()
 

@@ -86,7 +86,7 @@ def test_time_step_that_is_not_a_multiple_of_the_plant_time_step_raises_an_error
     planner = StepPlanner(env)
     planner.timestep = 1.5 * env.timestep
     with pytest.raises(
-        ValueError, match=r"step of 0.03 s must be a whole multiple or a whole fraction of the plant's step of 0.02 s"
+        ValueError, match="controller's step is 0.03 s and the plant's step is 0.02 s, but one must be a multiple"
     ):
         CheckedController(planner, env)
 

@@ -52,8 +52,8 @@ class DeterministicEngine(WarpEngine):
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
         """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
 
-        They do not share the scratch memory of this engine's launches, so a graph of their step takes about a hundred
-        times as much memory.
+        Their launches do not share scratch memory. A graph of their step therefore takes about a hundred times the
+        memory of this engine's graph.
         """
         model, data = super().bare()
         with wp.ScopedDevice(self.device):

@@ -1,4 +1,4 @@
-"""Compute substeps, forward passes and parts of forward passes, for all worlds or for a group of worlds."""
+"""Compute substeps and full or partial forward passes, in all worlds or in a group of worlds."""
 
 import functools
 import inspect
@@ -91,8 +91,8 @@ _NEEDS: dict[Part, tuple[Part, ...]] = {
     mjw.fwd_velocity: (mjw.com_pos, mjw.flex, mjw.tendon, mjw.transmission),
     mjw.subtree_vel: (mjw.com_vel,),
 }
-"""The parts that must run before each part. None of them needs collisions or constraints. ``fwd_velocity`` includes
-``com_vel``."""
+"""Maps each part of a forward pass to the parts that must run first. None of these parts needs collisions or
+constraints. ``fwd_velocity`` includes ``com_vel``."""
 
 _FIELDS: dict[Part, str] = {
     mjw.kinematics: "xpos xquat xmat xipos ximat xanchor xaxis geom_xpos geom_xmat site_xpos site_xmat",

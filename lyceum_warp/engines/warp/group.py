@@ -43,7 +43,7 @@ def aligned(size: int) -> int:
 def group_size(nworld: int, device: wp.Device) -> int:
     """Return the number of worlds in a group.
 
-    A group has room for the worlds that usually restart in a step, and is small enough for a cheap forward pass.
+    A group has room for the usual number of restarts in a step. It is small enough for a cheap forward pass.
     """
     return min(nworld, max(1 if device.is_cpu else 64, nworld // 16))
 
@@ -98,7 +98,7 @@ class Turns:
             wp.launch(kernels.return_rows, rows.shape, [self._world, self._left, rows, flat(target)])
 
     def give_bits(self, source: wp.array, target: wp.array) -> None:
-        """Combine the bits of each row of the group with the bits of the row's world, by bitwise or."""
+        """Copy the set bits of each row of the group to the row's world. Other bits of the world do not change."""
         wp.launch(kernels.return_bits, self.size, [self._world, self._left, source, target])
 
 
@@ -162,7 +162,7 @@ class Conditional:
     def __call__(self, mask: wp.array, run: Callable[[], None]) -> None:
         """Run launches that affect only the masked worlds.
 
-        ``mask`` is (nworld,) bool. If ``run`` calls this method again, the inner call does not read its mask.
+        ``mask`` is (nworld,) bool. If ``run`` calls this method again, the inner call ignores the argument ``mask``.
         """
         if self._inside:
             run()

@@ -17,7 +17,7 @@ _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
 
 
 class StaticGeoms:
-    """Computes the poses of static geoms if model fields that determine them differ between worlds."""
+    """Computes the poses of static geoms in each world if worlds differ in ``geom_pos`` or a similar field."""
 
     def __init__(self, model: mujoco.MjModel, varied: Iterable[str], device: wp.Device) -> None:
         body = model.geom_bodyid
@@ -132,7 +132,7 @@ class ModelRows:
             turns.take(source, group)
 
     def give(self, turns: Turns, names: Iterable[str]) -> None:
-        """Copy the group's rows of the given fields back."""
+        """Copy the given fields of the group back to its worlds."""
         for name in names:
             if name in self._pairs:
                 source, group = self._pairs[name]

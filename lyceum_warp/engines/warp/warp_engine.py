@@ -37,7 +37,7 @@ quicken_mujoco_warp()
 
 
 class WarpEngine(Engine):
-    """Steps worlds by MuJoCo Warp, and exposes MuJoCo Warp's arrays without a copy.
+    """Steps worlds with MuJoCo Warp, and exposes MuJoCo Warp's arrays without a copy.
 
     Args:
         model, nworld, fields: See ``Engine``.
@@ -45,8 +45,8 @@ class WarpEngine(Engine):
         dynamics: The model fields that differ between worlds. Contact and constraint capacities are measured with the
             model's own values; see ``sizes.probe_sizes``.
         initial: The initial state for ``reset``, rounded to float32; None for the model's initial state.
-        nconmax: Contact capacity of all worlds, divided by the number of worlds. By default, it is measured in random
-            rollouts. The engine then adds room for the contacts of a single world whose geoms all touch.
+        nconmax: Contact capacity, as an average per world. By default, it is measured in random rollouts. The engine
+            then adds room for the contacts of a single world whose geoms all touch.
         njmax: Constraint capacity of each world. By default, it is measured in random rollouts.
 
     Raises:
@@ -107,8 +107,8 @@ class WarpEngine(Engine):
         moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
         current_parts = () if moved else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom whose position is NaN has contacts with every element of a flex. The NaN in their Jacobian rows would
-        # survive a reset, because the solver multiplies unused rows by zero. Therefore a reset clears these rows.
+        # A geom whose position is NaN has contacts with every element of a flex. The Jacobian rows of these contacts
+        # hold NaN. The solver multiplies unused rows by zero, and NaN times zero is NaN. So a reset clears these rows.
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)

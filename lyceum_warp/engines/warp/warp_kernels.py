@@ -1,6 +1,6 @@
 """Define kernels of the Warp engine. They copy worlds into a group and back, place static geoms, and correct constants.
 
-The masked worlds are numbered from 0 in any order. The number of a world is called its rank. A group holds the worlds
+Each masked world gets a number from 0, called its rank. The order of the ranks is arbitrary. A group holds the worlds
 with consecutive ranks, beginning with rank ``first``.
 """
 
@@ -95,7 +95,7 @@ def return_rows(
 
 @wp.kernel(enable_backward=False)
 def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.array[int], target_inout: wp.array[int]):
-    """Add each row's bits to the bits of its world with a bitwise or; launched over (group size,)."""
+    """Copy the set bits of each row to its world, with a bitwise OR; launched over (group size,)."""
     place = wp.tid()
     if place < left_in[0]:
         world = world_in[place]

@@ -1,9 +1,9 @@
 """G1Stand: a Unitree G1 with a rigid upper body steps in place, and keeps its balance when it is pushed.
 
-Actions are offsets of the leg joints' targets. The targets follow a gait clock and lift the feet. With zero actions,
-the robot steps in place and falls after about a second. A planner only keeps it upright. The servos have the
-gains of unitree_rl_gym, which also keeps waist and arms rigid. A substep would take twice as long with the upper body's
-17 joints and the legs' dry friction.
+The leg joints' targets follow a gait clock and lift the feet. Actions are added to these targets. With zero actions,
+the robot steps in place and falls after about a second. A planner does not need to find the gait, but it must keep the
+robot upright. The servos have the gains of unitree_rl_gym, which also keeps waist and arms rigid. A substep would take
+twice as long with the upper body's 17 joints and the legs' dry friction.
 """
 
 import mujoco

@@ -36,11 +36,11 @@ def lift(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def balance_effort(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the matrix P of the least effort x^T P x (in s) that balances a state x = (qpos, qvel) near upright.
+    """Return the matrix P that determines the least effort of balancing from a state near upright.
 
-    The effort is the integral of the squared action. The best actions bring the arms to rest upright with the least
-    effort, x^T P x. The linearized dynamics are dx/dt = A x + B u, with unstable modes z_i = w_i^T x, A^T w_i = r_i w_i
-    and b_i = w_i^T B. The effort is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
+    The effort is the integral of the squared action, in s. From the state x = (qpos, qvel), the best actions bring the
+    arms to rest upright with the effort x^T P x. The linearized dynamics are dx/dt = A x + B u, with unstable modes
+    z_i = w_i^T x, A^T w_i = r_i w_i and b_i = w_i^T B. The effort is z^T G^-1 z with G_ij = b_i b_j / (r_i + r_j).
     """
     (a, b, c), (e1, e2) = p.inertia, p.lift
     mobility = np.linalg.inv([[a + 2.0 * c, b + c], [b + c, b]])

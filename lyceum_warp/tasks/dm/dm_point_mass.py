@@ -43,7 +43,7 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 class PointMassEasy(lw.Task):
     model, frame_skip = suite.model("point_mass"), 1
     obs = {"position": 2, "velocity": 2}
-    # planners get a larger margin around the target and a longer time step
+    # the planner's margin around the target and its time step are larger than the task's
     planning = lw.Planning(
         settings={"horizon": 50, "temperature": 0.05}, options={"timestep": 0.04}, params={"margin": 0.2}
     )

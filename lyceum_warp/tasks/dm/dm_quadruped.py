@@ -25,14 +25,17 @@ def centers(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 
 def axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return the axes of the geoms in the torso's axes, (geoms, 3, 3)."""
+    """Return the rotation matrix of each geom relative to the torso, (geoms, 3, 3)."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     return data.geom_xmat[p.geoms].reshape(-1, 3, 3)
 
 
 def radii(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Return each geom's radii along its axes, and a capsule's or cylinder's half length, (geoms, 4) in m."""
+    """Return three radii and the half length of each geom, (geoms, 4) in m.
+
+    The radii are along the geom's axes. The half length is 0 unless the geom is a capsule or a cylinder.
+    """
     kind = mujoco.mjtGeom
     found = np.zeros((len(p.geoms), 4))
     for row, geom in zip(found, p.geoms, strict=True):

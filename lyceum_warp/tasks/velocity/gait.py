@@ -1,4 +1,4 @@
-"""Make robots with two legs step in time with a gait clock.
+"""Add a gait clock to the walking tasks of robots with two legs.
 
 The clock says when each foot should stand and when it should swing. It is part of both observation groups, and the
 reward depends on how well the feet follow it. Its frequency is ``gait_frequency``. In each cycle, a foot should first
@@ -28,7 +28,7 @@ class Params(walking.BipedParams):
     stance_share: float = 0.55
     foot_lift: float = 0.07  # greatest height of a swing, m
     standing_height: float = 0.04  # height of the feet's sites above the soles, m
-    growth_steps: float = 4000.0  # steps of a world after which the costs have full weight
+    growth_steps: float = 4000.0  # steps of each world until the costs reach their full weight
 
 
 @wp.struct

@@ -422,7 +422,10 @@ class BipedParams(Params):
 
 
 class Biped(Velocity):
-    """A robot with two legs that follows velocity commands. Two terms reward standing on one leg and a calm trunk."""
+    """A robot with two legs that follows velocity commands.
+
+    One additional term rewards single stance, and another penalizes roll and pitch rates.
+    """
 
     frame_skip, keyframe = 5, "home"
     training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)

@@ -84,7 +84,7 @@ class WorldControl:
         self._reset_due = self._wanted = False
         self._seen: PlanView | None = None
         self.hidden: slice | None = None
-        """The part of the state with the forces of the user's push. Controllers see zeros in this part."""
+        """The columns of the state that hold the user's push force. Controllers see zeros in these columns."""
 
     def new_run(self) -> "ControlRun":
         """Return the controller for a new control loop. Calls from earlier control loops then fail."""

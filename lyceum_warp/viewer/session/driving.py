@@ -15,7 +15,7 @@ from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
 _NEVER = 1e9  # seconds until the task chooses a new command
-# arrows start _HEIGHT metres above the base; at 1 m/s or 1 rad/s, they are _SECONDS metres long
+# arrows start _HEIGHT metres above the base; the length of an arrow is its velocity times _SECONDS
 _HEIGHT, _SECONDS = 0.25, 0.4
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
 

@@ -47,7 +47,7 @@ class FrameMaker:
         """Make a frame of the displayed world, with other worlds as ghosts.
 
         Args:
-            live: The worlds that are stepped: ``main``, or the plant, which is a copy of ``main``'s displayed world.
+            live: The worlds that are stepped now. They are either ``main`` or the plant, a copy of the displayed world.
             main: All worlds.
             traces: The paths of a planner's samples.
             status: A function that completes a ``Status``, given some of its fields.

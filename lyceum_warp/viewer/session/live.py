@@ -1,6 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-On a GPU, frames wait for the device, but steps do not.
+On a GPU, a step does not wait for the device. Only a frame waits for it.
 """
 
 import dataclasses

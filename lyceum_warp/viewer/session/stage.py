@@ -199,7 +199,7 @@ class Stage:
         self._trace()
 
     def show_world(self, world: int) -> None:
-        """Show another world. In the previous world, end the user's push and command."""
+        """Show another world. First clear the user's push and command in the displayed world."""
         before = self.live
         before.end_push()
         if self.driving.wanted is not None:

@@ -89,7 +89,8 @@ class Window:
     def show(self, frame: Frame) -> None:
         """Send a frame without waiting for the window.
 
-        An older frame that was not sent yet is skipped. Its curve points and messages move to the new frame.
+        An older frame that was not sent yet is skipped. The new frame then also holds the curve points and messages of
+        the older frame.
         """
         with self._changed:
             self._pending = protocol.latest(self._pending, frame)

@@ -107,7 +107,7 @@ class Actions:
         self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
 
     def set_ghosts(self, **changes: Any) -> None:
-        """Change the ghosts to draw."""
+        """Change settings of the ghosts."""
         self.do(dataclasses.replace(self.status.ghosts, **changes))
 
     def toggle_video(self) -> None:

@@ -11,7 +11,7 @@ processes. The proxy forwards a request only if
 
 Browsers send a cookie to all ports of a host, including the servers of other users on the loopback address. The cookie
 is therefore limited to a random path (``Path=/RANDOM/``), below which the page is served. Studio's page requests
-addresses from the root of the host. A script from the proxy prefixes these addresses with the random path.
+absolute paths, such as ``/ui``. A script from the proxy adds the random path in front of them.
 
 aiohttp parses requests, and limits their headers to 128 lines of 8 KiB. The proxy runs in a thread.
 """
@@ -58,7 +58,7 @@ PROTECTION = {
 }
 """These headers stop other sites from embedding the page or getting its address.
 
-Pages of this machine that know the token, such as notebooks, may embed the page.
+A notebook on this machine may embed the page, because the notebook knows the token.
 """
 SCRIPT = """<script>
 (() => {
@@ -197,7 +197,7 @@ class Proxy:
         ready.wait()
 
     def offer(self, file: str) -> None:
-        """Offer a file for download to the open pages. Any thread may call this method."""
+        """Offer a file as a download on all open pages. Any thread may call this method."""
         self._loop.call_soon_threadsafe(lambda: self._loop.create_task(self._tell(file)))
 
     def close(self) -> None:
@@ -368,7 +368,7 @@ class Proxy:
 
 
 class _Server(web.Server):
-    """Limits the number of connections without the secret, and closes slow or idle connections."""
+    """Limits the number of unauthenticated connections, and closes slow or idle connections."""
 
     def __init__(self, handler: Any) -> None:
         super().__init__(

@@ -11,7 +11,7 @@ from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Ac
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""Maximum number of points of a plotted curve, and its length in seconds. Every frame sends all points."""
+"""A plotted curve covers PLOT_SECONDS seconds with at most PLOT_POINTS points. Every frame sends all points."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
@@ -34,7 +34,7 @@ class Windows:
         """Draw every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
-        # a moved window keeps its place until the size of the browser's window changes
+        # panels stay where the user moved them until the browser window is resized
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
         if resized and width < NARROW:
@@ -180,7 +180,10 @@ class Windows:
                 self._actions.do(protocol.Drive((command[0], command[1], command[2])))
 
     def _numbers(self) -> None:
-        """Let the user change the planner's settings and the task's parameters. A value is sent when its edit ends."""
+        """Let the user change the planner's settings and the task's parameters.
+
+        A value is sent when the user has finished editing it.
+        """
         status = self._actions.status
         parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
         for of, numbers in parts:
