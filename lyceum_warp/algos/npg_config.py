@@ -95,9 +95,7 @@ class NPGConfig:
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
-            raise ValueError(
-                f"log_std={self.log_std} is below min_log_std={self.min_log_std}: raise log_std, or lower min_log_std"
-            )
+            raise ValueError(f"log_std must be at least min_log_std={self.min_log_std}, not {self.log_std}")
 
 
 def enough_samples(config: NPGConfig, nworld: int) -> int:

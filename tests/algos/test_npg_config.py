@@ -14,7 +14,7 @@ from lyceum_warp.algos.npg_config import enough_samples
         ("samples", 0, "a whole number from 1"),
         ("value_rate", None, "a finite number of at least 0"),
         ("log_std", math.nan, "a finite number"),
-        ("log_std", -5.0, "not be below min_log_std, which is -3.0"),
+        ("log_std", -5.0, "be at least min_log_std=-3.0, not -5.0"),
         ("fisher_fraction", 0, "be greater than 0"),
         ("rollout", "foo", "be 'auto', 'episodes' or 'segments'"),
         ("whiten", 1, "be True or False"),
