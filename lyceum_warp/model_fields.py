@@ -212,7 +212,7 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
 """Fields that move a body's inertial frame. They cannot differ between worlds for bodies that MuJoCo compiled as
-"simple": there, the inertial frame is the body frame."""
+"simple". In such a body, the inertial frame is the body frame."""
 
 
 def check_simple(model: mujoco.MjModel, name: str) -> None:

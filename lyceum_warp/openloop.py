@@ -43,7 +43,7 @@ class OpenLoop:
         models: Values, by name, of model fields that differ between worlds. They replace the values in ``state``. Each
             is (n, size) float64 on the environment's device. World w uses row w % n. Every run reads ``keys`` and these
             values.
-        states: Number of initial states. From each state, ``nworld / states`` consecutive worlds start.
+        states: Number of initial states. Each is the initial state of ``nworld / states`` consecutive worlds.
 
     Raises:
         ValueError: The environment has automatic resets, ``keys`` or ``states`` does not fit the worlds, or the memory

@@ -355,12 +355,12 @@ class Planning:
     """
 
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Settings of the planner by name: fields of ``lw.MPPIConfig``."""
+    """Values of ``lw.MPPIConfig`` for the planner."""
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Options of the planner's worlds by name: arguments of ``lw.make``, as in ``{"physics": "fast"}``."""
+    """Arguments of ``lw.make`` for the planner's worlds, as in ``{"physics": "fast"}``."""
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Parameters of the planner's worlds by name: fields of the task's ``Params``. MPPI with a value function
-    ignores these parameters, because the value function was fitted to the rewards of the unchanged task."""
+    """Values of the task's ``Params`` for the planner's worlds. MPPI with a value function ignores these values,
+    because the value function was fitted to the rewards of the unchanged task."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -403,7 +403,7 @@ class Task:
     ``World`` lists fields of MjData and MjModel by MuJoCo's names, such as ``qpos``, ``site_xpos`` and ``body_mass``. A
     model field differs between worlds, and is part of the state, if ``startup``, ``initialize``, ``randomize`` or
     ``event`` writes it. Otherwise all worlds share it. ``World`` also declares memory, as in ``air_time: Row[float] =
-    lw.memory(4)``. Resets clear this memory, but not the lasting memory of ``lw.lasting_memory(4)``.
+    lw.memory(4)``. Resets clear this memory. They do not clear lasting memory, which ``lw.lasting_memory(4)`` declares.
 
     A default in ``Params`` may name an element of the model, such as ``tip: int = lw.site("tip")``. Functions get the
     element's index. There are also ``lw.body``, ``lw.geom``, ``lw.camera``, ``lw.joint``, ``lw.qpos``, ``lw.dof``,

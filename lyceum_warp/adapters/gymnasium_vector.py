@@ -31,9 +31,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     - SAME_STEP resets the world within that step. The world returns the first observation of its next episode.
       ``infos["final_obs"]`` and ``infos["final_info"]`` have the last observations and infos of ended episodes. The
       masks ``_final_obs`` and ``_final_info`` mark the worlds whose episodes ended. With ``torch``, ``final_obs`` and
-      ``final_info`` always exist, as tensors over all worlds: omitting them would require a wait for the device.
-      Without ``torch``, a step that ends no episode omits both. In other steps, ``final_obs`` is an object array with
-      None for the other worlds, as Gymnasium's wrappers expect.
+      ``final_info`` always exist, as tensors over all worlds. Omitting them would require a wait for the device.
+      Without ``torch``, a step that ends no episode omits both. Otherwise, ``final_obs`` is an object array with None
+      for worlds whose episodes continue, as Gymnasium's wrappers expect.
     - DISABLED resets worlds only in ``reset(options={"reset_mask": mask})``. Until then, a world keeps stepping, and
       its termination or truncation stays True. A world with a fault is reset at once, but returns its last valid
       observation.

@@ -112,8 +112,8 @@ class Team:
     def together(self) -> Iterator[None]:
         """End all processes if the ``with`` block raises an error in one of them.
 
-        Code in the ``with`` block must not communicate with other processes. Communication with a failed process
-        blocks.
+        Code in the ``with`` block must not communicate with other processes. Otherwise, an error in one process would
+        make the others hang.
 
         Raises:
             SystemExit: The ``with`` block failed in another process.

@@ -23,8 +23,8 @@ def room(batch: int, team: Team) -> int:
 class Minibatches:
     """Shuffles a rollout's samples once, and learns from the same mini-batches in every epoch.
 
-    The mini-batches do not depend on the number of processes. The number of a process's samples therefore varies from
-    one mini-batch to the next. The process copies its samples into a buffer of fixed size, padded with samples of
+    The mini-batches do not depend on the number of processes. The number of samples from one process therefore
+    varies between mini-batches. The process copies its samples into a buffer of fixed size, padded with samples of
     weight 0. Samples that do not fit are dropped.
 
     ``learn`` gets this process's samples and their weights, (samples,). The weights of all processes sum to 1. On a

@@ -116,7 +116,7 @@ class MPPIConfig:
     def changed(self, settings: Mapping[str, Any]) -> "MPPIConfig":
         """Return a copy with changed settings.
 
-        If ``update`` changes, settings that only the old update uses return to their defaults.
+        If ``update`` changes, the old update's own settings get their default values.
 
         Raises:
             ValueError: A value is of the wrong type or out of range.

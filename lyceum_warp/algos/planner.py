@@ -533,7 +533,7 @@ class Planner:
         return [int(seed) for seed in self._seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
-        """Randomize the planner's models with the task's functions. No plant uses the same random streams."""
+        """Randomize the planner's models with the task's functions. Plants use other random streams."""
         self.env.rand_reset(int(np.random.SeedSequence([seed, _MODELS]).generate_state(1)[0]) >> 1)
         states = self.env.get_state()[: self.config.models]
         for name, rows in self.model_fields.items():

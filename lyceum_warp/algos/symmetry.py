@@ -28,7 +28,7 @@ class Reflected(nn.Module):
         return self.swapped(rows) * self.signs
 
     def swapped(self, rows: torch.Tensor) -> torch.Tensor:
-        """Reorder columns as in the mirror image, without changing signs, for example of standard deviations."""
+        """Mirror positive numbers, such as standard deviations: reorder the columns, but keep the signs."""
         return rows.index_select(-1, self.order)
 
 

@@ -173,7 +173,7 @@ class Terms:
     def source_of(
         self, function: wp.Function, name: str, given: Mapping[str, str], within: tuple[str, ...]
     ) -> tuple[Literal["expression", "function", "default"], str]:
-        """Find where an argument's value comes from: an expression, the function with its name, or the default."""
+        """Find where an argument's value comes from: an expression, a function of the same name, or the default."""
         source: Literal["expression", "function"] = "expression"
         if name in given:
             text = given[name]

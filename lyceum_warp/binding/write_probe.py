@@ -1,4 +1,4 @@
-"""Find faulty writes of a task's functions: call each once in one world, with guard memory around every row."""
+"""Find faulty writes of a task's functions: call each function in one world, with guard memory around rows."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -198,7 +198,7 @@ def _worlds(
 ) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
     """Make the controlled world, and a function that makes a planner.
 
-    The function takes a ``RealTimeSetting``, which overrides the flags, or None.
+    The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)

@@ -162,9 +162,9 @@ class Train:
     transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
     cheap comparisons are made. A policy that was trained on a GPU is tested on the C engine. A policy that was trained
-    under other physics is tested under the task's default physics. With --transfer, the policy is also tested under
-    each set of physics options that the task defines. After training on CPU cores, it is also tested on the Warp
-    engine. Compiling the kernels of this engine may take minutes.
+    under other physics is tested under the task's default physics. --transfer adds a test under each set of physics
+    options that the task defines. After training on CPU cores, --transfer also adds a test on the Warp engine.
+    Compiling the kernels of this engine may take minutes.
     """
     trust: Trust = False
     take_over: bool = False

@@ -33,7 +33,7 @@ def policy_episodes(
     if env.autoreset:
         raise ValueError("trajectories need an environment without automatic resets: make(..., autoreset=False)")
     if env.horizon == 0:
-        raise ValueError(f"an episode of {env.task.name!r} has no time limit: pass one, as in make(..., horizon=1000)")
+        raise ValueError(f"an episode of {env.task.name!r} has no time limit: set one, as in make(..., horizon=1000)")
     named = {"name": type(policy).__name__, **(controller or {})}
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)

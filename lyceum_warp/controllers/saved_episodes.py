@@ -61,8 +61,8 @@ def episode_env(
 
     Raises:
         FileNotFoundError: The file of the task or of its model is missing.
-        ValueError: The task is not found, differs from the episode's task, or does not fit the states. Files to which
-            other users can write are also refused.
+        ValueError: The task is not found, differs from the episode's task, or does not fit the states. A task file to
+            which other users can write is also refused.
     """
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}

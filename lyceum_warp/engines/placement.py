@@ -30,7 +30,7 @@ break-even points are 27 samples per core on adroit_pen without noslip, 41 on re
 (bench/README.md)."""
 
 _MOST_CORES = 16
-"""A machine with more CPU cores is treated like one with this number, because larger machines were not measured."""
+"""A machine with more CPU cores is treated like one with this many, because larger machines were not measured."""
 
 _NOSLIP = 6
 """The noslip solver, which is slow on a GPU, raises the break-even point by this factor."""

@@ -249,8 +249,8 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
     Args:
         distance: Distance from the point between the fingers to the target, m.
         finger: Position of a finger, m; it is 0 if the fingers meet.
-        closed: Largest position at which the fingers count as closed, m. The fingers count as open at ``closed`` plus
-            2.2 cm and above.
+        closed: Largest position at which the fingers count as closed, m. Above ``closed`` + 2.2 cm, the fingers
+            count as open.
     """
     near = tolerance(distance, wp.vec2(0.0, 0.01), 0.01)
     reach = tolerance(distance, wp.vec2(0.0, 0.005), 0.1, int(Sigmoid.RECIPROCAL), 0.2)

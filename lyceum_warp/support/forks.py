@@ -25,7 +25,7 @@ def leave_in_parent(thing: Any, *attributes: str) -> None:
 
 
 def call_once_gone(thing: Any, function: Callable[[], object]) -> None:
-    """Call a function when an object is deleted. Forked children and an ending process do not call the function."""
+    """Call a function when an object is deleted, except in forked children and at exit."""
     weakref.finalize(thing, _call_in, os.getpid(), function).atexit = False
 
 

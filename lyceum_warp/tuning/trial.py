@@ -40,7 +40,7 @@ class Effort:
     steps: int
     """Maximum number of steps in an episode, or 0 for the task's horizon."""
     recorded_at: tuple[int, ...]
-    """Numbers of the steps after which states are recorded. Speed and divergence are measured from these states on."""
+    """States are recorded after these numbers of steps. Speed and divergence are measured from the recorded states."""
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))

@@ -167,8 +167,8 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
 
 _TEMPORARIES = 1.25
 """The estimated memory of a world, divided by its memory in MuJoCo Warp's Data. In measurements, a step's temporary
-arrays took 1 to 9 % of the memory of the Data. The rest is room for graphs and for the group of a partial forward pass.
-CPU graphs can exceed the estimate, because they keep all temporary arrays alive."""
+arrays took 1 to 9 % of the Data's memory. The rest is room for graphs and for the group of a partial forward pass. CPU
+graphs can exceed the estimate, because they keep all temporary arrays alive."""
 
 _TEMPORARIES_CONVEX = 3.5
 """The same factor for models with convex collisions or the noslip solver. On adroit_pen, the temporary arrays take 1.5
