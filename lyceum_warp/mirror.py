@@ -14,12 +14,12 @@ Reflection = tuple[Sequence[int], Sequence[float]]
 class Mirror:
     """A task's left-right mirror image, for ``lw.Task.mirror``.
 
-    Each reflection applies to the parts of observations, actions and states that have its name. A reflection that
-    keeps the order of columns is a list of signs: ``"command": (1, -1, -1)`` inverts the lateral velocity and the yaw
-    rate. Any other reflection is a pair of lists: the new order of the columns, and the signs. For example,
-    ``"foot_force": ([1, 0], [1, 1])`` exchanges the left and the right foot. In the base's axes, velocities have the
-    signs (1, -1, 1), and angular velocities have the signs (-1, 1, -1). If actions are controls, one reflection named
-    "action" applies to the whole action.
+    In observations, actions and states, each reflection applies to the parts with its name. A reflection that keeps the
+    order of columns is a list of signs: ``"command": (1, -1, -1)`` inverts the lateral velocity and the yaw rate. Any
+    other reflection is a pair of lists: the new order of the columns, and the signs. For example, ``"foot_force":
+    ([1, 0], [1, 1])`` exchanges the left and the right foot. In the base's axes, velocities have the signs (1, -1, 1),
+    and angular velocities have the signs (-1, 1, -1). If actions are controls, one reflection named "action" applies to
+    the whole action.
 
     Args:
         parts: The reflection of each part, by the part's name.

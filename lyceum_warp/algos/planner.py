@@ -503,7 +503,7 @@ class Planner:
 
         Args:
             seed: A new seed. With several plants, plant i gets the seed ``seed + i``; a list gives one seed per plant.
-                The planner draws new models with the first seed.
+                The planner randomizes its models again with the first seed.
             where: Mask of the plants to reset, (plants,) bool; by default all plants are reset. With a mask, all plants
                 outside the mask keep their seeds, and the planner keeps its models.
 
