@@ -32,7 +32,7 @@ from lyceum_warp.runs.folder import Run
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
 """Command-line flags for tasks whose threshold is a mean return of training episodes."""
 NPG = ("--algorithm", "npg", "--mean-every", "5")
-"""Command-line flags for tasks whose threshold is the mean policy's return in 16 evaluation episodes."""
+"""Command-line flags for tasks whose threshold is a return without exploration noise, in 16 episodes."""
 LARGE = ("--samples", "65536")
 SUITE = (*WALKING, "--num-steps", "32", "--gamma", "0.995", "--entropy-coef", "0.001", "--no-clip-value-loss")
 

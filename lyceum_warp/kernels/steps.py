@@ -214,7 +214,7 @@ UNIT = wp.constant(2.0**20)
 
 
 def shared_kernels(task: TaskCode) -> None:
-    """Make the kernels for the memory that all worlds share."""
+    """Make the kernels that sum and update the memory shared by all worlds."""
     Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
     tally, share = task.functions["tally"], task.functions["share"]
     view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)

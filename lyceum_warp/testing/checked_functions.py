@@ -157,7 +157,7 @@ class _Rewriter(ast.NodeTransformer):
     def _refused(self, node: ast.Name | ast.Attribute) -> ast.AST:
         """Refuse a function that the source uses as a value.
 
-        The checked copy of a function takes the report as an additional argument. Other code would not pass it.
+        The copy with index checks takes the report as an additional argument. Other code would not pass it.
         """
         function = self.source.value(node)
         if isinstance(function, wp.Function) and function.func is not None:

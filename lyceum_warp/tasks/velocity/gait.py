@@ -97,7 +97,10 @@ def gait_clock(clock: Row[wp.vec2], contact_time: Row[float], stance_share: floa
 
 @wp.func
 def foot_lift_l2(active: float, s: World, p: Params) -> float:
-    """Return the sum of ((height - target) / ``foot_lift``)^2 over the feet; a swing's target is half a sine wave."""
+    """Return the sum of ((height - target) / ``foot_lift``)^2 over the feet.
+
+    While a foot swings, its target height rises and falls like half a sine wave.
+    """
     total = float(0.0)
     for foot in range(p.feet.shape[0]):
         x, _ = walking.foot_motion(s, p, foot)
