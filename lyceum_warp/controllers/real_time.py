@@ -316,7 +316,6 @@ class PlannerThread:
         return published
 
     def _plan(self, step: int, state: torch.Tensor, obs: torch.Tensor, action: torch.Tensor | None) -> None:
-        """Plan from a state, or from the predicted next state."""
         controller, last = self._controller, self._plans[-1].step if self._plans else 0
         if not self._plans:
             controller(state, obs, controller.passed(max(self._first - 1, 0), self._first), step)
