@@ -66,7 +66,8 @@ class OpenLoop:
     final_obs_groups: dict[str, torch.Tensor]
     """Observations of each group after the last step. The group ``policy`` is ``final_obs``."""
     fault: torch.Tensor
-    """Faults of each world, (nworld,) int32. Each fault is a bit of ``Done``. Ignore the rewards of a world with a fault."""
+    """Faults of each world, (nworld,) int32. Each fault is a bit of ``Done``. Ignore the rewards of worlds with faults.
+    """
     phases: tuple[Phase, ...]
     """The phases of ``run``, for callers that add their own phases to its graph."""
 
