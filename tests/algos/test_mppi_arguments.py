@@ -200,25 +200,19 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
         planner("reach", update="mppi")
 
 
-@pytest.mark.parametrize(
-    ("task", "words", "expected"),
-    [
-        ("reach", dict(samples=79), ("mujoco", "cpu")),
-        ("reach", dict(samples=20, models=4), ("warp", "cuda:0")),
-        ("reach", dict(samples=79, nconmax=16), ("mujoco", "cpu")),
-        # the noslip solver is slow on a GPU
-        ("adroit_pen", dict(samples=160), ("mujoco", "cpu")),
-        ("adroit_pen", dict(samples=160, solver={"noslip_iterations": 0}), ("warp", "cuda:0")),
-    ],
-)  # fmt: skip
-def test_engine_auto_on_a_gpu_depends_on_the_number_of_samples(
-    task: str, words: dict[str, Any], expected: tuple[str, str | None], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_engine_auto_on_a_gpu_counts_the_worlds_of_all_models_and_plants(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = types.SimpleNamespace(is_cuda=True), types.SimpleNamespace(is_cuda=False)
     monkeypatch.setattr(placement, "find_device", lambda name: cuda[not str(name).startswith("cuda")])
-    options = arguments(task, **{"device": "cuda:0", "nthread": 2} | words)[1]
-    assert (options.engine, options.device) == expected
-    assert options.physics.nconmax is None, "only the Warp engine takes sizes"
+
+    def chosen(task: str, plants: int = 1, **words: Any) -> str:
+        words |= {"device": "cuda:0", "nthread": 2}
+        return planner_arguments(find_task(task), None, words, None, None, plants)[1].engine
+
+    assert [chosen("reach", samples=79), chosen("reach", samples=20, models=4)] == ["mujoco", "warp"]
+    assert chosen("reach", plants=4, samples=20) == "warp"
+    # the noslip solver is slow on a GPU
+    assert chosen("adroit_pen", samples=160) == "mujoco"
+    assert chosen("adroit_pen", samples=160, solver={"noslip_iterations": 0}) == "warp"
 
 
 def test_settings_are_json_values() -> None:

@@ -15,6 +15,13 @@ def first_squared(obs: Row[float]) -> float:
     return 3.0 * obs[0] * obs[0]
 
 
+def fitted_value() -> lw.ValueFunction:
+    value = lw.ValueFunction(6, time_orders=2)
+    for weights in value.parameters():
+        torch.nn.init.normal_(weights, generator=torch.Generator().manual_seed(len(weights)))
+    return value
+
+
 CASES: dict[str, dict[str, Any]] = {
     "mppi": dict(task="point_mass"),
     "without the plan": dict(task="point_mass", include_plan=False, smoothing=(0.5, 0.3, 0.2), iterations=2),
@@ -27,6 +34,7 @@ CASES: dict[str, dict[str, Any]] = {
     "predictive sampling": dict(task="point_mass", update="predictive_sampling", iterations=2),
     "models": dict(task=Varied, models=2, risk="worst", knots=2),
     "models with a value": dict(task=Varied, models=3, value=first_squared),
+    "fitted value": dict(task="point_mass", value=fitted_value()),
     "control of the task": dict(task=Pushed, noise=0.5),
     "stop": dict(task="hopper", termination="stop"),
     "frame skip": dict(task="reach", frame_skip=2),
@@ -37,7 +45,11 @@ FIRST = ("returns", "weights", "model_returns")
 
 
 def states_of(task: Any, count: int) -> torch.Tensor:
-    return lw.make(task, nworld=count, autoreset=False, seed=3).get_state()
+    """Make states at different steps, on which a fitted value function depends."""
+    env = lw.make(task, nworld=count, autoreset=False, seed=3)
+    states = env.get_state()
+    states[:, env.state_space.parts["step"].start] = 30.0 * torch.arange(count)
+    return states
 
 
 @pytest.mark.quick(*(f"{case}-mujoco" for case in CASES))
@@ -62,24 +74,6 @@ def test_planner_for_several_plants_equals_separate_planners(case: str, engine: 
                 torch.testing.assert_close(getattr(together, name)[i], getattr(plan, name))
             for name, value in plan.summary.items():
                 assert together.summary[name][i].item() == pytest.approx(value, rel=1e-5)
-
-
-@pytest.mark.parametrize("kind", ["torch", "warp", "fitted"])
-def test_value_function_receives_the_samples_of_every_plant(kind: str) -> None:
-    generator = torch.Generator().manual_seed(0)
-    fitted = lw.ValueFunction(6, time_orders=2)
-    for weights in fitted.parameters():
-        torch.nn.init.normal_(weights, generator=generator)
-    value = {"torch": lambda obs: 3.0 * obs[:, 0] ** 2, "warp": first_squared, "fitted": fitted}[kind]
-    settings = dict(horizon=4, samples=5, value=value)
-    states = states_of("point_mass", 2)
-    states[1, lw.make("point_mass").state_space.parts["step"]] = 60
-    together = lw.MPPI("point_mass", plants=2, seed=7, **settings)
-    actions = together(states)
-    for i in range(2):
-        alone = lw.MPPI("point_mass", seed=7 + i, **settings)
-        torch.testing.assert_close(actions[i], alone(states[i]))
-        torch.testing.assert_close(together.returns[i], alone.returns)
 
 
 def test_reset_with_a_mask_restarts_only_the_selected_plants() -> None:
