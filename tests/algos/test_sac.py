@@ -12,7 +12,6 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.algos.networks import Normalizer
-from lyceum_warp.algos.sac import SACIteration
 
 SMALL = lw.SACConfig(
     hidden=(8,), value_hidden=(8, 8), num_steps=12, warmup=60, updates=2, batch=16, replay=78, mean_every=2,
@@ -27,10 +26,6 @@ def env(shared_env: SharedEnv) -> lw.Env:
 
 def made(env: lw.Env, *, seed: int = 0, **changes: Any) -> lw.SAC:
     return lw.SAC(env, config=dataclasses.replace(SMALL, **changes), seed=seed)
-
-
-def numbers(it: SACIteration) -> dict[str, Any]:
-    return {name: value for name, value in it.row().items() if "time" not in name and name != "samples_per_second"}
 
 
 def test_sac_learns_for_a_fixed_seed(shared_env: SharedEnv) -> None:
@@ -167,30 +162,6 @@ def test_action_density_integrates_to_one() -> None:
     torch.testing.assert_close(policy.unit(action), unit, atol=1e-5, rtol=0.0)
 
 
-@pytest.mark.parametrize("changes", [{}, {"n_step": 3, "actor_every": 2, "normalize": False, "layer_norm": False}])
-def test_run_is_reproducible_and_resumes_bit_for_bit(changes: dict[str, Any], env: lw.Env) -> None:
-    def fresh(seed: int) -> lw.SAC:
-        env.rand_reset(7)
-        return made(env, seed=seed, **changes)
-
-    sac = fresh(1)
-    first = [numbers(next(sac)) for _ in range(3)]
-    saved = sac.state_dict(), sac.replay.state_dict()
-    rest = [numbers(next(sac)) for _ in range(3)]
-    torch.manual_seed(2)  # the run does not depend on torch's global generators
-    again = fresh(1)
-    np.testing.assert_equal([numbers(next(again)) for _ in range(6)], first + rest)
-    resumed = fresh(2)
-    next(resumed)
-    resumed.load_state_dict(saved[0])
-    resumed.replay.load_state_dict(saved[1])
-    np.testing.assert_equal([numbers(next(resumed)) for _ in range(3)], rest)
-    for own, other in ((sac.policy, resumed.policy), (sac.value, resumed.value), (sac.target, resumed.target)):
-        for name, part in own.state_dict().items():
-            assert torch.equal(part, other.state_dict()[name]), name
-    assert math.isnan(first[0]["critic_loss"]) and math.isfinite(first[1]["critic_loss"])
-
-
 def test_resumed_run_uses_the_replay_buffer_in_its_folder(tmp_path: Path) -> None:
     runs = []
     for name, parts in (("whole", (6,)), ("parts", (1, 3, 6))):
@@ -264,25 +235,9 @@ def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
     assert sac.target.normalizer is sac.value.normalizer
 
 
-def test_a_non_finite_reward_is_a_fault_and_learning_continues(env: lw.Env) -> None:
-    sac = made(env)
-    next(sac)
-    step = env.step
-
-    def faulty() -> None:
-        env.action[1] = 1e30  # the square of this reward is infinite
-        step()
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(env, "step", faulty)
-        it = next(sac)
-    assert it.faults == 12 and math.isfinite(it.critic_loss)
-    assert sac.replay.truncated[4:16, 1].sum() >= 4 and sac.replay.reward.isfinite().all()
-
-
 def test_non_finite_update_ends_learning(env: lw.Env) -> None:
     sac = made(env, learning_rate=1e30)
-    next(sac)
+    assert math.isnan(next(sac).critic_loss)  # the first iteration is a warm-up, without updates
     with pytest.raises(FloatingPointError, match="the updates of iteration 2 are not finite: make learning_rate, or"):
         next(sac)
 
