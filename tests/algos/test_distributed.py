@@ -1,4 +1,3 @@
-import csv
 import os
 import signal
 import socket
@@ -9,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from training_runs import QUIET, metrics
 
 from lyceum_warp import cli
 from lyceum_warp.algos import distributed
@@ -18,7 +18,6 @@ from lyceum_warp.runs.folder import Run
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",
            "--mean-episodes", "2", "--rollout", "segments", "--normalize", "--time-orders", "2",
            "--fisher-fraction", "0.34", "--min-restarts", "10"]  # fmt: skip
-QUIET = ["--no-video", "--no-plot"]
 
 
 def torchrun(
@@ -47,19 +46,13 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def table(run: Path) -> list[dict[str, float]]:
-    with (run / "metrics.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    clocks = {name for name in rows[0] if "time" in name or name == "samples_per_second"}
-    return [{name: float(cell or "nan") for name, cell in row.items() if name not in clocks} for row in rows]
-
-
 def assert_equal_runs(one: Path, other: Path, *, tolerance: float) -> None:
     """Compare the last metrics and the checkpoints of two runs, up to rounding."""
-    row, expected = table(one)[-1], table(other)[-1]
+    row, expected = metrics(one)[-1], metrics(other)[-1]
     for name in expected:
         bound = tolerance * (10.0 if name.startswith("mean_") else 1.0)  # episodes amplify rounding
-        np.testing.assert_allclose(row[name], expected[name], rtol=bound, atol=bound, err_msg=name)
+        pair = [float(numbers[name] or "nan") for numbers in (row, expected)]
+        np.testing.assert_allclose(*pair, rtol=bound, atol=bound, err_msg=name)
     state, wanted = (Run.open(folder).read()["state"] for folder in (one, other))
     assert torch.equal(state["generator"], wanted["generator"])
     close = dict(rtol=tolerance, atol=tolerance)
@@ -138,7 +131,7 @@ def test_two_gpu_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> N
             process.send_signal(signal.SIGTERM)
             break
     rest, error = process.communicate(timeout=25)  # after 30 s, torchrun would kill the processes
-    rows = table(run)
+    rows = metrics(run)
     assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
     assert Run.open(run).read()["iteration"] == len(rows) >= 2
 
@@ -183,7 +176,7 @@ def test_all_processes_end_if_one_of_them_is_interrupted(tmp_path: Path) -> None
     (code, out, error), (early, nothing, early_error) = ended(processes)
     assert code != 0 and early != 0
     assert "interrupted by SIGTERM after 2 of 100000 iterations; continue with" in out, (out, error)
-    assert len(table(run)) == Run.open(run).read()["iteration"] == 2
+    assert len(metrics(run)) == Run.open(run).read()["iteration"] == 2
     assert nothing == "" and not (tmp_path / "beginning").exists()
     assert "lyceum_warp/" not in error + early_error, (error, early_error)  # no traceback
 

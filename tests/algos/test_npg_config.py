@@ -1,5 +1,6 @@
 import dataclasses
 import math
+from typing import Any
 
 import pytest
 
@@ -27,10 +28,11 @@ def test_error_of_an_invalid_value_names_the_setting(name: str, value: object, w
         lw.NPGConfig(**{name: value})  # type: ignore[arg-type]
 
 
-def test_every_config_field_is_checked() -> None:
-    for field in dataclasses.fields(lw.NPGConfig):
+@pytest.mark.parametrize("config", [lw.NPGConfig, lw.PPOConfig, lw.SACConfig])
+def test_every_config_field_is_checked(config: Any) -> None:
+    for field in dataclasses.fields(config):
         with pytest.raises(ValueError, match=f"^{field.name} must "):
-            lw.NPGConfig(**{field.name: object()})
+            config(**{field.name: object()})
 
 
 def test_lists_and_numbers_of_other_types_are_converted() -> None:

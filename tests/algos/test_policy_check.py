@@ -7,7 +7,6 @@ from conftest import SharedEnv
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos.networks import mlp
 from lyceum_warp.algos.policy_check import check_policy
 from lyceum_warp.runs.checkpoints import policy_content
 from lyceum_warp.runs.folder import Run
@@ -118,20 +117,6 @@ def test_policy_check_accepts_usual_layers_and_changes_nothing(shared_env: Share
     check_policy(policy, env)
     assert torch.equal(env.get_state(), before) and torch.equal(torch.get_rng_state(), random)
     assert all(parameter.grad is None for parameter in policy.parameters())
-
-
-def test_npg_gives_equal_results_with_equal_user_and_default_networks() -> None:
-    config = lw.NPGConfig(samples=200, hidden=(8,))
-    own = mlp([6, 8, 2], last_scale=1e-2, generator=torch.Generator().manual_seed(3))
-    policies = (
-        lw.GaussianPolicy(6, 2, network=own, normalize=True),
-        lw.GaussianPolicy(6, 2, (8,), normalize=True, generator=torch.Generator().manual_seed(3)),
-    )
-    iterations = []
-    for policy in policies:
-        npg = lw.NPG(lw.make("point_mass", nworld=4, horizon=25, seed=1), policy, config=config)
-        iterations.append([next(npg).kl for _ in range(2)])
-    assert iterations[0] == iterations[1]
 
 
 def test_policy_with_a_user_network_is_saved_and_loaded(tmp_path: Path) -> None:

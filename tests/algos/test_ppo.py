@@ -128,8 +128,6 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
 
 
 @pytest.mark.parametrize("words, message", [
-    ({"num_steps": 0}, "num_steps must be a whole number from 1 "),
-    ({"schedule": "linear"}, "schedule must be 'adaptive' or 'fixed', not 'linear'"),
     ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
     ({"entropy_decay": 7}, r"entropy_decay must be a first and a last iteration, such as \(150, 200\), not 7"),
     ({"entropy_decay": (5, 5)}, r"entropy_decay must have a last iteration after the first iteration, not \(5, 5\)"),

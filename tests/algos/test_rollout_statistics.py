@@ -88,19 +88,6 @@ def test_value_statistics_of_two_processes_equal_those_of_all_samples() -> None:
     )
 
 
-def test_metrics_row_has_a_column_for_each_metric() -> None:
-    env = lw.make(Metered, nworld=4)
-    config = lw.NPGConfig(samples=400, hidden=(8,), value_hidden=(8,), mean_every=0)
-    it = next(lw.NPG(env, config=config))
-    assert list(it.metrics) == ["forward", "effort"]
-    assert it.return_mean == pytest.approx(it.metrics["forward"] - 0.1 * it.metrics["effort"], abs=1e-5)
-    row = it.row()
-    assert it.reward_mean == pytest.approx(it.step_metrics["forward"] - 0.1 * it.step_metrics["effort"], abs=1e-6)
-    wanted = ["metrics/forward", "metrics/effort", "step_metrics/forward", "step_metrics/effort"]
-    assert "metrics" not in row and list(row)[-4:] == wanted
-    assert row["metrics/effort"] == it.metrics["effort"] and row["return_mean"] == it.return_mean
-
-
 def test_task_without_success_reports_no_success_rate() -> None:
     env = lw.make("hopper", nworld=2, horizon=10)
     config = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
