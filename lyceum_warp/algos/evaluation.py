@@ -145,14 +145,14 @@ class MeanPolicyEvaluation:
     All evaluations start from the same initial states, so that they differ only in the policy.
     """
 
-    def __init__(self, env: Env, episodes: int, team: Team) -> None:
-        self.env, self.episodes, self.team = env, episodes, team
+    def __init__(self, env: Env, config: Any, team: Team) -> None:
+        self.env, self.every, self.episodes, self.team = env, config.mean_every, config.mean_episodes, team
         self._few: Env | None = None
 
-    def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, *, due: bool) -> dict[str, Any]:
+    def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, iteration: int) -> dict[str, Any]:
         """Evaluate the policy if due, and add the results to the statistics; otherwise, the results are None."""
         found: dict[str, Any] = dict.fromkeys(_MEAN_STATISTICS)
-        if due:
+        if self.every > 0 and iteration % self.every == 0:
             means = torch.zeros(len(found), dtype=torch.float64, device=self.env.obs.device)
             if self.team.leads:
                 if self._few is None:

@@ -208,7 +208,7 @@ class NPG(OnPolicyLearner):
         # 7. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
-        statistics = self._with_mean_policy(statistics)
+        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
         timer.mark()
 
         time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()

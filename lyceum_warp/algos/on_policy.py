@@ -92,7 +92,7 @@ class OnPolicyLearner(Learner):
         self.count = steps * self.env.nworld * self.team.size
         self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
         self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
-        self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config.mean_episodes, self.team)
+        self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config, self.team)
 
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
@@ -102,10 +102,6 @@ class OnPolicyLearner(Learner):
         args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
         wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
         return self._advantage, self._return
-
-    def _with_mean_policy(self, statistics: dict[str, Any]) -> dict[str, Any]:
-        every = self.config.mean_every
-        return self._evaluate_mean.added(statistics, self.policy, due=every > 0 and self.iteration % every == 0)
 
     def settings(self) -> dict[str, Any]:
         """Return the hyperparameters and the networks' sizes for a run's config.json."""

@@ -21,7 +21,7 @@ from lyceum_warp.algos.on_policy import OnPolicyLearner
 from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.ppo_config import PPOConfig
 from lyceum_warp.algos.rollout_statistics import OnPolicyIteration, gathered
-from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
+from lyceum_warp.algos.symmetry import apply_symmetry
 from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
@@ -112,7 +112,9 @@ class PPO(OnPolicyLearner):
         # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
-        self._make_mirror()
+        if self.policy.mirror is not None:
+            config = self.config = dataclasses.replace(config, symmetry="exact")
+        self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
         self._make_rollout(steps)
         self.noise = torch.empty(steps, env.nworld * team.size, env.action_space.size, device=device)
         self._mean = torch.empty_like(self.rollout.action)
@@ -142,21 +144,6 @@ class PPO(OnPolicyLearner):
         self.rollout.restart()
         if config.stagger:
             self.rollout.stagger(self.generator, team)
-
-    def _make_mirror(self) -> None:
-        config, env = self.config, self.env
-        if self.policy.mirror is not None:
-            config = self.config = dataclasses.replace(config, symmetry="exact")
-        self._mirror: PolicyMirror | None = None
-        if config.symmetry == "none":
-            return
-        found = reflections(env)
-        self._mirror = PolicyMirror(found).to(env.obs.device)
-        if config.symmetry == "exact":
-            self.policy.use_mirror(found)
-        elif config.symmetry == "augment":
-            value = reflections(env, group=self.value.group)["obs"]
-            self._mirror_value = Reflected(value).to(env.obs.device)
 
     def __next__(self) -> PPOIteration:
         config, rollout, team = self.config, self.rollout, self.team
@@ -192,7 +179,7 @@ class PPO(OnPolicyLearner):
         # 4. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
-        statistics = self._with_mean_policy(statistics)
+        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
         timer.mark()
 
         time_sample, time_update, time_mean = timer.seconds()
@@ -307,7 +294,7 @@ class PPO(OnPolicyLearner):
 
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples; an image has the same density as its original."""
-        assert self._mirror is not None
+        assert self._mirror is not None and self._mirror_value is not None
         images = dict(samples)
         for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
                             ("action", self._mirror.action), ("mean", self._mirror.action)):  # fmt: skip

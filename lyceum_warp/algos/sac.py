@@ -28,7 +28,7 @@ from lyceum_warp.algos.rollout_buffer import Rollout
 from lyceum_warp.algos.rollout_statistics import SampledIteration, gathered
 from lyceum_warp.algos.sac_config import SACConfig
 from lyceum_warp.algos.squashed_policy import SquashedPolicy
-from lyceum_warp.algos.symmetry import PolicyMirror, Reflected, reflections
+from lyceum_warp.algos.symmetry import apply_symmetry
 from lyceum_warp.algos.timing import PhaseTimer
 from lyceum_warp.algos.twin_critic import TwinCritic, quantile_loss
 from lyceum_warp.algos.value import value_group
@@ -140,7 +140,7 @@ class SAC(Learner):
         )  # fmt: skip
         _check_sizes(self.policy, self.value, env, low, high)
         trainable(self.policy.to(device)), trainable(self.value.to(device))
-        self._make_mirror(given)
+        self._mirror, self._mirror_value = apply_symmetry(given.symmetry, env, self.policy, self.value.group)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.target.normalizer = self.value.normalizer
         self._follow = get_ema_multi_avg_fn(1.0 - given.tau)
@@ -176,20 +176,9 @@ class SAC(Learner):
         if given.compiled:
             self._losses = [torch.compile(loss) for loss in self._losses]
         self._learn = Captured(self.learn, team, device)
-        self._evaluate_mean = MeanPolicyEvaluation(env, given.mean_episodes, team)
+        self._evaluate_mean = MeanPolicyEvaluation(env, given, team)
         self.rollout.restart()
         self.rollout.stagger(self.generator, team)
-
-    def _make_mirror(self, config: SACConfig) -> None:
-        self._mirror: PolicyMirror | None = None
-        if config.symmetry == "none" or self.policy.mirror is not None:
-            return
-        found, device = reflections(self.env), self.env.obs.device
-        if config.symmetry == "exact":
-            self.policy.use_mirror(found)
-        else:
-            value = reflections(self.env, group=self.value.group)["obs"]
-            self._mirror, self._mirror_value = PolicyMirror(found).to(device), Reflected(value).to(device)
 
     @property
     def title(self) -> str:
@@ -234,9 +223,8 @@ class SAC(Learner):
         # 3. Evaluate the mean policy.
         self.iteration += 1
         self.samples += self.count
-        timer, every = PhaseTimer(self.env.obs.device), config.mean_every
-        due = every > 0 and self.iteration % every == 0
-        statistics = self._evaluate_mean.added(statistics, self.policy, due=due)
+        timer = PhaseTimer(self.env.obs.device)
+        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
         timer.mark()
 
         time_sample, time_update = sum(times[::2]), sum(times[1::2])
@@ -309,7 +297,7 @@ class SAC(Learner):
             self._follow(list(self.target.parameters()), list(self.value.parameters()), None)
 
     def _with_images(self, batch: Transitions) -> Transitions:
-        assert self._mirror is not None
+        assert self._mirror is not None and self._mirror_value is not None
         images = {"policy": self._mirror.obs, self.value.group: self._mirror_value}
 
         def both(rows: torch.Tensor, image: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:

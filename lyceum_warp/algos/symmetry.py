@@ -67,3 +67,22 @@ def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
         "obs": declared.columns(env.obs_spaces[group].parts, task=env.task.name),
         "action": declared.columns(env.action_space.parts, task=env.task.name, whole="action"),
     }
+
+
+def apply_symmetry(
+    symmetry: str, env: Env, policy: Any, value_group: str
+) -> tuple[PolicyMirror | None, Reflected | None]:
+    """Make a policy symmetric if ``symmetry`` is "exact"; otherwise, make the mirrors that a learner needs.
+
+    Returns:
+        The mirror of the policy for "loss" and "augment", and the mirror of the value function's observations for
+        "augment"; otherwise None.
+    """
+    if symmetry == "none" or policy.mirror is not None:
+        return None, None
+    found, device = reflections(env), env.obs.device
+    if symmetry == "exact":
+        policy.use_mirror(found)
+        return None, None
+    images = Reflected(reflections(env, group=value_group)["obs"]).to(device) if symmetry == "augment" else None
+    return PolicyMirror(found).to(device), images
