@@ -113,8 +113,9 @@ class DensePasses:
                 self._times_slope(derivative, self.results[i])
         return self.derivatives[-1]
 
-    def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor]) -> Sequence[torch.Tensor]:
-        """Compute J^T u at the last inputs, and write it into ``out``; u has the shape (rows, outputs)."""
+    def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor] | None = None) -> list[torch.Tensor]:
+        """Compute J^T u at the last inputs, in ``out`` or in new tensors; u has the shape (rows, outputs)."""
+        out = [torch.empty_like(parameter) for parameter in self.parameters] if out is None else list(out)
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
             # compute the product or its transpose, whichever has longer rows, because this is faster
@@ -135,7 +136,6 @@ class DensePolicy:
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
         self.policy, self.passes = policy, passes
         self._x = torch.empty(0, policy.nobs)
-        self._pulled = [torch.empty_like(parameter) for parameter in passes.parameters]
 
     @staticmethod
     def of(policy: GaussianPolicy) -> "DensePolicy | None":
@@ -172,15 +172,6 @@ class DensePolicy:
         np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
         np.add(action, self(obs).numpy(), out=action)
         return out
-
-    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
-        """Compute J v; see ``DensePasses.push``."""
-        return self.passes.push(parts)
-
-    def pull(self, u: torch.Tensor) -> list[torch.Tensor]:
-        """Compute J^T u; see ``DensePasses.pull``."""
-        self.passes.pull(u, self._pulled)
-        return list(self._pulled)
 
 
 class DenseValue:

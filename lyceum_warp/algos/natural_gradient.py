@@ -23,7 +23,7 @@ def score_gradient(
         return flatten(torch.autograd.grad((policy.log_prob(obs, action) * weight).sum(), parameters))
     precision = torch.exp(-policy.log_std.detach())
     z, weight = (action - dense(obs)) * precision, weight.unsqueeze(-1)
-    gradients = dense.pull(z * precision * weight)
+    gradients = dense.passes.pull(z * precision * weight)
     if (at := _place(policy.log_std, parameters)) is not None:
         gradients.insert(at, ((z.square() - 1.0) * weight).sum(0))
     return flatten(gradients)
@@ -59,7 +59,7 @@ class FisherProduct:
         self.damping, self.team = damping, team or Team()
         self.mean = (dense or policy)(obs)
         network = [p for p in self.parameters if p is not policy.log_std]
-        self.jacobian = dense or AutogradJacobian(self.mean, network)
+        self.jacobian = AutogradJacobian(self.mean, network) if dense is None else dense.passes
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         """Compute (F + damping I) v, (parameters,)."""
