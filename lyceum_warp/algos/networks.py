@@ -4,7 +4,7 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import torch
 import warp as wp
@@ -51,7 +51,7 @@ def mlp(
     Raises:
         ValueError: The activation is unknown.
     """
-    check_word("activation", activation, get_args(Activation))
+    check_word("activation", activation, list(ACTIVATIONS))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
     kind = ACTIVATIONS[activation]
     layers: list[nn.Module] = []

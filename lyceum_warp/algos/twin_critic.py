@@ -14,7 +14,7 @@ from torch import nn
 
 from lyceum_warp.algos.networks import ACTIVATIONS, LIMIT, Activation, Normalized, check_memory
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import layer_sizes, whole_number
+from lyceum_warp.support.validate import check_word, layer_sizes, whole_number
 
 
 @document_attributes
@@ -56,6 +56,7 @@ class TwinCritic(Normalized):
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
         sizes = [nobs + nact, *layer_sizes(hidden), whole_number("quantiles", quantiles, low=1)]
+        check_word("activation", activation, list(ACTIVATIONS))
         check_memory([2 * size for size in sizes], nobs=nobs, hidden=hidden, nact=nact)
         super().__init__(nobs, normalize, limit)
         self.group = group

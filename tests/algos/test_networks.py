@@ -19,8 +19,9 @@ def test_only_hidden_layers_are_followed_by_an_activation(name: Activation) -> N
 
 
 def test_unknown_activation_raises_an_error_that_names_it() -> None:
-    with pytest.raises(ValueError, match="^activation must be 'tanh', .* not 'sin'$"):
-        lw.GaussianPolicy(2, 1, activation="sin")  # type: ignore[arg-type]
+    for network in (lw.GaussianPolicy, lw.TwinCritic):
+        with pytest.raises(ValueError, match="^activation must be 'tanh', .* not 'sin'$"):
+            network(2, 1, activation="sin")
 
 
 def test_policy_and_value_function_can_have_different_activations(shared_env: SharedEnv) -> None:
