@@ -209,9 +209,8 @@ def parameters(npg: lw.NPG) -> torch.Tensor:
     return torch.cat([p.detach().flatten() for p in (*npg.policy.parameters(), *npg.value.parameters())])
 
 
-@pytest.mark.parametrize("size", [1e20, 3e38])
-def test_rewards_are_bounded_if_their_sums_exceed_float32(size: float, env: lw.Env) -> None:
-    npg = unnormalized(env, lambda rollout, _: rollout.reward.copy_(size * rollout.obs[..., 0].sign()))
+def test_rewards_are_bounded_if_their_sums_exceed_float32(env: lw.Env) -> None:
+    npg = unnormalized(env, lambda rollout, _: rollout.reward.copy_(3e38 * rollout.obs[..., 0].sign()))
     for it in (next(npg) for _ in range(5)):
         assert not it.skipped_updates and math.isfinite(it.value_error) and it.kl > 1e-6
 
