@@ -1,10 +1,6 @@
-"""Test both cartpole tasks.
-
-oracles/test_dm_control.py compares the models and cartpole's rewards with those of dm_control.
-"""
-
 import mujoco
 import numpy as np
+import pytest
 import torch
 from checks import check_formula, check_normal, check_uniform, positions, put_at_random
 from conftest import SharedEnv
@@ -52,6 +48,26 @@ def test_task_functions_equal_the_formulas_of_lyceum(shared_env: SharedEnv) -> N
         check_formula(env.eval, zz)
         check_formula(env.obs, np.stack([qpos[:, 0], zz, xz, qvel[:, 0], qvel[:, 1]], axis=1))
         assert not env.terminated.any()
+
+
+@pytest.mark.parametrize(("task", "sparse"), [("dm/cartpole_balance", False), ("dm/cartpole_balance_sparse", True)])
+def test_cartpole_moves_and_is_rewarded_as_in_the_suite_of_dm_control(
+    shared_env: SharedEnv, task: str, sparse: bool
+) -> None:
+    ours = shared_env("cartpole", nworld=NWORLD, autoreset=False, sparse=sparse)
+    theirs = shared_env(task, nworld=NWORLD, autoreset=False)
+    rng, rewards = np.random.default_rng(0), []
+    for position, velocity in ((0.3, 1.0), (3.0, 8.0)):
+        theirs.set_state(put_at_random(ours, rng, position=position, velocity=velocity))
+        action = torch.from_numpy(rng.uniform(-1.5, 1.5, (NWORLD, 1)).astype(np.float32))
+        for env in (ours, theirs):
+            env.step(action)
+        torch.testing.assert_close(ours.obs, theirs.obs, rtol=1e-6, atol=2e-6)
+        torch.testing.assert_close(ours.reward, theirs.reward, rtol=0.0, atol=2e-6)
+        assert not ours.terminated.any()
+        assert not sparse or torch.equal(ours.success, theirs.reward == 1.0)
+        rewards.append(theirs.reward.clone())
+    assert np.ptp(torch.cat(rewards).numpy()) > 0.7
 
 
 def test_random_resets_add_normal_noise_to_the_hanging_pole() -> None:
