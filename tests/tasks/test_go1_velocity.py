@@ -3,7 +3,8 @@
 oracles/test_mjlab.py compares its observations, rewards and terminations with those of mjlab.
 """
 
-import itertools
+from collections.abc import Iterator
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -11,33 +12,45 @@ import pytest
 import torch
 from checks import check_uniform
 from conftest import SharedEnv
-from go1_states import DT, GO1, HOME, LEGS, NEVER, NOISELESS, STILL, SUBSTEP, State, random_steps
 
 import lyceum_warp as lw
 
-NWORLD = 64
+NWORLD, DT, SUBSTEP = 64, 0.02, 0.005
+FEET = [f"{leg}_foot" for leg in ("FR", "FL", "RR", "RL")]
+HOME = np.array([0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2)
+NEVER = (1e6, 1e6)
+NOISELESS: dict[str, Any] = {
+    f"{part}_noise": 0.0
+    for part in ("linear_velocity", "angular_velocity", "gravity", "joint_position", "joint_velocity")
+}
 
 
-def roll_out(env: lw.Env, steps: int, size: float = 1.0) -> torch.Tensor:
-    actions = random_steps(env, steps, size)
-    for action in actions:
+def state_parts(env: lw.Env) -> dict[str, torch.Tensor]:
+    return dict(env.state_space.split(env.get_state()))
+
+
+def random_steps(env: lw.Env, steps: int) -> Iterator[None]:
+    """Step with random actions that are correlated over time."""
+    generator, action = torch.Generator().manual_seed(1), torch.zeros(env.nworld, 12)
+    for _ in range(steps):
+        action = 0.8 * action + 0.6 * torch.randn(env.nworld, 12, generator=generator)
         env.step(action)
-    return actions[-1]
+        yield
 
 
 def test_forces_are_zero_until_the_first_substep(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=NWORLD)
-    roll_out(env, 20)
+    list(random_steps(env, 20))
     env.rand_reset()
     assert not env.field("sensordata").any() and not env.obs_groups["critic"][:, -12:].any()
     for _ in range(10):
-        roll_out(env, 1, 0.0)
+        env.step(torch.zeros(NWORLD, 12))
     assert (env.field("sensordata")[:, 2::3].abs() > 1.0).any(dim=1).float().mean() > 0.9  # the robots stand
 
 
 def test_policy_observations_have_uniform_noise_and_critic_observations_have_none(shared_env: SharedEnv) -> None:
     env = shared_env("go1_velocity", nworld=1000)
-    roll_out(env, 2)
+    list(random_steps(env, 2))
     clean = shared_env("go1_velocity", nworld=1000, **NOISELESS)
     clean.set_state(env.get_state())
     noise = (env.obs - clean.obs).numpy()
@@ -47,94 +60,61 @@ def test_policy_observations_have_uniform_noise_and_critic_observations_have_non
     check_uniform(noise[:, :33] / (sizes * (1 + 1e-3)))
 
 
-def test_foot_timers_count_substeps_in_contact_and_in_the_air(shared_env: SharedEnv) -> None:
-    """Compare timers with MuJoCo's contacts after every substep."""
-    env = shared_env("go1_velocity", nworld=4, autoreset=False, **STILL)
-    model = mujoco.MjModel.from_xml_path(GO1)
-    feet = [model.geom(f"{leg}_foot").id for leg in LEGS]
-    states = [State(env)]
-    actions = random_steps(env, 40)
-    for action in actions:
-        env.step(action)
-        states.append(State(env))
-    landings = 0
-    for i in range(env.nworld):
-        for s0, s1 in itertools.pairwise(states):
-            model.geom_friction[:] = s0.parts["geom_friction"][i].reshape(-1, 3)
-            model.body_ipos[:] = s0.parts["body_ipos"][i].reshape(-1, 3)
-            data = mujoco.MjData(model)
-            mujoco.mj_setConst(model, data)
-            data.qpos, data.qvel, data.ctrl = s0.qpos[i], s0.qvel[i], s1.parts["ctrl"][i]
-            data.qacc_warmstart = s0.parts["qacc_warmstart"][i]
-            contact, air = s0.contact_time[i].copy(), s0.air_time[i].copy()
-            for _ in range(4):
-                mujoco.mj_step(model, data)
-                mujoco.mj_forward(model, data)
-                touching = np.isin(feet, data.contact.geom[(data.contact.geom == 0).any(axis=1)])
-                landings += int((touching & (contact == 0)).sum())
-                contact, air = np.where(touching, contact + SUBSTEP, 0), np.where(touching, 0, air + SUBSTEP)
-            np.testing.assert_allclose(s1.contact_time[i], contact, atol=1e-6)
-            np.testing.assert_allclose(s1.air_time[i], air, atol=1e-6)
-    assert landings > 20
-
-
-def test_peak_height_of_a_foot_becomes_zero_only_at_a_landing(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", nworld=16, autoreset=False, **STILL)
-    landings, before = 0, State(env)
-    for action in random_steps(env, 30):
-        env.step(action)
-        s = State(env)
-        landed = (s.contact_time > 0) & (s.contact_time < DT + 1e-6)
-        grown = np.where(s.touching, before.peak, np.maximum(before.peak, s.height))
-        np.testing.assert_allclose(s.peak, np.where(landed, 0.0, grown), atol=1e-6)
-        landings, before = landings + landed.sum(), s
+def test_timers_and_peak_heights_follow_the_contacts_of_the_feet(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=16, autoreset=False, **NOISELESS, push_seconds=NEVER)
+    landings, before = 0, state_parts(env)
+    for _ in random_steps(env, 40):
+        now, critic = state_parts(env), env.obs_spaces["critic"].split(env.obs_groups["critic"])
+        touching = critic["foot_contact"] > 0
+        for name, running in (("contact_time", touching), ("air_time", ~touching)):
+            assert torch.equal(now[name] > 0, running)
+            goes_on = (now[name] - before[name] - DT).abs() < 1e-6
+            assert (goes_on | (now[name] < DT + 1e-6))[running].all()
+            substeps = now[name] / SUBSTEP
+            torch.testing.assert_close(substeps, substeps.round(), atol=1e-3, rtol=0)
+        landed = touching & (now["contact_time"] < DT + 1e-6)
+        peak = torch.where(touching, before["peak_height"], before["peak_height"].maximum(critic["foot_height"]))
+        torch.testing.assert_close(now["peak_height"], torch.where(landed, 0.0, peak), atol=1e-6, rtol=0)
+        landings, before = landings + int(landed.sum()), now
     assert landings > 50
     env.rand_reset()
-    s = State(env)
-    assert np.array_equal(s.peak, before.peak) and s.peak.max() > 0.02
-    assert not s.contact_time.any() and not s.air_time.any() and not s.last_action.any()
+    after = state_parts(env)
+    assert torch.equal(after["peak_height"], before["peak_height"]) and after["peak_height"].max() > 0.02
+    assert not any(after[name].any() for name in ("contact_time", "air_time", "last_action"))
 
 
 @pytest.mark.usefixtures("freed")
 def test_commands_have_the_distribution_of_mjlab() -> None:
     env = lw.make("go1_velocity", nworld=4000, seed=0)
-    s = State(env)
-    vx, vy, yaw = s.drawn.T
+    parts = {name: part.numpy().squeeze(-1) for name, part in state_parts(env).items() if part.shape[1] == 1}
+    vx, vy, yaw = state_parts(env)["drawn_velocity"].numpy().T
     forward = (vy == 0) & (yaw == 0)
-    for share, wanted in ((forward, 0.2), (s.heading_controlled, 0.3), (s.standing, 0.1)):
+    for share, wanted in ((forward, 0.2), (parts["heading_controlled"], 0.3), (parts["standing"], 0.1)):
         assert abs(share.mean() - wanted) < 4 * np.sqrt(wanted * (1 - wanted) / 4000)
-    timers = (s.command_timer - 5.5) / 2.5, s.push_timer - 2
-    drawn = np.stack([vx, vy, 2 * yaw, s.heading_target / np.pi, *timers], axis=1)
+    timers = (parts["command_timer"] - 5.5) / 2.5, parts["push_timer"] - 2
+    drawn = np.stack([vx, vy, 2 * yaw, parts["heading_target"] / np.pi, *timers], axis=1)
     check_uniform(drawn[~forward] / (1 + 1e-6))
     assert vx[forward].min() == np.float32(0.3) and vx[forward].max() <= 1
     assert abs((vx[forward] == np.float32(0.3)).mean() - 0.3) < 0.07
-    flags = np.stack([forward, s.heading_controlled, s.standing], axis=1)
+    flags = np.stack([forward, parts["heading_controlled"], parts["standing"]], axis=1)
     assert np.abs(np.corrcoef(flags.T) - np.eye(3)).max() < 5.5 / np.sqrt(4000)
-
-
-def command_of(env: lw.Env) -> torch.Tensor:
-    """Return each world's random velocity, heading and command timer.
-
-    The shape is (nworld, 5).
-    """
-    parts = env.state_space.split(env.get_state())
-    return torch.cat([parts[name] for name in ("drawn_velocity", "heading_target", "command_timer")], dim=1)
 
 
 def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None:
     nworld = 24
     env = shared_env("go1_velocity", nworld=nworld, autoreset=False, **NOISELESS, push_seconds=NEVER)
     action = torch.zeros(nworld, 12)
-    changes, before = 0, command_of(env)
+    changes, before = 0, state_parts(env)
     for _ in range(300):
         env.step(action)
-        command = command_of(env)
-        due = before[:, 4] - DT <= 1e-9
-        changed = (command[:, :4] != before[:, :4]).any(dim=1)
-        assert torch.equal(changed, due)
-        torch.testing.assert_close(command[~due, 4], before[~due, 4] - DT, atol=1e-6, rtol=0)
-        assert (command[due, 4] >= 3).all() and (command[due, 4] <= 8).all()
-        changes, before = changes + int(due.sum()), command
+        now = state_parts(env)
+        timer, last = now["command_timer"][:, 0], before["command_timer"][:, 0]
+        due = last - DT <= 1e-9
+        for name in ("drawn_velocity", "heading_target"):
+            assert torch.equal((now[name] != before[name]).any(dim=1), due)
+        torch.testing.assert_close(timer[~due], last[~due] - DT, atol=1e-6, rtol=0)
+        assert (timer[due] >= 3).all() and (timer[due] <= 8).all()
+        changes, before = changes + int(due.sum()), now
     assert 0.3 * nworld < changes < 0.9 * nworld  # the steps take 6 s, and commands change every 3 to 8 s
 
 
@@ -147,7 +127,7 @@ def test_curriculum_widens_the_command_ranges_at_each_stage() -> None:
         parts["command_timer"][:] = 0.0
         env.set_state(state)
         env.step(torch.zeros(1000, 12))
-        drawn = State(env).drawn
+        drawn = state_parts(env)["drawn_velocity"]
         free = drawn[:, 1] != 0
         for column, bounds in ((0, (low, high)), (2, (-yaw, yaw))):
             values, width = drawn[free, column], bounds[1] - bounds[0]
@@ -186,7 +166,7 @@ def test_pushes_add_velocities_along_world_axes(shared_env: SharedEnv) -> None:
 def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
     env = lw.make("go1_velocity", nworld=1000, seed=0)
     friction = env.field("geom_friction").numpy().copy()
-    feet = [env.model.geom(f"{leg}_foot").id for leg in LEGS]
+    feet = [env.model.geom(name).id for name in FEET]
     assert (friction[:, feet] == friction[:, feet[:1]]).all()
     others = np.delete(np.arange(env.model.ngeom), feet)
     assert (friction[:, others] == np.float32(env.model.geom_friction[others])).all()
@@ -204,21 +184,16 @@ def test_robots_differ_in_friction_centre_of_mass_and_encoders() -> None:
     assert np.array_equal(again, bias)
 
 
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: SharedEnv, engine: str) -> None:
-    n = 1000 if engine == "mujoco" else 4
-    env = shared_env("go1_velocity", engine=engine, nworld=n)
-    qpos, qvel = (env.state_space.split(env.get_state())[name].numpy() for name in ("qpos", "qvel"))
-    np.testing.assert_allclose(qpos[:, 7:], np.tile(HOME, (n, 1)), atol=1e-6)
+def test_resets_put_the_robot_above_the_floor_in_its_default_pose(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_velocity", nworld=1000)
+    qpos, qvel = (state_parts(env)[name].numpy() for name in ("qpos", "qvel"))
+    np.testing.assert_allclose(qpos[:, 7:], np.tile(HOME, (1000, 1)), atol=1e-6)
     assert not qvel.any() and not qpos[:, 4:6].any()
     yaw = 2 * np.arctan2(qpos[:, 6], qpos[:, 3])
     yaw = (yaw + np.pi) % (2 * np.pi) - np.pi
     start = np.stack([qpos[:, 0] / 0.5, qpos[:, 1] / 0.5, (qpos[:, 2] - 0.308) / 0.02, yaw / 3.14], axis=1)
-    if engine == "mujoco":
-        check_uniform(start / (1 + 1e-4))
-    assert np.abs(start).max() < 1 + 1e-4
+    check_uniform(start / (1 + 1e-4))
     env.reset()
     wanted = np.hstack([[0, 0, 0.278, 1, 0, 0, 0], HOME])
-    np.testing.assert_allclose(env.field("qpos").numpy(), np.tile(wanted, (n, 1)), atol=1e-6)
+    np.testing.assert_allclose(env.field("qpos").numpy(), np.tile(wanted, (1000, 1)), atol=1e-6)
     torch.testing.assert_close(env.eval, env.obs[:, 45:47].norm(dim=1))  # the robots do not move yet
