@@ -13,16 +13,6 @@ RANGES = np.array([[-2.2854, 1.714602], [-0.5236, 1.3963], [-1.5, 1.7], [-2.3213
                    [-1.5, 1.5], [-1.094, 0.0], [-1.5, 1.5]])  # fmt: skip
 
 
-def test_only_palm_and_table_collide(shared_env: SharedEnv) -> None:
-    model = shared_env("reach").model
-    solid = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
-    assert [model.body(model.geom_bodyid[i]).name for i in solid] == ["world", "hand"]
-    np.testing.assert_allclose([model.geom_pos[solid[0]], model.geom_pos[solid[1]]], [[0, 0.5, -0.425], [0.03, 0, 0]])
-    assert model.geom_type[solid[0]] == mujoco.mjtGeom.mjGEOM_PLANE and model.geom_size[solid[1], 0] == 0.08
-    assert (model.geom_condim == 1).all() and (model.geom_margin == 0.002).all()
-    assert model.site("target").size[0] == 0.05
-
-
 def test_arm_moves_like_the_original_arm_for_three_seconds(shared_env: SharedEnv) -> None:
     model = shared_env("reach").model
     np.testing.assert_allclose(model.jnt_range, RANGES)
