@@ -6,7 +6,6 @@ Add the special states of a new task to SPECIAL.
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -26,18 +25,13 @@ from lyceum_warp.binding.registry import find_task
 gymnasium.register_envs(gymnasium_robotics)
 
 IDS = {
-    name: task.gymnasium or ""
+    name: id
     for name in lw.task_names()
-    if (task := find_task(name)).__module__.startswith("lyceum_warp.tasks.")
+    if (id := find_task(name).gymnasium) and str(gymnasium.spec(id).entry_point).startswith("gymnasium_robotics.")
 }
-"""Map each task to the id of its Gymnasium environment."""
+"""Map each task to the id of its Gymnasium-Robotics environment."""
 
-ENTRIES = {
-    name: str(spec.entry_point)
-    for name, id in IDS.items()
-    if (spec := gymnasium.registry.get(id)) and str(spec.entry_point).startswith("gymnasium_robotics.")
-}
-TASKS = sorted(ENTRIES)
+pytestmark = pytest.mark.parametrize("task", IDS)
 
 
 def relative_error(ours: np.ndarray | float, theirs: np.ndarray | float) -> float:
@@ -51,7 +45,7 @@ def geoms(pair: mujoco.MjsPair) -> set[str]:
 @functools.cache
 def oracle_class(name: str) -> type[MujocoEnv]:
     """Return Gymnasium-Robotics' class, but with the task's model and without duplicate contact pairs."""
-    registered: Any = load_env_creator(ENTRIES[name])
+    registered: Any = load_env_creator(gymnasium.spec(IDS[name]).entry_point)
 
     class Oracle(registered):  # type: ignore[misc]
         def _initialize_simulation(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -200,28 +194,15 @@ SPECIAL = {
 """Map each task to states in which it succeeds or gives a reward bonus."""
 
 
-@pytest.fixture(params=TASKS)
-def task(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-MakePair = Callable[..., Pair]
-
-
-@pytest.fixture
-def make_pair(task: str, shared_env: SharedEnv) -> MakePair:
-    """Return ``make_pair(theirs, **params)``, which pairs a world with an original environment."""
-
-    def make(theirs: Any = None, **params: Any) -> Pair:
-        ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
-        return Pair(ours, theirs or oracle_class(task)())
-
-    return make
+def make_pair(shared_env: SharedEnv, task: str, theirs: Any = None, **params: Any) -> Pair:
+    """Pair a world with an original environment, or with the modified one."""
+    ours = shared_env(task, autoreset=False, horizon=0, nthread=1, **params)
+    return Pair(ours, theirs or oracle_class(task)())
 
 
 @pytest.mark.quick("adroit_pen")
-def test_results_under_random_actions_equal_gymnasium_robotics(make_pair: MakePair) -> None:
-    pair = make_pair()
+def test_results_under_random_actions_equal_gymnasium_robotics(shared_env: SharedEnv, task: str) -> None:
+    pair = make_pair(shared_env, task)
     for _ in range(5):
         pair.reset()
         for i in range(200):
@@ -235,8 +216,8 @@ def pairs(model: mujoco.MjModel) -> list[tuple[int, int]]:
     return list(zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True))
 
 
-def test_task_agrees_with_the_unchanged_original_until_contacts_differ(make_pair: MakePair, task: str) -> None:
-    pair = make_pair(registered(task))
+def test_task_agrees_with_the_unchanged_original_until_contacts_differ(shared_env: SharedEnv, task: str) -> None:
+    pair = make_pair(shared_env, task, registered(task))
     ours, theirs = pair.ours.model, pair.theirs.model
     ghosts = set(np.flatnonzero(ours.geom_contype != theirs.geom_contype))
     doubled, checked = {pair for pair in pairs(theirs) if pairs(theirs).count(pair) > pairs(ours).count(pair)}, 0
@@ -256,8 +237,8 @@ def test_task_agrees_with_the_unchanged_original_until_contacts_differ(make_pair
 
 @pytest.mark.quick("dense")
 @pytest.mark.parametrize("reward_type", ["dense", "sparse"])
-def test_bonuses_and_success_equal_gymnasium_robotics(make_pair: MakePair, task: str, reward_type: str) -> None:
-    pair = make_pair(oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
+def test_bonuses_and_success_equal_gymnasium_robotics(shared_env: SharedEnv, task: str, reward_type: str) -> None:
+    pair = make_pair(shared_env, task, oracle_class(task)(reward_type=reward_type), sparse=reward_type == "sparse")
     assert task in SPECIAL, "add states that reach the bonuses and success"
     rewards, successes = set(), 0
     for special in SPECIAL[task]:
@@ -320,8 +301,8 @@ def test_model_equals_gymnasium_robotics_except_for_edits(shared_env: SharedEnv,
         assert getattr(ours.opt, name) == getattr(theirs.opt, name), name
 
 
-def test_fixed_resets_give_the_initial_positions_of_the_model(make_pair: MakePair, task: str) -> None:
-    pair = make_pair(registered(task))
+def test_fixed_resets_give_the_initial_positions_of_the_model(shared_env: SharedEnv, task: str) -> None:
+    pair = make_pair(shared_env, task, registered(task))
     pair.ours.reset()
     pair.put()
     for field, own in pair.places.items():
