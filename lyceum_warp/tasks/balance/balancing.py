@@ -58,9 +58,7 @@ def velocity(s0: World, s1: World, p: Params) -> wp.vec2:  # velocity of the cen
     return wp.vec2(moved[0] - p.forward_speed, moved[1])
 
 
-@wp.func
-def height_l2(base_height: float, p: Params) -> float:
-    return (base_height - p.target_height) * (base_height - p.target_height)
+height_l2 = terms.base_height_l2
 
 
 @wp.func
