@@ -1,5 +1,4 @@
 import warnings
-from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
@@ -12,34 +11,18 @@ import lyceum_warp as lw
 from lyceum_warp.gym import GymnasiumEnv
 from lyceum_warp.viz.video import NoVideoError
 
-
-@pytest.fixture(scope="module")
-def hopper() -> Iterator[gymnasium.Env]:
-    env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0")
-    yield env
-    env.close()
-
-
-@pytest.fixture(scope="module")
-def draws() -> bool:
-    try:
-        env = GymnasiumEnv("hopper", render_mode="rgb_array", render_size=(64, 48))
-        assert env.render().shape == (48, 64, 3)
-        env.close()
-    except NoVideoError:
-        return False
-    return True
-
-
 THEIRS = ("is -infinity. This is probably too low", "is infinity. This is probably too high")
 """Gymnasium's own environments cause these warnings, too, because their observations are unbounded."""
 
 
-def test_gymnasium_env_checker_accepts_the_adapter(hopper: gymnasium.Env, draws: bool) -> None:
+def test_gymnasium_env_checker_accepts_the_adapter() -> None:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        check_env(hopper.unwrapped, skip_render_check=not draws)
         check_env(GymnasiumEnv(Full), skip_render_check=True)
+        try:
+            check_env(gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0").unwrapped)
+        except NoVideoError as error:
+            pytest.skip(str(error))
     said = [str(warning.message) for warning in caught]
     assert not [text for text in said if not any(known in text for known in THEIRS)]
 
@@ -65,7 +48,7 @@ def test_step_returns_the_values_of_the_wrapped_environment() -> None:
         pytest.fail("no episode ended within the horizon")
 
 
-def test_make_with_max_episode_steps_truncates_episodes(hopper: gymnasium.Env) -> None:
+def test_make_with_max_episode_steps_truncates_episodes() -> None:
     env = gymnasium.make("lyceum_warp.gym:lyceum/Hopper-v0", max_episode_steps=2)
     env.reset(seed=0)
     ends = [env.step(np.zeros(3, dtype=np.float32))[3] for _ in range(2)]
@@ -76,8 +59,9 @@ def test_make_with_max_episode_steps_truncates_episodes(hopper: gymnasium.Env) -
     assert ends == [False, True]
 
 
-def test_invalid_actions_and_reset_options_raise_an_error(hopper: gymnasium.Env) -> None:
+def test_invalid_actions_and_reset_options_raise_an_error() -> None:
+    hopper = GymnasiumEnv("hopper")
     with pytest.raises(ValueError, match=r"a float32 array of shape \(3,\), not a float64 array of shape \(2,\)"):
-        hopper.unwrapped.step(np.zeros(2))
+        hopper.step(np.zeros(2))
     with pytest.raises(ValueError, match="reset has no option 'reset_mask': call it without options"):
         hopper.reset(options={"reset_mask": [True]})

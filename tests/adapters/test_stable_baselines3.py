@@ -7,9 +7,7 @@ import torch
 from full_task import Full
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import lyceum_warp as lw
 from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
@@ -24,15 +22,11 @@ def full() -> StableBaselines3VecEnv:
     return StableBaselines3VecEnv(Full, N, seed=3)
 
 
-@pytest.fixture(scope="module")
-def hopper() -> StableBaselines3VecEnv:
-    return StableBaselines3VecEnv("hopper", N)
-
-
 def test_step_returns_the_values_of_the_wrapped_environment(full: StableBaselines3VecEnv) -> None:
     twin = lw.make(Full, nworld=N)
     full.seed(9)
-    np.testing.assert_array_equal(full.reset(), (twin.rand_reset(9), twin.obs.numpy())[1])
+    first = full.reset()
+    np.testing.assert_array_equal(first, (twin.rand_reset(9), twin.obs.numpy())[1])
     rng = np.random.default_rng(0)
     returns, lengths, ends, timeouts = np.zeros(N), np.zeros(N, dtype=int), 0, 0
     for _ in range(45):
@@ -56,21 +50,10 @@ def test_step_returns_the_values_of_the_wrapped_environment(full: StableBaseline
                 timeouts += info["TimeLimit.truncated"]
         returns[done], lengths[done], ends = 0, 0, ends + done.sum()
     assert ends and timeouts
+    assert (full.reset() != first).any()  # the seed applies only to the first reset
 
 
-def test_ppo_updates_its_policy_and_records_episode_statistics(hopper: StableBaselines3VecEnv) -> None:
-    model = PPO("MlpPolicy", hopper, n_steps=64, batch_size=64, n_epochs=2, seed=0, device="cpu")
-    before = [parameter.clone() for parameter in model.policy.parameters()]
-    model.learn(512)
-    assert any((a != b).any() for a, b in zip(before, model.policy.parameters(), strict=True))
-    assert model.ep_info_buffer and model.ep_info_buffer[0]["l"] > 1
-    returns, lengths = evaluate_policy(model, hopper, n_eval_episodes=6, return_episode_rewards=True)
-    assert len(returns) == len(lengths) == 6 and len(set(returns)) > 1 and min(lengths) > 1
-
-
-def test_off_policy_learner_stores_final_observations(
-    full: StableBaselines3VecEnv,
-) -> None:
+def test_off_policy_learner_stores_final_observations(full: StableBaselines3VecEnv) -> None:
     model = SAC("MlpPolicy", full, learning_starts=40, batch_size=16, buffer_size=2000, seed=0, device="cpu")
     model.learn(200)
     buffer = model.replay_buffer
@@ -85,27 +68,6 @@ def test_stable_baselines3_checker_accepts_a_single_world() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(GymnasiumEnv("hopper"), skip_render_check=True)
-
-
-def test_vector_wrappers_accept_the_environment(hopper: StableBaselines3VecEnv) -> None:
-    with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
-        env = VecMonitor(VecNormalize(hopper))
-    env.reset()
-    rng = np.random.default_rng(0)
-    for _ in range(40):
-        *_, infos = env.step(rng.uniform(-1, 1, (N, 3)).astype(np.float32))
-        for info in infos:
-            assert ("terminal_observation" in info) == ("episode" in info)
-    assert env.episode_count
-
-
-def test_equal_seeds_give_equal_worlds(hopper: StableBaselines3VecEnv) -> None:
-    hopper.seed(2**31 + 1)
-    first = hopper.reset()
-    other = hopper.reset()
-    hopper.seed(2**31 + 1)
-    np.testing.assert_array_equal(first, hopper.reset())
-    assert (first != other).any() and len(np.unique(first[:, 0])) == N
 
 
 def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
@@ -124,23 +86,9 @@ def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:
     assert env.env_is_wrapped(gymnasium.Wrapper, indices=[0]) == [False]
     with pytest.raises(ValueError, match="'ctrl_cost_weight' is shared by all worlds: call set_attr without indices"):
         env.set_attr("ctrl_cost_weight", 1.0, indices=[1])
-
-
-@pytest.mark.parametrize(
-    "name, message",
-    [
-        ("ctrl_cost_wieght", "the task 'hopper' has no parameter 'ctrl_cost_wieght': did you mean ctrl_cost_weight"),
-        ("horizon", "'horizon' is an option, not a parameter of the task 'hopper'"),
-        ("reward", "the task 'hopper' has no parameter 'reward': "),
-    ],
-)
-def test_setting_an_attribute_that_would_have_no_effect_raises_an_error(
-    name: str, message: str, hopper: StableBaselines3VecEnv
-) -> None:
-    with pytest.raises(ValueError, match=message) as error:
-        hopper.set_attr(name, 5)
-    assert "\n" not in str(error.value) and name not in vars(hopper)
-    hopper.set_attr("render_mode", hopper.render_mode)
+    with pytest.raises(ValueError, match="'horizon' is an option, not a parameter of the task 'hopper'"):
+        env.set_attr("horizon", 5)
+    env.set_attr("render_mode", env.render_mode)
 
 
 def test_dict_obs_returns_observation_groups_as_a_dict(full: StableBaselines3VecEnv) -> None:
