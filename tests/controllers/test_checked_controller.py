@@ -1,20 +1,14 @@
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
-from conftest import SharedEnv
 from toy_controllers import SamplingPlanner, StepPlanner
 
 import lyceum_warp as lw
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.real_time import control_async
 from lyceum_warp.controllers.trajectory import Trajectory
-
-Run = Callable[..., Trajectory]
-BOTH = pytest.mark.parametrize("run", [control, control_async])
 
 
 @pytest.fixture(scope="module")
@@ -38,23 +32,24 @@ def test_policy_with_one_argument_raises_an_error(env: lw.Env) -> None:
     assert control(env, lambda state, obs: policy(obs), steps=2).steps == 2
 
 
-@BOTH
-def test_a_planner_cannot_control_its_own_environment(run: Run) -> None:
+def test_a_planner_cannot_control_its_own_environment() -> None:
     plan = lw.MPPI("point_mass", horizon=4, samples=1)
     with pytest.raises(ValueError, match="plans in the environment that it controls.*: control another environment"):
-        run(plan.env, plan, steps=4)
+        control(plan.env, plan, steps=4)
 
 
-@pytest.mark.parametrize("timestep", [0.0, math.nan, "fast"])
-def test_time_step_that_is_not_positive_raises_an_error(env: lw.Env, timestep: object) -> None:
+@pytest.mark.parametrize("timestep, message", [
+    ("fast", "the timestep of a controller must be a positive number of seconds"),
+    (0.03, "controller's step is 0.03 s and the plant's step is 0.02 s, but one must be a multiple"),
+])  # fmt: skip
+def test_invalid_time_step_raises_an_error(env: lw.Env, timestep: object, message: str) -> None:
     planner = StepPlanner(env)
     planner.timestep = timestep  # type: ignore[assignment]
-    with pytest.raises(ValueError, match="the timestep of a controller must be a positive number of seconds"):
+    with pytest.raises(ValueError, match=message):
         CheckedController(planner, env)
 
 
-@BOTH
-def test_invalid_action_or_plan_raises_an_error(run: Run, env: lw.Env) -> None:
+def test_invalid_action_or_plan_raises_an_error(env: lw.Env) -> None:
     bad = type("Bad", (), {"actions": torch.zeros(8, 3), "__call__": lambda *_: torch.zeros(2)})
     for controller, message in (
         (lambda *_: torch.zeros(1, 2), r"return an action of shape \(2,\), not a float32 tensor of shape \(1, 2\)"),
@@ -63,7 +58,7 @@ def test_invalid_action_or_plan_raises_an_error(run: Run, env: lw.Env) -> None:
         (lambda *_: torch.tensor([0.0, math.nan]), "the controller's action 'y' at step 0 must be finite, not nan"),
     ):
         with pytest.raises(ValueError, match=message):
-            run(env, controller)
+            control(env, controller)
 
 
 def test_plan_is_resampled_to_the_time_step_of_the_plant(env: lw.Env) -> None:
@@ -82,25 +77,11 @@ def test_plan_is_resampled_to_the_time_step_of_the_plant(env: lw.Env) -> None:
     assert applied(env.timestep / 2, 3) == [0, 2, 2]
 
 
-def test_time_step_that_is_not_a_multiple_of_the_plant_time_step_raises_an_error(env: lw.Env) -> None:
-    planner = StepPlanner(env)
-    planner.timestep = 1.5 * env.timestep
-    with pytest.raises(
-        ValueError, match="controller's step is 0.03 s and the plant's step is 0.02 s, but one must be a multiple"
-    ):
-        CheckedController(planner, env)
-
-
-@pytest.mark.parametrize("between, change", [("hold", [0, 1, 0, 1, 0]), ("linear", [1, 1, 1, 1, 1])])
-def test_planner_with_a_doubled_time_step_repeats_or_interpolates_actions(between: str, change: list[int]) -> None:
-    plant = lw.make("point_mass", autoreset=False, horizon=40)
-    plan = lw.MPPI("point_mass", frame_skip=2 * plant.task.frame_skip, horizon=4, samples=8, between=between)
-    assert plan.timestep == 2 * plant.timestep
-    actions = control(plant, plan, seed=1, steps=6, replan_every=6).actions
-    assert [int(bool(moved)) for moved in actions.diff(dim=0).any(1)] == change
+def test_actions_of_mppi_are_interpolated_to_the_time_step_of_the_plant(env: lw.Env) -> None:
+    plan = lw.MPPI("point_mass", frame_skip=2 * env.task.frame_skip, horizon=4, samples=8, between="linear")
+    actions = control(env, plan, seed=1, steps=6, replan_every=6).actions
     torch.testing.assert_close(actions[::2], plan.actions[:3], rtol=0, atol=0)
-    timed = control_async(plant, plan, seed=1, steps=6)
-    torch.testing.assert_close(timed.actions[0], actions[0], rtol=0, atol=0)
+    torch.testing.assert_close(actions[1:5:2], (plan.actions[:2] + plan.actions[1:3]) / 2)
 
 
 def test_trajectory_describes_the_controller_by_json_values(env: lw.Env, tmp_path: Path) -> None:
@@ -114,9 +95,3 @@ def test_trajectory_describes_the_controller_by_json_values(env: lw.Env, tmp_pat
     assert episode.controller["name"] == "SamplingPlanner" and episode.controller["smoothing"] == [1.0, 0.0]
     assert isinstance(episode.controller["odd"], str)
     assert Trajectory.load(episode.save(tmp_path / "a.npz")).controller == episode.controller
-
-
-def test_error_names_the_column_of_an_action_with_several_columns(shared_env: SharedEnv) -> None:
-    env = shared_env("go1_velocity", autoreset=False)
-    with pytest.raises(ValueError, match=r"action '\w+\[11\]' at step 0 must be finite, not nan"):
-        control(env, lambda state, obs: torch.cat((torch.zeros(11), torch.full((1,), math.nan))), steps=2, seed=0)

@@ -39,16 +39,12 @@ def times() -> np.ndarray:
 
 
 def test_planning_time_summary_excludes_the_first_plan(episode: Trajectory, times: np.ndarray) -> None:
-    report = control_report(with_plan_times(episode, times))
+    timed = with_plan_times(episode, times)
+    report = control_report(timed)
     for name, q in (("p50", 0.5), ("p90", 0.9), ("p99", 0.99), ("p99_9", 0.999), ("max", 1.0)):
         assert getattr(report, f"plan_{name}_ms") == pytest.approx(1000 * np.quantile(times, q))
     assert report.plan_jitter_ms == pytest.approx(1000 * times.std(ddof=1))
-    assert report.first_plan_ms == 1000
-
-
-def test_rate_determines_the_deadline(episode: Trajectory, times: np.ndarray) -> None:
-    timed = with_plan_times(episode, times)
-    assert control_report(timed).misses == (times > episode.timestep).sum()
+    assert report.first_plan_ms == 1000 and report.misses == (times > episode.timestep).sum()
     assert control_report(timed, rate=100).misses == (times > 0.01).sum()
 
 
@@ -95,13 +91,11 @@ def test_report_of_unsuitable_episodes_raises_an_error(env: lw.Env) -> None:
     controller = {**one.controller, "samples": 9}
     with pytest.raises(ValueError, match=r"differ in their controller \(samples\)"):
         control_report([one, dataclasses.replace(one, controller=controller)])
-    with pytest.raises(ValueError, match=r"differ in their params \(success_distance\)"):
-        control_report([one, dataclasses.replace(one, params={**one.params, "success_distance": 1.0})])
     odd = dataclasses.replace(one, params={**one.params, "odd": math.nan})
     assert control_report([odd, dataclasses.replace(odd, params={**one.params, "odd": float("nan")})]).episodes == 2
 
 
-def test_failed_samples_are_reported(env: lw.Env, tmp_path: Path) -> None:
+def test_failed_samples_are_reported(env: lw.Env) -> None:
     episode = control(env, SamplingPlanner(0, 8, 8, 2), steps=4, seed=1)
     assert episode.plan_failed.tolist() == [0, 8, 8, 2] and episode.plan_effective.tolist() == [2, 0, 0, 2]
     report = control_report(episode)
@@ -110,8 +104,6 @@ def test_failed_samples_are_reported(env: lw.Env, tmp_path: Path) -> None:
     rows = dict(report.rows())
     assert rows["plans without a good sample"] == "2 of 4" and rows["failed samples"] == "56.2 %"
     assert rows["effective samples, mean"] == "1"
-    loaded = Trajectory.load(episode.save(tmp_path / "episode.npz"))
-    assert torch.equal(loaded.plan_failed, episode.plan_failed) and loaded.plan_failed.dtype == torch.float64
 
 
 def test_report_of_a_controller_without_samples_has_no_sample_statistics(env: lw.Env) -> None:

@@ -33,14 +33,6 @@ def test_largest_number_of_samples_that_meets_the_deadline_is_chosen(microsecond
     assert len(machine.measured) == len(set(machine.measured)) <= 5
 
 
-def test_message_names_the_chosen_and_the_next_larger_number_of_samples() -> None:
-    choice = choose_setting(SAMPLES, [32], ["fast"], Machine(3.5), deadline=0.015)
-    assert str(choice) == "64 samples, horizon 32, physics fast: 8.17 ms of 15 ms; 128 would take 15.3 ms"
-    assert str(choose_setting([64], [8], [None], Machine(1.0), deadline=0.02)) == (
-        "64 samples, horizon 8: 1.51 ms of 20 ms"
-    )
-
-
 def test_shorter_horizons_are_tried_before_faster_physics() -> None:
     physics = ["exact", "fast"]
     assert choose_setting(SAMPLES, [32, 16], physics, Machine(10.0, fast=10.0), deadline=0.015).setting == (
@@ -59,9 +51,6 @@ def test_fastest_setting_is_chosen_if_all_settings_miss_the_deadline() -> None:
     choice = choose_setting(SAMPLES, [32, 16], [None], Machine(100.0), deadline=0.01)
     # a plan takes 26.6 ms, which is 3.3 times the allowed 8 ms
     assert choice.setting == RealTimeSetting(16, 16) and choice.replan_every == 4
-    assert str(choice) == (
-        "no setting meets the deadline; 16 samples, horizon 16: 26.6 ms of 10 ms, so there is a plan every 40 ms"
-    )
 
 
 def test_planning_time_is_measured_on_real_plans_and_the_plant_is_restored(shared_env: SharedEnv) -> None:

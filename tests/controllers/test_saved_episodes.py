@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import TaskFile
+from tiny_task import TINY
 from toy_controllers import towards
 
 import lyceum_warp as lw
@@ -66,25 +67,22 @@ def test_episode_files_of_earlier_releases_are_loaded(folder: Path, tmp_path: Pa
 
 
 def test_episode_env_finds_the_task_file(task_file: TaskFile, tmp_path: Path) -> None:
-    source = Path(lw.make("cartpole").task.task.__module__.replace(".", "/") + ".py")
-    text = (Path(lw.__file__).parent.parent / source).read_text().replace("class Cartpole", "class MyPole")
-    model = Path(lw.__file__).parent / "tasks"
-    file = task_file("my_pole.py", text.replace('model = "', f'model = "{model}/'))
-    env = lw.make(f"{file}:MyPole", autoreset=False, horizon=3)
-    path = lw.control(env, lambda state, obs: torch.zeros(1)).save(tmp_path / "mine.npz")
+    file = task_file("tiny_of_episodes.py", TINY)
+    env = lw.make(f"{file}:Tiny", autoreset=False, horizon=3)
+    path = lw.control(env, lambda state, obs: torch.zeros(3)).save(tmp_path / "mine.npz")
     made = episode_env(load_episodes(path))
-    assert made.task.name == "my_pole" and made.task.task is env.task.task
-    gone = dataclasses.replace(lw.Trajectory.load(path), source={"task": "/nowhere/my_pole.py:MyPole"})
-    with pytest.raises(FileNotFoundError, match=r"/nowhere/my_pole.py, does not exist any more: pass a file"):
+    assert made.task.name == "tiny" and made.task.task is env.task.task
+    gone = dataclasses.replace(lw.Trajectory.load(path), source={"task": "/nowhere/tiny.py:Tiny"})
+    with pytest.raises(FileNotFoundError, match=r"/nowhere/tiny.py, does not exist any more: pass a file"):
         episode_env(gone)
-    assert episode_env(gone, task=file).task.name == "my_pole"
+    assert episode_env(gone, task=file).task.name == "tiny"
     notebook = dataclasses.replace(gone, source={"task": None})
-    with pytest.raises(ValueError, match="'my_pole' was defined in a notebook or a script: pass a file"):
+    with pytest.raises(ValueError, match="'tiny' was defined in a notebook or a script: pass a file"):
         episode_env(notebook)
     unknown = dataclasses.replace(gone, source={}, task="nonesuch")
     with pytest.raises(ValueError, match="there is no task 'nonesuch': .*; pass a file that defines the task"):
         episode_env(unknown)
-    with pytest.raises(ValueError, match="is an episode of the task 'my_pole', not of the task 'point_mass'"):
+    with pytest.raises(ValueError, match="is an episode of the task 'tiny', not of the task 'point_mass'"):
         episode_env(gone, task="point_mass")
 
 
@@ -112,15 +110,13 @@ def test_episode_of_another_model_raises_an_error(folder: Path, env: lw.Env, tmp
 
 
 def test_files_that_cannot_be_read_raise_a_one_line_error(folder: Path, tmp_path: Path) -> None:
-    newer, broken, empty = tmp_path / "newer.npz", tmp_path / "broken.npz", tmp_path / "empty"
+    newer, empty = tmp_path / "newer.npz", tmp_path / "empty"
     np.savez(newer, info=np.array(json.dumps({"format": 2})))
-    broken.write_bytes(min(folder.iterdir()).read_bytes()[:-100])
     empty.mkdir()
     for given, kind, message in (
         (tmp_path / "none.npz", FileNotFoundError, f"^there is no file {tmp_path / 'none.npz'}$"),
         (empty, FileNotFoundError, f"there is no episode in the folder {empty}: it contains no .npz file"),
         (newer, ValueError, rf"{newer} has format 2, and this lyceum_warp reads formats up to 1"),
-        (broken, ValueError, f"{broken} is broken, or is not a trajectory"),
     ):
         with pytest.raises(kind, match=message) as caught:
             load_episodes([folder, given])

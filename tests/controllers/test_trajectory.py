@@ -9,7 +9,6 @@ import torch
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.control_report import control_report
 from lyceum_warp.controllers.loop import control
 from lyceum_warp.controllers.trajectory import Trajectory
 
@@ -50,9 +49,6 @@ def test_trajectory_file_contains_column_names_and_planner_settings(env: lw.Env,
     controller = info["controller"]
     assert controller["name"] == "MPPI" and controller["engine"] == "mujoco" and controller["device"] == "cpu"
     assert controller.items() >= plan.settings.items() and controller["temperature"] == 0.3
-    report = json.loads(control_report(Trajectory.load(path)).to_json())
-    assert report["controller"] == controller
-    assert Trajectory.load(path).controller == controller
 
 
 def test_damaged_trajectory_file_raises_an_error(episode: Trajectory, tmp_path: Path) -> None:
