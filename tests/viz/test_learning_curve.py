@@ -9,7 +9,6 @@ from lyceum_warp.viz.learning_curve import learning_curve
 
 
 def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     sizes = []
     for number, metrics in enumerate(({}, {"metrics/forward": 1.0, "metrics/effort": float("nan")})):
         run = Run.create(tmp_path / str(number), {"task": "point_mass", "seed": 3})
@@ -26,7 +25,6 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
 
 
 def test_learning_curve_shows_rewards_if_no_episode_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("matplotlib")
     figures = []
     monkeypatch.setattr(module, "save_png", lambda figure, out: figures.append(figure))
     for mean_return in (None, 3.0):

@@ -15,7 +15,6 @@ def npg() -> lw.NPG:
 
 
 def test_training_in_python_writes_the_same_videos_as_the_command_line(npg: lw.NPG, tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     with pytest.raises(ValueError, match="there is no camera 'side': the model has"):
         lw.train(npg, tmp_path / "run", iterations=2, video_every=1, camera="side")
     with pytest.raises(ValueError, match="video_every must be a whole number from 0 to .*, not -1"):
@@ -33,7 +32,6 @@ def test_training_in_python_writes_the_same_videos_as_the_command_line(npg: lw.N
 def test_training_in_python_continues_if_no_video_can_be_drawn(
     npg: lw.NPG, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
     with caplog.at_level(logging.WARNING):
         run = lw.train(npg, tmp_path / "run", iterations=2, video_every=1)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from headless_screen import state_of
-from varied_task import Varied, ball
+from varied_task import ball
 
 import lyceum_warp as lw
 from lyceum_warp.viz import drawing, video
@@ -56,7 +56,6 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture(scope="module")
 def can_draw(model: mujoco.MjModel) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     try:
         with drawing.DrawingProcess(model, camera={}, size=SMALL):
             pass
@@ -82,24 +81,7 @@ def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("can_draw")
-def test_video_shows_the_model_fields_of_its_states(tmp_path: Path) -> None:
-    env = lw.make(Varied, autoreset=False)
-    first, second = (episode(env, seed) for seed in (1, 2))
-    states, parts = torch.cat([first, second]), env.state_space.parts
-    sizes = states[:, parts["geom_size"]][:, 0]
-    assert sizes.unique().numel() == 2
-    path = video.write_video(env, states, tmp_path / "video.mp4", size=(160, 120), speed=0.01)
-    areas = np.array(frames_of(path)["red"], dtype=float)  # a fixed camera shows the red ball
-    assert len(areas) == len(states) and areas.min() > 0
-    ratio = areas[len(first) :].mean() / areas[: len(first)].mean()
-    assert ratio == pytest.approx((sizes[-1] / sizes[0]).item() ** 2, rel=0.25)
-
-
-@pytest.mark.usefixtures("can_draw")
 def test_video_is_rendered_from_the_given_camera(env: lw.Env, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="there is no camera 'side': the model has "):
-        video.write_video(env, env.get_state(), tmp_path / "video.mp4", camera="side")
-    assert not list(tmp_path.iterdir())
     near, far = (
         video.write_video(env, env.get_state(), tmp_path / "video.mp4", camera=camera, size=SMALL).read_bytes()
         for camera in (FreeCamera(distance=0.3), FreeCamera(distance=3.0))
@@ -110,7 +92,6 @@ def test_video_is_rendered_from_the_given_camera(env: lw.Env, tmp_path: Path) ->
 def test_error_on_a_machine_that_cannot_render_names_a_fix(
     env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
     message = r"cannot draw off-screen \(nonsense: .*\): install Mesa's EGL"
     with pytest.raises(video.NoVideoError, match=message) as caught:
@@ -185,30 +166,7 @@ def test_slow_rendering_drops_shots_but_keeps_the_video_length(model: mujoco.MjM
     assert columns[1] > columns[0] + 0.5 and columns[-1] == pytest.approx(columns[-2], abs=0.3)
 
 
-def test_cancel_kills_a_process_that_hangs(
-    model: mujoco.MjModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("imageio_ffmpeg")
-    started: list[subprocess.Popen[bytes]] = []
-    popen = subprocess.Popen
-
-    def hanging(command: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        started.append(popen([sys.executable, "-c", "import time; time.sleep(300)"], **options))
-        return started[-1]
-
-    monkeypatch.setattr(drawing.subprocess, "Popen", hanging)
-    mp4 = video_of(model, tmp_path / "video.mp4")
-    mp4.add(shot(0.0))
-    while not started:
-        time.sleep(0.01)
-    begin = time.monotonic()
-    mp4.cancel()
-    assert time.monotonic() - begin < 4 and mp4.finished
-    assert len(started) == 1 and started[0].poll() is not None and not list(tmp_path.iterdir())
-
-
 def test_cancelled_or_empty_video_does_not_replace_the_old_file(model: mujoco.MjModel, tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     out = tmp_path / "video.mp4"
     out.write_text("old")
     mp4 = video_of(model, out)
@@ -222,34 +180,22 @@ def test_cancelled_or_empty_video_does_not_replace_the_old_file(model: mujoco.Mj
 
 
 @pytest.mark.long
+@pytest.mark.usefixtures("can_draw")
 def test_killed_program_leaves_no_video_file(tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg")
-    program = f"""
-import time
-from pathlib import Path
-import mujoco
-import numpy as np
-from lyceum_warp.viz.render import Shot
-from lyceum_warp.viz.video import Recorder
-model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><geom size='1'/></body></worldbody></mujoco>")
-mp4 = Recorder(model, Path({str(tmp_path / "video.mp4")!r}), camera={{}}, size={SMALL}, fps=30, most_waiting=2)
-for _ in range(2):
-    state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION))
-    mp4.add(Shot(state=state, model_fields={{}}, ghosts=[], lines=[], frames=1))
-while mp4._shots and not mp4.finished:
-    time.sleep(0.01)
-print("drawn", flush=True)
-time.sleep(60)
+    program = """
+import sys, time, mujoco
+from lyceum_warp.viz.drawing import Drawing
+with Drawing(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={}, size=(96, 64), fps=30):
+    print("ready", flush=True)
+    time.sleep(60)
 """
-    folder = tmp_path / "temporary"
+    folder, out = tmp_path / "temporary", tmp_path / "video.mp4"
     folder.mkdir()
-    environment = os.environ | {"TMPDIR": str(folder)}
-    with subprocess.Popen(
-        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout is not None and process.stdout.readline() == "drawn\n"
+    command, environment = [sys.executable, "-c", program, str(out)], os.environ | {"TMPDIR": str(folder)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGKILL)
     end = time.monotonic() + 30
     while list(folder.iterdir()) and time.monotonic() < end:
         time.sleep(0.05)
-    assert not list(folder.iterdir()) and not (tmp_path / "video.mp4").exists()
+    assert not list(folder.iterdir()) and not out.exists()

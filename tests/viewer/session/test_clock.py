@@ -31,7 +31,6 @@ def test_session_obeys_the_commands_set_speed_and_set_paused(shared_env: SharedE
 def test_failed_video_is_reported_as_a_message(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("imageio_ffmpeg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
     session = Session(shared_env("point_mass"), seed=0)

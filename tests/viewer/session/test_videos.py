@@ -18,7 +18,7 @@ from lyceum_warp.viewer.session import videos
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
 from lyceum_warp.viz import drawing
-from lyceum_warp.viz.video import NoVideoError, check_video
+from lyceum_warp.viz.video import NoVideoError
 
 CAMERA = dict(type=1, trackbodyid=1, fixedcamid=-1, lookat=[0.0, 0.0, 1.0], distance=4.0, azimuth=90.0,
               elevation=-20.0)  # fmt: skip
@@ -27,10 +27,6 @@ CAMERA = dict(type=1, trackbodyid=1, fixedcamid=-1, lookat=[0.0, 0.0, 1.0], dist
 def test_a_video_of_the_session_is_written_and_reported(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    try:
-        check_video()
-    except NoVideoError as error:
-        pytest.skip(str(error))
     monkeypatch.chdir(tmp_path)
 
     def after(frame: Frame, number: int) -> list[Command] | None:
@@ -58,7 +54,6 @@ def frame(shared_env: SharedEnv) -> Frame:
 
 @pytest.fixture
 def taker(shared_env: SharedEnv, tmp_path: Path) -> Iterator[VideoTaker]:
-    pytest.importorskip("imageio_ffmpeg")
     with contextlib.chdir(tmp_path):
         yield VideoTaker(shared_env("hopper").task.model, "runs/one two")
 
