@@ -1,4 +1,3 @@
-import pytest
 import torch
 from conftest import SharedEnv
 from memory_window import pushing
@@ -11,9 +10,8 @@ from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.live import HISTORY_BYTES, PLANT_HISTORY_BYTES
 
 
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedEnv, engine: str) -> None:
-    env = shared_env("hopper", engine=engine, nworld=3)
+def test_steps_back_and_forth_restore_the_states_bit_for_bit(shared_env: SharedEnv) -> None:
+    env = shared_env("hopper", nworld=3)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=1)
     states = [env.get_state()]
     for k in range(40):

@@ -80,19 +80,6 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         pytest.skip(str(error))
 
 
-@pytest.mark.long
-def test_an_interrupted_viewer_completes_its_video(
-    taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    lines: list[str] = []
-    with pytest.raises(Interrupted), taker.finishing(lines.append):
-        take(taker, frame, monkeypatch)
-        monkeypatch.undo()
-        raise Interrupted(signal.SIGINT)
-    (video,), (page,) = tmp_path.glob("runs-one-two-*.mp4"), tmp_path.glob("runs-one-two-*.html")
-    assert lines == [f"page: {page.name}", f"video: {video.name}"]
-
-
 def test_a_video_without_frames_has_no_page(taker: VideoTaker, tmp_path: Path) -> None:
     lines: list[str] = []
     with taker.finishing(lines.append):

@@ -384,7 +384,7 @@ def open_tab(proxy: Proxy, path: str = "/ui") -> ClientConnection:
                    additional_headers={"Cookie": cookie})  # fmt: skip
 
 
-def test_proxy_serves_two_tabs_and_one_may_close(echo: Echo) -> None:
+def test_proxy_serves_two_tabs_and_notices_a_closed_or_lost_tab(echo: Echo) -> None:
     proxy, opened, _ = echo
     with open_tab(proxy) as one:
         with open_tab(proxy, "/state?sid=b") as two:
@@ -396,7 +396,8 @@ def test_proxy_serves_two_tabs_and_one_may_close(echo: Echo) -> None:
         wait_until(lambda: len(opened) == 1)
         one.send(b"still here")
         assert one.recv() == b"still here"
-    wait_until(lambda: not opened)
+        one.socket.shutdown(socket.SHUT_RDWR)  # a killed browser closes its connection in the same way
+        wait_until(lambda: not opened)
 
 
 def test_page_receives_the_reason_for_a_closed_websocket(echo: Echo) -> None:
@@ -408,14 +409,6 @@ def test_page_receives_the_reason_for_a_closed_websocket(echo: Echo) -> None:
         tab.send(bytes(2**20 + 1))  # too large
         tab.recv(timeout=10)
     wait_until(lambda: not echo[1])
-
-
-def test_private_server_notices_a_lost_tab(echo: Echo) -> None:
-    proxy, opened, _ = echo
-    tab = open_tab(proxy)
-    wait_until(lambda: len(opened) == 1)
-    tab.socket.shutdown(socket.SHUT_RDWR)  # a killed browser closes its connection in the same way
-    wait_until(lambda: not opened)
 
 
 def test_silence_of_the_controlling_browser_is_reported(monkeypatch: pytest.MonkeyPatch, echo: Echo) -> None:
