@@ -365,7 +365,7 @@ def test_a_saved_page_plays_without_a_server(browser: Browser, tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_another_browser_gets_control_after_the_first_is_killed(
+def test_another_browser_gets_control_after_the_first_is_closed_or_killed(
     viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
 ) -> None:
     shared_tab.page.goto("about:blank")
@@ -375,10 +375,15 @@ def test_another_browser_gets_control_after_the_first_is_killed(
     for process in processes:
         with contextlib.suppress(ProcessLookupError):
             os.kill(process["id"], signal.SIGKILL)
-    tab = Tab(context.new_page(), viewer).loaded()
-    tab.logs("role=controller")
-    paused = viewer.status.paused
-    tab.press("Space", lambda: viewer.status.paused != paused)
+    address = None
+    for _ in range(2):
+        tab = Tab(context.new_page(), viewer, address).loaded()
+        tab.logs("role=controller")
+        paused = viewer.status.paused
+        tab.press("Space", lambda: viewer.status.paused != paused)  # noqa: B023
+        address = tab.page.url
+        tab.page.close()
+    assert viewer.window.is_open()
 
 
 @pytest.mark.long
