@@ -101,17 +101,9 @@ class Painter:
 def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
     """Set fields of a model by name, and recompute derived constants, such as the poses of cameras."""
     for name, row in rows.items():
-        owner = _owner(model, name)
-        value = getattr(owner, name)
-        if isinstance(value, np.ndarray):
-            value[...] = np.reshape(row, value.shape)
-        else:
-            setattr(owner, name, np.asarray(row).item())
+        owner = model if hasattr(model, name) else model.opt
+        setattr(owner, name, np.reshape(row, np.shape(getattr(owner, name))))
     mujoco.mj_setConst(model, mujoco.MjData(model))
-
-
-def _owner(model: Any, name: str) -> Any:
-    return model if hasattr(model, name) else model.opt
 
 
 def main(folder: str) -> int:

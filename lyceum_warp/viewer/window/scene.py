@@ -97,25 +97,27 @@ def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> 
     for path in paths:
         points = path[np.linspace(0, len(path) - 1, segments + 1).round().astype(int)]
         for start, end in itertools.pairwise(points):
-            line = mujoco.MjvGeom()
-            kind, rgba = mujoco.mjtGeom.mjGEOM_LINE, np.array(colour, dtype=np.float32)
-            mujoco.mjv_initGeom(line, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
+            line = _connector(mujoco.mjtGeom.mjGEOM_LINE, colour, LINE_WIDTH, start, end)
             line.emission = 1.0  # make the lines visible without light
-            mujoco.mjv_connector(line, kind, LINE_WIDTH, start, end)
             lines.append(line)
     return lines
 
 
 def _arrows(arrows: Sequence[Arrow]) -> list[mujoco.MjvGeom]:
-    geoms, kind = [], mujoco.mjtGeom.mjGEOM_ARROW
-    for arrow in arrows:
-        if np.linalg.norm(arrow.end - arrow.start) > SHORTEST_ARROW:
-            geom = mujoco.MjvGeom()
-            rgba = np.array(arrow.colour, dtype=np.float32)
-            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
-            mujoco.mjv_connector(geom, kind, ARROW_WIDTH, arrow.start, arrow.end)
-            geoms.append(geom)
-    return geoms
+    return [
+        _connector(mujoco.mjtGeom.mjGEOM_ARROW, arrow.colour, ARROW_WIDTH, arrow.start, arrow.end)
+        for arrow in arrows
+        if np.linalg.norm(arrow.end - arrow.start) > SHORTEST_ARROW
+    ]
+
+
+def _connector(
+    kind: mujoco.mjtGeom, colour: Sequence[float], width: float, start: np.ndarray, end: np.ndarray
+) -> mujoco.MjvGeom:
+    geom, rgba = mujoco.MjvGeom(), np.array(colour, dtype=np.float32)
+    mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.eye(3).ravel(), rgba)
+    mujoco.mjv_connector(geom, kind, width, start, end)
+    return geom
 
 
 # the model with the values of the displayed world
@@ -130,7 +132,8 @@ class ModelValues:
 
     def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
         """Set a world's values. Return whether any value has changed, and whether the change is visible."""
-        changed = [name for name, value in values.items() if not _equal(value, field(self.model, name))]
+        model = self.model
+        changed = [name for name, value in values.items() if not _equal(value, getattr(_owner(model, name), name))]
         if changed:
             self._values = values
             self.copy_to(self.model)
@@ -139,19 +142,18 @@ class ModelValues:
     def copy_to(self, model: mujoco.MjModel) -> None:
         """Set the values in another copy of the model, and recompute its constants."""
         for name, values in self._values.items():
-            field(model, name)[...] = values.reshape(field(model, name).shape)
+            owner = _owner(model, name)
+            setattr(owner, name, values.reshape(np.shape(getattr(owner, name))))
         mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def _equal(first: np.ndarray, second: np.ndarray) -> bool:
+def _equal(first: np.ndarray, second: Any) -> bool:
     """Compare in single precision, because MuJoCo Warp rounds the model's values."""
-    return np.array_equal(first.astype(np.float32), second.ravel().astype(np.float32))
+    return np.array_equal(first.astype(np.float32), np.ravel(second).astype(np.float32))
 
 
-def field(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return a field of a model or of its options as a writable array."""
-    owner = model if hasattr(model, name) else model.opt
-    return np.atleast_1d(getattr(owner, name))
+def _owner(model: mujoco.MjModel, name: str) -> Any:
+    return model if hasattr(model, name) else model.opt
 
 
 # cameras
