@@ -35,7 +35,7 @@ class CheckedController:
             env.timestep, positive_number("the timestep of a controller", timestep, "seconds")
         )
         self._linear = getattr(controller, "between", "hold") == "linear"
-        self._takes_shift = (signature := _signature(controller)) is not None and "shift" in signature.parameters
+        self._takes_shift = (signature := signature_of(controller)) is not None and "shift" in signature.parameters
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, shift: int, step: int) -> torch.Tensor:
         """Return the plan for a state, (horizon, nact) float32, on the CPU."""
@@ -131,23 +131,24 @@ def _check_call(controller: Any) -> None:
             f"a controller must be callable with (state, obs), not {described(controller)}: pass a function, or "
             "lw.MPPI(...)"
         )
-    signature = _signature(controller.forward if isinstance(controller, torch.nn.Module) else controller)
-    if signature is not None and _fits(signature, 1) and not _fits(signature, 2):
+    signature = signature_of(controller)
+    if signature is not None and accepts(signature, 1) and not accepts(signature, 2):
         raise ValueError(
             f"control loops call a controller with (state, obs), but {type(controller).__name__} takes one argument: "
-            "pass "
-            "lambda state, obs: policy(obs)"
+            "pass lambda state, obs: policy(obs)"
         )
 
 
-def _signature(function: Callable[..., Any]) -> inspect.Signature | None:
+def signature_of(function: Callable[..., Any]) -> inspect.Signature | None:
+    """Return the signature of a function or of a module's ``forward``, or None if it is unknown."""
     try:
-        return inspect.signature(function)
+        return inspect.signature(function.forward if isinstance(function, torch.nn.Module) else function)
     except (TypeError, ValueError):  # some C functions have no signature
         return None
 
 
-def _fits(signature: inspect.Signature, count: int) -> bool:
+def accepts(signature: inspect.Signature, count: int) -> bool:
+    """Return whether a function can be called with ``count`` positional arguments."""
     try:
         signature.bind(*[None] * count)
     except TypeError:

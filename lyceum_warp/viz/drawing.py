@@ -17,7 +17,6 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import EXTRA, NoVideoError
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
@@ -181,7 +180,6 @@ class Drawing(DrawingProcess):
         self.out = Path(out)
         if fps is not None:
             self.product = "the video"
-            fps = positive_number("fps", fps, "frames per second")
         super().__init__(model, camera=camera, size=size, fps=fps, background=background)
         if fps is not None and (self.out.suffix.lower() != ".mp4" or self.out.is_dir()):
             raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")

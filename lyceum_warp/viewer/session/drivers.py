@@ -1,7 +1,6 @@
 """Call policies, which act in all worlds, and controllers of one world, such as planners."""
 
 import dataclasses
-import inspect
 import threading
 import time
 from collections.abc import Mapping
@@ -12,7 +11,7 @@ import torch
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.planner import Planner
 from lyceum_warp.algos.policy import Policy, acting
-from lyceum_warp.controllers.checked_controller import CheckedController
+from lyceum_warp.controllers.checked_controller import CheckedController, accepts, signature_of
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
@@ -190,19 +189,10 @@ def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 
 def _is_policy(controller: Any) -> bool:
-    function: Any = acting(controller)
-    if module := isinstance(function, torch.nn.Module):
-        function = function.forward
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
+    function = acting(controller)
+    if (signature := signature_of(function)) is None:
         return False
-    try:
-        signature.bind(None, None)
-    except TypeError:
-        return True
-    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    return module and sum(p.default is p.empty and p.kind in places for p in signature.parameters.values()) < 2
+    return not accepts(signature, 2) or (isinstance(function, torch.nn.Module) and accepts(signature, 1))
 
 
 def _on_device(policy: Any, env: Env) -> Any:
