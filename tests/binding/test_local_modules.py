@@ -49,18 +49,13 @@ def shared(folder: Path, skip: int) -> Path:
     return tiny_task.write(folder, SHARED)
 
 
-def test_task_can_import_modules_from_its_folder(tmp_path: Path) -> None:
-    path = list(sys.path)
-    assert find_task(shared(tmp_path, 3)).frame_skip == 3
-    assert sys.path == path and not list(tmp_path.rglob("__pycache__"))
-
-
 def test_modules_with_equal_names_in_two_folders_are_distinct(tmp_path: Path) -> None:
-    files = []
+    path, files = list(sys.path), []
     for name, skip in (("a", 4), ("b", 5)):
         (tmp_path / name).mkdir()
         files.append(shared(tmp_path / name, skip))
     assert [find_task(file).frame_skip for file in (*files, *files)] == [4, 5, 4, 5]
+    assert sys.path == path and not list(tmp_path.rglob("__pycache__"))
 
 
 def test_a_changed_module_is_reloaded(tmp_path: Path) -> None:

@@ -1,4 +1,3 @@
-import importlib.util
 from pathlib import Path
 
 import mujoco
@@ -6,7 +5,6 @@ import pytest
 import tiny_task
 
 import lyceum_warp as lw
-from lyceum_warp.binding.bound_task import task_spec
 from lyceum_warp.binding.models import compile_model, load_spec
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.options import PhysicsOptions
@@ -29,28 +27,6 @@ def test_compiled_model_raises_an_error() -> None:
         load_spec(ball().compile())
 
 
-def test_relative_model_path_is_relative_to_the_task_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "models").mkdir()
-    (tmp_path / "models" / "robot.xml").write_text(lw.gymnasium_model("hopper.xml").spec().to_xml())
-    file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", "models/robot.xml")))
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    monkeypatch.chdir(elsewhere)
-    assert task_spec(find_task(file)).modelname == "hopper"
-
-
-def test_path_in_the_option_model_is_relative_to_the_current_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spec = lw.gymnasium_model("hopper.xml").spec()
-    spec.geom("torso_geom").density = 5000
-    (tmp_path / "hopper.xml").write_text(spec.to_xml())
-    own = lw.make("hopper").model.body_mass
-    monkeypatch.chdir(tmp_path)
-    assert (lw.make("hopper").model.body_mass == own).all()
-    assert lw.make("hopper", model="hopper.xml").model.body_mass[1] > 2 * own[1]
-
-
 @pytest.mark.parametrize(
     ("model", "message"),
     [
@@ -63,24 +39,6 @@ def test_error_of_a_missing_model_file_names_the_file(model: str, message: str, 
     file = tiny_task.write(tmp_path, tiny_task.changed(("hopper.xml", model)))
     with pytest.raises(FileNotFoundError, match=message):
         lw.make(file)
-
-
-def test_error_of_an_unreadable_model_file_names_the_file(tmp_path: Path) -> None:
-    (tmp_path / "robot.xml").write_text("<mujoco><robot/></mujoco>")
-    with pytest.raises(ValueError, match=r"MuJoCo can't read the model .*robot.xml: "):
-        load_spec(tmp_path / "robot.xml")
-
-
-def test_error_names_the_extra_if_gymnasium_robotics_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
-    with pytest.raises(FileNotFoundError, match=r"gymnasium-robotics, .*: pip install 'lyceum-warp\[hand\]'"):
-        lw.make("adroit_pen", engine="mujoco")
-
-
-def test_error_of_an_unknown_gymnasium_robotics_model_suggests_similar_names() -> None:
-    with pytest.raises(FileNotFoundError, match=r"no model file 'adroit_hand/adroit_pan.xml'.* adroit_hand/adroit_pen"):
-        lw.gymnasium_robotics_model("adroit_hand/adroit_pan.xml").spec()
 
 
 # changes before compiling
@@ -129,14 +87,11 @@ def test_physics_options_override_the_options_of_the_model() -> None:
     assert (option.jacobian, option.impratio) == (mujoco.mjtJacobian.mjJAC_SPARSE, 10.0)
 
 
-def test_sensors_are_added_for_fields_that_need_them() -> None:
+def test_sensors_are_added_for_fields_that_need_them_and_otherwise_disabled() -> None:
     model = compile_model(ball(), ["qpos", "cfrc_ext", "subtree_linvel"], PHYSICS)
     kinds = [mujoco.mjtSensor.mjSENS_FRAMELINACC, mujoco.mjtSensor.mjSENS_SUBTREELINVEL]
     assert sorted(model.sensor_type) == sorted(map(int, kinds))
     assert not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
-
-
-def test_sensors_are_disabled_if_no_field_needs_them() -> None:
     model = compile_model(ball(), ["qpos"], PHYSICS)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
 
@@ -187,7 +142,7 @@ def test_relative_model_path_still_works_after_a_change_of_folder(
     (tmp_path / "robot.xml").write_text(CUBE)
     (tmp_path / "cube.obj").write_text(CORNERS)
     monkeypatch.chdir(tmp_path)
-    env = lw.make(tiny_task.write(tmp_path, tiny_task.TINY),
+    env = lw.make(tiny_task.write(tmp_path / "elsewhere", tiny_task.TINY),
                   model=mujoco.MjSpec.from_file("robot.xml") if as_spec else "robot.xml")  # fmt: skip
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert env.replicate().model.nmesh == 1

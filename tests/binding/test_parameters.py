@@ -11,8 +11,6 @@ from table_task import Follow
 import lyceum_warp as lw
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.options import OPTIONS
-from lyceum_warp.testing import check_task
-from lyceum_warp.testing.index_rules import check_bounds
 
 XML = """
 <mujoco>
@@ -79,8 +77,7 @@ def test_named_elements_become_model_indices(model: mujoco.MjModel) -> None:
         ({"count": 2.5}, "count=2.5 of 'arm' must be a whole number"),
         ({"lively": 0.5}, "lively=0.5 of 'arm' must be a whole number"),
         ({"tip": 1}, "tip=1 of 'arm' is not an index of 'site_xpos': give an index from 0 to 0"),
-        ({"tip": -1}, "tip=-1 of 'arm' is not an index of 'site_xpos'"),
-        ({"tip": [0, 1]}, r"tip=\[0, 1\] of 'arm' is not an index of 'site_xpos'"),
+        ({"tip": [0, -1]}, r"tip=\[0, -1\] of 'arm' is not an index of 'site_xpos'"),
         ({"tip": "top"}, "no site 'top'; it has: tip"),
         ({"tip": lw.body("lower")}, "tip of 'arm' can't be an element of 'xpos': its default is one of 'site_xpos'"),
         ({"gain": lw.body("lower")}, "gain of 'arm' can't be an element of 'xpos': its default is a number"),
@@ -200,10 +197,7 @@ def test_array_of_named_elements_contains_their_indices(model: mujoco.MjModel) -
     ("joints", "message"),
     [
         (["knee"], "the model has no joint 'knee'; it has: elbow, shoulder"),
-        (
-            [0, 2],
-            "joints of 'arm' is not an index of 'qvel': give an index from 0 to 1, or a name",
-        ),
+        ([0, 2], "joints of 'arm' is not an index of 'qvel': give an index from 0 to 1, or a name"),
         (lw.sites("tip"), "joints of 'arm' can't have an element of 'site_xpos': its elements belong to 'qvel'"),
     ],
 )
@@ -220,10 +214,7 @@ def test_array_parameter_accepts_each_kind_of_element(model: mujoco.MjModel) -> 
         "dofs": "qvel", "actuators": "actuator_force", "sensors": "sensordata",
     }  # fmt: skip
     for kind, field in kinds.items():
-        assert [(element.field, element.name) for element in getattr(lw, kind)("a", "b")] == [
-            (field, "a"),
-            (field, "b"),
-        ]
+        assert [(element.field, element.name) for element in getattr(lw, kind)("a")] == [(field, "a")]
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
@@ -266,22 +257,6 @@ def test_changed_arrays_reach_replicas_planners_and_evaluations() -> None:
     assert planner.env.obs[0, 1] == 0.125
     npg = lw.NPG(env, config=lw.NPGConfig(samples=32, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2))
     assert next(npg).mean_return is not None
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("found", ["number", "nan"])
-def test_check_task_finds_an_out_of_range_read_of_an_array(task_file: Any, found: str, engine: str) -> None:
-    source = (Path(__file__).parent.parent / "table_task.py").read_text()
-    wrong = source.replace("p.motion.shape[0] - 1)", "p.motion.shape[0])")
-    value = {"number": "0.0", "nan": "wp.nan"}[found]
-    read = "p.motion[frame(s, p), 0]"
-    wrong = wrong.replace(f"obs[1] = {read}", f"x = {read}\n    obs[1] = wp.where(frame(s, p) > 2, {value}, x)")
-    wrong = wrong.replace("obs[2] = p.motion[frame(s, p)][1]", "obs[2] = 0.0")
-    assert wrong.count(read) == 1 and value in wrong
-    with pytest.raises(
-        AssertionError, match=r"observe reads p\.motion\[frame.*out of range .*the index is 3, and there"
-    ):
-        check_task(str(task_file(f"beyond_{found}.py", wrong)), engine=engine, steps=12, checks=[check_bounds])
 
 
 # parameters computed from the model

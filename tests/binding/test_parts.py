@@ -159,12 +159,3 @@ def test_invalid_part_raises_a_one_line_error_that_names_it(
     with pytest.raises(ValueError, match=f"^{message}") as caught:
         lw.make(tiny_task.write(tmp_path, tiny_task.changed(*changes)))
     assert "\n" not in str(caught.value)
-
-
-def test_helper_function_called_by_observe_defines_no_observation_group(tmp_path: Path) -> None:
-    helper = struct_of(PART, "observe_all(s, p, obs)").replace(
-        "@wp.func\n",
-        "@wp.func\ndef observe_all(s: World, p: Params, obs: Policy):\n    obs.x[0] = s.qpos[0]\n\n@wp.func\n",
-    )
-    source = tiny_task.changed(STRUCT, (f"@wp.func\n{OBSERVE}", helper))
-    assert list(lw.make(tiny_task.write(tmp_path, source)).obs_spaces) == ["policy"]

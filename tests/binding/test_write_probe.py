@@ -1,10 +1,101 @@
-from pathlib import Path
-
 import pytest
+import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp import Row
 
-TASK = Path(__file__).with_name("out_of_range_task.py")
+
+@wp.struct
+class World:
+    qpos: Row[float]
+    qfrc_applied: Row[float]
+    body_mass: Row[float]
+    counts: Row[float] = lw.memory(2)
+    level: Row[float] = lw.lasting_memory(3)
+
+
+@wp.struct
+class Params:
+    dt: float
+    function: int = 0
+    index: int = 0
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    if p.function == 1:
+        obs[p.index] = 1.0
+
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Row[float]):
+    obs[0] = s.qpos[0]
+    obs[1] = s.qpos[1]
+    if p.function == 2:
+        obs[p.index] += 0.0
+
+
+@wp.func
+def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float]):
+    metrics[0] = s1.qpos[0]
+    if p.function == 3:
+        metrics[p.index] = 1.0
+
+
+@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    for i in range(3):
+        ctrl[i] = action[i]
+    if p.function == 4:
+        ctrl[p.index] = 1.0
+    if p.function == 5:
+        s.qfrc_applied[p.index] = 1.0
+
+
+@wp.func
+def substep(s: World, p: Params):
+    if p.function == 6:
+        s.counts[p.index] = 1.0
+
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 7:
+        s1.counts[p.index] = 1.0
+
+
+@wp.func
+def event(s: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 8:
+        s.level[p.index] = 1.0
+
+
+@wp.func
+def startup(s: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 9:
+        s.body_mass[p.index] = 1.0
+
+
+@wp.func
+def initialize(s: World, p: Params):
+    if p.function == 10:
+        s.qpos[p.index] = 1.0
+
+
+@wp.func
+def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 11:
+        s.qpos[p.index] = 1.0
+    if p.function == 12:
+        rng[p.index] = wp.uint32(1)
+
+
+class OutOfRange(lw.Task):
+    model = "hopper.xml"
+    obs = {"policy": {"x": 1}, "critic": {"x": 2}}
+    metrics = ("x",)
+
 
 ROWS = {
     "observe": (1, 1, "", "obs declares 1"),
@@ -32,12 +123,12 @@ def test_write_out_of_range_raises_an_error_before_it_damages_the_heap(name: str
         (-size - 1, f"at index {-size - 1}{of}"),
     ):
         with pytest.raises(ValueError, match="out_of_range") as caught:
-            lw.make(str(TASK), nworld=2, function=number, index=index)
+            lw.make(OutOfRange, nworld=2, function=number, index=index)
         assert str(caught.value) == f"{name.split()[0]} of the task 'out_of_range' writes {text}, but {declared}"
 
 
 @pytest.mark.parametrize("index", [0, 5, -1, -6])
 def test_positive_and_negative_indices_within_an_array_are_accepted(index: int) -> None:
-    env = lw.make(str(TASK), function=10, index=index)
+    env = lw.make(OutOfRange, function=10, index=index)
     env.reset()
     assert env.field("qpos")[0, index] == 1.0
