@@ -6,7 +6,6 @@ import importlib.util
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import TypeAlias
 
 Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
@@ -97,7 +96,9 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
         yield
     except BaseException:
         for name, module in before.items():
-            _put(name, module)
+            sys.modules.pop(name, None)
+            if module is not None:
+                sys.modules[name] = module
         raise
     finally:
         sys.path.remove(folder)
@@ -105,10 +106,3 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     for name, path in modules.items():
         if (module := sys.modules.get(name)) is not None and module is not before[name]:
             _taken[name] = stamps([path])
-
-
-def _put(name: str, module: ModuleType | None) -> None:
-    if module is not None:
-        sys.modules[name] = module
-    else:
-        sys.modules.pop(name, None)

@@ -49,13 +49,6 @@ lyceum-warp COMMAND --help describes a command and its usual options, --help-all
 """
 
 
-class _Messages(logging.Handler):
-    """Print the package's warnings to stderr."""
-
-    def emit(self, record: logging.LogRecord) -> None:
-        print(f"lyceum-warp: {record.getMessage()}", file=sys.stderr)
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the program ``lyceum-warp``.
 
@@ -67,7 +60,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
         return 0
-    log, messages = logging.getLogger("lyceum_warp"), _Messages(logging.WARNING)
+    log, messages = logging.getLogger("lyceum_warp"), logging.StreamHandler()
+    messages.setLevel(logging.WARNING)
+    messages.setFormatter(logging.Formatter("lyceum-warp: %(message)s"))
     log.addHandler(messages)
     try:
         with signals():

@@ -5,7 +5,6 @@ import dataclasses
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import UnionType
 from typing import Annotated, Any
 
 import tyro
@@ -50,8 +49,6 @@ TaskWord = Annotated[
     ),
 ]
 
-_UNIONS = (UnionType, type(typing.Union[int, str]))  # noqa: UP007 (the type of such a hint)
-
 
 @typing.dataclass_transform(kw_only_default=True, frozen_default=True)
 class OptionFlags:
@@ -86,8 +83,7 @@ class OptionFlags:
                 value = getattr(cls, name)
                 flag = own.pop(name, None) or hints[name]
                 if value is None and flag is hints[name]:  # the user may omit the flag, but cannot pass None
-                    (kind_of_flag,) = {*(typing.get_args(flag) if isinstance(flag, _UNIONS) else [flag])} - {type(None)}
-                    flag = Annotated[kind_of_flag | None, tyro.conf.DisallowNone]
+                    flag = Annotated[flag | None, tyro.conf.DisallowNone]
                 text = default[name] if isinstance(default, Mapping) else default or ""
                 help_text, hint = " ".join(docs.get(name, "").split()), text if value is None else None
                 flags[name] = Annotated[flag, tyro.conf.arg(help=help_text, help_behavior_hint=hint)]

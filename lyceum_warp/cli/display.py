@@ -15,7 +15,6 @@ from rich.table import Table
 
 from lyceum_warp import training
 from lyceum_warp.algos.learner import Iteration, Learner
-from lyceum_warp.controllers.control_report import ControlReport
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.runs.folder import Run
@@ -230,12 +229,3 @@ class PlanDisplay(Progress):
             f"{trajectory.steps} steps, {trajectory.wall_seconds:.3g} s, {factor:.2f}x real time", soft_wrap=True,
         )  # fmt: skip
         sys.stdout.flush()
-
-
-def report_table(report: ControlReport, *, success: bool = True) -> Table:
-    """Make the table of a controller's report."""
-    table = Table(box=rich.box.SIMPLE, show_header=False)
-    for row in report.rows():
-        if success or row[0] != "success":
-            table.add_row(*row)
-    return table

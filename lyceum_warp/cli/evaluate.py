@@ -1,6 +1,7 @@
 """Evaluate a run's policy: lyceum-warp eval."""
 
 import dataclasses
+import functools
 import signal
 from pathlib import Path
 from typing import Annotated, Any
@@ -116,8 +117,8 @@ class Eval:
             "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
             "length": episodes.lengths, **episodes.metrics,
         }  # fmt: skip
-        columns = {"": list(found)}
-        for heading, number in (("mean", torch.mean), ("std", _std), ("min", torch.min), ("max", torch.max)):
+        columns, deviation = {"": list(found)}, functools.partial(torch.std, correction=0)
+        for heading, number in (("mean", torch.mean), ("std", deviation), ("min", torch.min), ("max", torch.max)):
             columns[heading] = [f"{number(values).item():.6g}" for values in found.values()]
         which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
         where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
@@ -136,10 +137,6 @@ class Eval:
         if self.video:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
             say(f"video: {tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)}")
-
-
-def _std(values: torch.Tensor) -> torch.Tensor:
-    return values.std(correction=0)
 
 
 def _print_transfer(verdict: Transfer) -> None:

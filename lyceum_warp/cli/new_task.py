@@ -73,7 +73,7 @@ class New:
             raise ValueError(f"{path} exists: choose another name, or remove it")
         if not path.absolute().parent.is_dir():
             raise ValueError(f"there is no folder {path.parent} for the task file: create it first")
-        source, title, spec = _model(self.model, path)
+        source, spec = _model(self.model, path)
         try:
             model = compile_model(spec, ("sensordata",), PhysicsOptions())
             walker = Walker(spec, self.feet, self.joints) if self.template == "velocity" else None
@@ -84,9 +84,9 @@ class New:
         if model.nv == 0:
             raise ValueError(f"the model {self.model} has no joints, so its bodies cannot move: add joints")
         if walker is not None:
-            text = velocity_text(path.name, class_name, source, title, walker)
+            text = velocity_text(path.name, class_name, source, walker)
         else:
-            text = task_text(path.name, class_name, source, title, model)
+            text = task_text(path.name, class_name, source, model)
         try:
             with replaced(path) as temporary:
                 temporary.write_text(text, encoding="utf-8")
@@ -126,18 +126,13 @@ def _class_name(path: Path) -> str:
     return class_name
 
 
-def _model(text: str, path: Path) -> tuple[str, str, mujoco.MjSpec]:
-    """Return the Python expression for a model in a task file, a description of the model, and the model."""
+def _model(text: str, path: Path) -> tuple[str, mujoco.MjSpec]:
+    """Return the Python expression for a model in a task file, and the model."""
     where, _, file = text.partition(":")
     if where in _SOURCES:
-        return f"lw.{where}_model({literal(file)})", _title(file), _SOURCES[where](file).spec()
+        return f"lw.{where}_model({literal(file)})", _SOURCES[where](file).spec()
     model = Path(text).expanduser()
     if not model.is_file():
         raise FileNotFoundError(f"there is no model file {text!r}")
     given = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))
-    return literal(given.as_posix()), _title(model.name), read_spec(model)
-
-
-def _title(file: str) -> str:
-    plain = file.isprintable() and not set(file) & set('\\"') and len(file) <= 50
-    return f"the model {file}" if plain else "a model"
+    return literal(given.as_posix()), read_spec(model)

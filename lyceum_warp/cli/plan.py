@@ -29,7 +29,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import PlanDisplay, console, counted, report_table, say, tried
+from lyceum_warp.cli.display import PlanDisplay, console, counted, say, tried
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.control_report import ControlReport, control_report
 from lyceum_warp.controllers.loop import control
@@ -308,7 +308,9 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
             whole, rest = counted(len(done), "episode"), counted(sum(part.steps for part in aborted), "step")
             say(f"interrupted by {signal.Signals(error.number).name} after {whole} and {rest}; files in {run.folder}")
         raise
-    console.print(report_table(report, success=plant.task.functions["success"] is not None))
+    for label, text in report.rows():
+        if label != "success" or plant.task.functions["success"] is not None:
+            say(f"  {label:<30}{text}")
     paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
     if options.plot:
         paths["plot"] = tried(control_plot, done, run.folder / "plan.png")

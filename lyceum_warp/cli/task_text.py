@@ -1,6 +1,7 @@
 """Generate the text of a task file for a model, for lyceum-warp new."""
 
 import json
+import textwrap
 from collections.abc import Sequence
 
 import mujoco
@@ -12,11 +13,8 @@ _STEP = 0.02
 _EPISODE = 10.0
 """Duration of an episode, in seconds."""
 
-_NAMES = 8
-"""Maximum number of names that a comment lists for each kind of element."""
-
-_WIDTH = 118
-"""Width of a comment in characters, without the #."""
+_WIDTH = 116
+"""Width of a list of names in a comment, in characters."""
 
 _ELEMENTS = {
     "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
@@ -33,7 +31,7 @@ _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
 """Types of sensors that do not measure the robot's state, or that need custom code."""
 
 
-def task_text(file: str, class_name: str, source: str, title: str, model: mujoco.MjModel) -> str:
+def task_text(file: str, class_name: str, source: str, model: mujoco.MjModel) -> str:
     """Generate the text of a task file, in ruff's format.
 
     ``source`` is the model as a Python expression, such as ``"robot.xml"`` with its quotes.
@@ -46,7 +44,7 @@ def task_text(file: str, class_name: str, source: str, title: str, model: mujoco
     if "home" in _names(model, "keyframes"):
         settings.append('keyframe = "home"  # where episodes start')
     return _TEXT.format(
-        file=file, class_name=class_name, title=title, elements=_elements(model), fields=indented(fields),
+        file=file, class_name=class_name, elements=_elements(model), fields=indented(fields),
         put=indented(put), settings=indented(settings),
     )  # fmt: skip
 
@@ -104,7 +102,11 @@ def _elements(model: mujoco.MjModel) -> str:
     names["bodies"] = [name for name in names["bodies"] if name != "world"]
     mocap = {name for i, name in enumerate(_names(model, "bodies")) if model.body_mocapid[i] >= 0}
     names["mocap bodies"] = [name for name in names["bodies"] if name in mocap]
-    lines = [line for kind, found in names.items() for line in _listed(kind, found)]
+    lines = [
+        textwrap.shorten(f"{kind}: {', '.join(found)}", _WIDTH, placeholder=" ...")
+        for kind, found in names.items()
+        if found
+    ]
     if not lines:
         return ""
     element, field = ("site", "site_xpos") if names["sites"] else ("body", "xpos")
@@ -114,7 +116,7 @@ def _elements(model: mujoco.MjModel) -> str:
         "Names in the model. A default in Params turns one into an index, as in",
         f"    {example}",
         f"with {field} in World, s.{field}[p.tip] is then a position; lw.joint, lw.sensor, ... find other kinds",
-        *lines,
+        *(f"  {line}" for line in lines),
     ]
     return "".join(f"# {line}\n" for line in comment) + "\n\n"
 
@@ -122,15 +124,6 @@ def _elements(model: mujoco.MjModel) -> str:
 def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     objtype, count = _ELEMENTS[kind]
     return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
-
-
-def _listed(kind: str, names: list[str]) -> list[str]:
-    for shown in range(min(len(names), _NAMES), 0, -1):
-        rest = f", ... ({len(names)} in all)" if shown < len(names) else ""
-        line = f"  {kind}: {', '.join(names[:shown])}{rest}"
-        if len(line) <= _WIDTH:
-            return [line]
-    return []
 
 
 def indented(lines: Sequence[str], indent: int = 4) -> str:
@@ -143,7 +136,7 @@ def literal(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-_TEXT = '''"""{class_name}: {title}, with a reward that is still to be written.
+_TEXT = '''"""{class_name}: a task whose reward is still to be written.
 
 ``lyceum-warp check {file}`` checks this task, and ``lyceum-warp train {file}`` trains it.
 ``help(lw.Task)`` describes every function of a task.

@@ -155,7 +155,7 @@ class Walker:
         return np.any(moment, axis=0)[m.jnt_dofadr]
 
 
-def velocity_text(file: str, class_name: str, source: str, title: str, walker: Walker) -> str:
+def velocity_text(file: str, class_name: str, source: str, walker: Walker) -> str:
     """Generate the text of a robot's task file, as ``task_text`` does."""
     biped = len(walker.feet) == 2
     model, new = walker.model, [foot for foot in walker.feet if foot.element]
@@ -187,7 +187,7 @@ def velocity_text(file: str, class_name: str, source: str, title: str, walker: W
         sites = [f"    {literal(foot.name)}: ({literal(foot.element)}, {foot.position})," for foot in new]
         head += ["NEW_SITES = {  # a body, or a joint or geom in it, and a position there", *sites, "}"]
     return _TEXT.format(
-        file=file, class_name=class_name, title=title, training=TRAINING, kind="Biped" if biped else "Velocity",
+        file=file, class_name=class_name, training=TRAINING, kind="Biped" if biped else "Velocity",
         params_class="BipedParams" if biped else "Params", feet="\n".join(head),
         joints="\n".join(_wrapped("JOINTS = [", [literal(name) for name in walker.joints], "]", 0)),
         params=indented(params), settings=indented(settings), edits=indented(edits, 8),
@@ -202,7 +202,7 @@ def _wrapped(start: str, parts: Sequence[str], end: str, indent: int = 4) -> lis
     return [start, *(f"    {text}" for text in body), f"{end}  # fmt: skip"]
 
 
-_TEXT = '''"""{class_name}: {title} walks at a commanded velocity.
+_TEXT = '''"""{class_name}: a robot walks at a commanded velocity.
 
 ``lyceum-warp check {file}`` checks this task. This trains it; docs/velocity.md has settings for a CPU:
 

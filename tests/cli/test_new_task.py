@@ -1,6 +1,5 @@
 import importlib.util
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -37,14 +36,9 @@ QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_m
 
 
 @pytest.fixture
-def folder(pytestconfig: pytest.Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Change to an empty directory at a constant path, so that Warp reuses compiled kernels."""
-    cache = getattr(pytestconfig, "cache", None)
-    folder = Path(cache.mkdir("new")) if cache else tmp_path / "new"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
 def new(name: str, xml: str) -> Path:
@@ -55,7 +49,7 @@ def new(name: str, xml: str) -> Path:
 
 @pytest.mark.quick("warp")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_new_task_passes_check_task_on_both_engines(engine: str, folder: Path) -> None:
+def test_new_task_passes_check_task(engine: str, folder: Path) -> None:
     file = new("everything", RICH)
     check_task(str(file), engine=engine, nworld=2, horizon=6, frame_skip=1, checks=MODEL_CHECKS)
 
@@ -84,14 +78,6 @@ def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, fold
     assert found.pop("sensors", 0) <= task.model.nsensordata
     assert all(sizes[part] == size for part, size in found.items())
     assert task.timestep == pytest.approx(0.02)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_new_task_for_any_model_passes_check_task(model: str, engine: str, folder: Path) -> None:
-    file = new("walk", model)
-    check_task(str(file), engine=engine, nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
 
 
 def package_models() -> list[Path]:
@@ -134,7 +120,7 @@ def test_new_files_are_formatted(folder: Path) -> None:
     for name, xml in (("everything", RICH), ("crowd", text(ARM + many))):
         new(name, xml)
     assert "  sites: here, aaaaaaaaaaaaaaa, bbb" in Path("crowd.py").read_text()
-    assert "... (29 in all)" in Path("crowd.py").read_text()
+    assert ", ...\n" in Path("crowd.py").read_text()
     settings = ["--isolated", "--line-length", "120", "--target-version", "py311"]
     for command in (["format", "--check", *settings], ["check", "--select", "E,W,F,UP,B,SIM", *settings]):
         done = subprocess.run([sys.executable, "-m", "ruff", *command, "."], capture_output=True, text=True)
@@ -184,7 +170,6 @@ def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
     [
         ("hopper", ["'hopper' is taken by a task of the package"]),
         ("2walk", ["can't be named '2walk'", "letters, digits and _"]),
-        ("my-walk", ["can't be named 'my-walk'"]),
         ("class", ["can't be named 'class'"]),
         ("true", ["can't be named 'true'"]),
         ("größe", ["can't be named 'größe'"]),
@@ -192,7 +177,6 @@ def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
         ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),
         ("world", ["can't be named 'world'", "defines World"]),
         ("torch", ["can't be named 'torch'", "hide the Python module"]),
-        ("random", ["can't be named 'random'", "hide the Python module"]),
         ("", ["can't be named '.py'"]),
         ("old", ["old.py exists"]),
         ("nowhere/walk", ["no folder nowhere"]),
