@@ -98,7 +98,3 @@ class Terms(lw.Task):
     terminations = ("outside", "too_fast")
     metrics = ("distance", "too_fast_before")
     horizon = 50
-
-
-class Ordered(Terms):
-    rewards = Terms.rewards | {"near": 3.0}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import tiny_task
 import torch
-from terms_task import Ordered, Terms
+from terms_task import Terms
 
 import lyceum_warp as lw
 from lyceum_warp.testing import CHECKS, check_task
@@ -69,12 +69,6 @@ def test_weights_are_set_like_parameters_and_may_differ_between_worlds(engine: s
     assert torch.equal(env.get_reward(start, action, after), plain)
     with pytest.raises(ValueError, match="the task 'terms' has no parameter 'neer': did you mean near"):
         env.set_params(neer=2.0)
-
-
-def test_variant_with_other_weights_shares_the_kernels() -> None:
-    plain, other = lw.make(Terms), lw.make(Ordered)
-    assert plain.task.kernels is other.task.kernels
-    assert (plain.task.params["near"], other.task.params["near"]) == (1.0, 3.0)
 
 
 def test_printed_reward_formula_calls_each_function_once() -> None:

@@ -47,21 +47,9 @@ def test_variant_passes_check_task(engine: str) -> None:
     check_task(Variant, engine=engine, steps=30, checks=quick)
 
 
-PARENT = """
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-@wp.struct
-class World:
-    qpos: Row[float]
-
-@wp.struct
-class Params:
-    dt: float
-    place: int = 0
-
-@wp.func
+PARENT = tiny_task.changed(
+    ("    dt: float", "    dt: float\n    place: int = 0"),
+    ("@wp.func", """@wp.func
 def scaled(x: float, s: World) -> float:
     return x
 
@@ -69,14 +57,10 @@ def scaled(x: float, s: World) -> float:
 def joint(s: World, p: Params) -> float:
     return scaled(s.qpos[p.place], s)
 
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = joint(s, p)
-
-class Parent(lw.Task):
-    model = "hopper.xml"
-    obs = {"x": 1}
-"""
+@wp.func"""),
+    ("obs[0] = s.qpos[0]", "obs[0] = joint(s, p)"),
+    ("class Tiny", "class Parent"),
+)  # fmt: skip
 
 CHILD = """
 import warp as wp

@@ -250,11 +250,6 @@ def writes_derived(s: World, p: Params):
 
 
 @wp.func
-def replaces_a_row(s: World, p: Params):
-    s.qpos = s.qvel
-
-
-@wp.func
 def table_row(s: World, p: Params):
     row = p.table[1]
     row[0] = 1.0
@@ -285,7 +280,6 @@ REFUSED = {
         r"initialize of the task 'mine' writes s\.xpos \(.*\): initialize may write qpos, qvel, mocap_pos, memory, and "
         "no function may write xpos",
     ),
-    "a whole row": ("initialize", replaces_a_row, r"writes s\.qpos \(.*\): write its elements, as s\.qpos\[0\] = "),
     "a table": ("initialize", table_row, r"writes p\.table \(.*\): parameters are changed with env\.set_params"),
     "a native function": (
         "observe", to_native,

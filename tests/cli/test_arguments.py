@@ -1,16 +1,12 @@
 import dataclasses
-from typing import Annotated
 
 import pytest
-import tyro
 
 from lyceum_warp.cli.arguments import (
     NO_FLAGS,
     EnvFlags,
-    OptionFlags,
     Physics,
     Placement,
-    Repeated,
     given,
     parameter,
     parameters,
@@ -41,29 +37,6 @@ def test_parameter_values_are_parsed_by_their_type(text: str, value: object) -> 
 def test_malformed_parameter_raises_an_error(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parameter(text)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Options:
-    size: int = 3
-    name: str | None = None
-    fast: bool = False
-    safe: bool = True
-    limits: tuple[float, ...] = (1.0,)
-
-
-class Flags(OptionFlags, options=[Options], default="(default: the best)"):
-    limits: Annotated[Repeated, tyro.conf.arg(metavar="NUMBER")] = ()
-    extra: int = 4
-
-
-def test_flags_are_the_fields_of_the_options_and_default_to_none() -> None:
-    assert [field.name for field in dataclasses.fields(Flags)] == ["size", "name", "fast", "safe", "limits", "extra"]
-    unset = {"size": None, "name": None, "fast": None, "safe": None, "limits": (), "extra": 4}
-    assert vars(tyro.cli(Flags, args=[])) == unset and given(Flags()) == {}
-    argv = ["--size", "5", "--name", "a", "--fast", "--no-safe", "--limits", "1", "--limits", "2"]
-    found = tyro.cli(Flags, args=argv)
-    assert given(found) == {"size": 5, "name": "a", "fast": True, "safe": False, "limits": ("1", "2")}
 
 
 def test_every_physics_option_has_a_flag() -> None:

@@ -6,13 +6,6 @@ from lyceum_warp.cli import main
 
 
 @pytest.mark.long
-def test_bench_lists_the_experiments(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench"]) == 0
-    out = capfd.readouterr().out
-    assert "--short" in out and "lyceum-warp bench plot" in out
-
-
-@pytest.mark.long
 def test_bench_forwards_options_and_returns_the_exit_code_of_the_program(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "plot", "no_experiment"]) == 2
     assert capfd.readouterr().err.startswith("plot: there is no experiment 'no_experiment': ")

@@ -1,5 +1,4 @@
 import dataclasses
-import inspect
 import json
 import re
 import signal
@@ -9,8 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import tiny_task
 import torch
-from conftest import TaskFile
 from rich.console import Console
 from training_runs import QUIET, TINY, interrupted, refused
 
@@ -233,16 +232,6 @@ def test_option_out_of_range_prints_one_line_and_makes_no_folder(
     assert not (tmp_path / "run").exists()
 
 
-def test_output_folder_that_is_not_empty_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "thesis.tex").write_text("")
-    assert plan(tmp_path / "run") == 2
-    refused(capsys, "run")
-    (tmp_path / "run" / "config.json").write_text("{}")
-    assert plan(tmp_path / "run") == 2
-    assert "--resume" not in (error := capsys.readouterr().err) and "contains a run: use another folder" in error
-
-
 def test_complete_episodes_are_saved_after_an_interrupt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -263,9 +252,8 @@ def test_complete_episodes_are_saved_after_an_interrupt(
     assert json.loads((out / "report.json").read_text())["episodes"] == 2
 
 
-@pytest.mark.parametrize("mode", [[], ["--real-time"]])
-def test_interrupted_episode_is_saved(
-    mode: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_interrupted_episode_in_real_time_is_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def third(display: PlanDisplay, now: lw.ControlProgress) -> None:
         if now.step == 3:
@@ -273,24 +261,12 @@ def test_interrupted_episode_is_saved(
 
     monkeypatch.setattr(PlanDisplay, "__call__", third)
     out = tmp_path / "run"
-    options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, *mode]
+    options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, "--real-time"]
     assert interrupted(["plan", "point_mass", "--out", str(out), *options]) == 130
-    path = out / "episode-000.npz"
     assert "interrupted by SIGINT after 0 episodes and 3 steps; files in" in capsys.readouterr().out
-    part = Trajectory.load(path)
+    part = Trajectory.load(out / "episode-000.npz")
     assert part.steps == 3 and part.done_reason == 0 and len(part.states) == 4
     assert not (out / "report.json").exists()
-
-
-def test_planner_settings_default_to_those_of_the_task(tmp_path: Path) -> None:
-    argv = ["plan", "reach", "--out", str(tmp_path / "run"), *QUIET, "--steps", "1", "--samples", "7", "--fill", "-0.5"]
-    assert (
-        cli.main([*argv, "--noise", "0.3", "0.4", "0.5", "0.6", "0.7", "0.8", "0.9", "--smoothing", "1", "0", "0"]) == 0
-    )
-    settings = json.loads((tmp_path / "run" / "config.json").read_text())["planner"]
-    assert (settings["samples"], settings["horizon"], settings["temperature"]) == (7, 16, 0.2)
-    assert settings["fill"] == -0.5
-    assert settings["noise"] == [0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9] and settings["smoothing"] == [1, 0, 0]
 
 
 def test_every_planner_setting_has_a_flag() -> None:
@@ -301,13 +277,8 @@ def test_every_planner_setting_has_a_flag() -> None:
     assert given.on_top_of(lw.MPPIConfig(samples=3)) == lw.MPPIConfig(samples=3, noise=0.25, fill=[0.5, 1], horizon=4)
 
 
-def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(
-    task_file: TaskFile, tmp_path: Path
-) -> None:
-    origin = Path(inspect.getfile(find_task("point_mass")))
-    source = origin.read_text().replace('"point_mass.xml"', repr(str(origin.with_name("point_mass.xml"))))
-    source = source.replace("@lw.register\n", "").replace("success_distance", "temperature")
-    file = task_file("warm_mass.py", source)
+def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(tmp_path: Path) -> None:
+    file = tiny_task.write(tmp_path, tiny_task.changed(("dt: float", "dt: float\n    temperature: float = 1.0")))
     options = ["--param", "temperature=0.5", "--temperature", "0.25", "--planner-param", "temperature=0.75"]
     assert plan(tmp_path / "run", *QUIET, "--steps", "1", *options, task=str(file)) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())

@@ -1,3 +1,4 @@
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -107,19 +108,14 @@ def test_invalid_view_arguments_print_one_line(
     assert not opened.scenes
 
 
-def test_ctrl_c_closes_the_window(opened: Opened, monkeypatch: pytest.MonkeyPatch) -> None:
-    import signal
-
+def test_ctrl_c_closes_the_window(monkeypatch: pytest.MonkeyPatch) -> None:
     closed = []
 
     def after(frame: Frame, number: int) -> list[Any]:
         signal.raise_signal(signal.SIGINT)
         return []
 
-    class Interrupting(MemoryWindow):
-        def close(self) -> None:
-            closed.append(True)
-
-    monkeypatch.setattr(views, "opened", lambda *words, **options: Interrupting(after))
+    monkeypatch.setattr(MemoryWindow, "close", lambda window: closed.append(True))
+    monkeypatch.setattr(views, "opened", lambda *words, **options: MemoryWindow(after))
     assert interrupted(["view", "point_mass"]) == 130
     assert closed == [True]

@@ -18,6 +18,7 @@ import guarded
 import torch
 from file_attacks import content
 from guarded import ProblemError
+from minimal_cases import COMMANDS
 from mutations import NUMBERS, TEXTS
 
 import lyceum_warp.cli.view
@@ -111,15 +112,11 @@ def words(command: str, random: Random) -> list[str]:
     return line
 
 
-def attack(case: str) -> str:
-    from minimal_cases import COMMANDS
-
-    if case in COMMANDS:
-        return run(COMMANDS[case].split())
-    return run(words(case.rsplit(" ", 1)[0], Random(case)))
+def attack(case: str) -> None:
+    run(COMMANDS[case].split() if case in COMMANDS else words(case.rpartition(" ")[0], Random(case)))
 
 
-def run(line: list[str]) -> str:
+def run(line: list[str]) -> None:
     os.chdir(HERE.parent)
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()
@@ -138,9 +135,7 @@ def run(line: list[str]) -> str:
             raise
         except BaseException as error:
             raise ProblemError(_spelled(line), error) from error
-    if code in (130, 143):
-        return "interrupted"
-    if code not in (0, 1, 2):
+    if code not in (0, 1, 2, 130, 143):  # the last two are interruptions
         raise ProblemError(f"{_spelled(line)} ended with {code}")
     if code == 2:
         lines = err.getvalue().splitlines()
@@ -150,7 +145,6 @@ def run(line: list[str]) -> str:
         if (after := content(Path())) != before:
             changed = [name for name in after | before if before.get(name) != after.get(name)]
             raise ProblemError(f"{_spelled(line)}: ended with 2, but changed {', '.join(changed)}: {lines[-1:]}")
-    return ("worked", "worked", "refused")[code]
 
 
 def _spelled(line: list[str]) -> str:

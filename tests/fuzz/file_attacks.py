@@ -18,8 +18,11 @@ from random import Random
 import guarded
 import mutations
 import numpy as np
+import tiny_task
 import torch
+from arbitrary_models import ARM, MOTOR, text
 from guarded import ProblemError
+from minimal_cases import FILES
 
 import lyceum_warp as lw
 import lyceum_warp.cli.view
@@ -32,47 +35,17 @@ REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
 """The documented errors for invalid files and arguments."""
 BASE, CASE, CANARY = Path("base").absolute(), Path("case").absolute(), Path("canary").absolute()
 
-TASK = """
-import warp as wp
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-@wp.struct
-class World:
-    qpos: Row[float]
-    time: float
-
-@wp.struct
-class Params:
-    dt: float
-    motion: wp.array2d[float] = [[0.0, 1.0]]
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
-    obs[1] = p.motion[0, 1]
-
-class Slide(lw.Task):
-    model = "slide.xml"
-    obs = {"x": 1, "reference": 1}
-    horizon = 8
-"""
-SLIDE = """<mujoco model="slide">
-  <option timestep="0.01" integrator="Euler"/>
-  <default><geom density="500"/><default class="ball"><geom size="0.1" rgba="1 0 0 1"/></default></default>
-  <worldbody>
-    <geom name="floor" type="plane" size="1 1 .1"/>
-    <body name="ball" pos="0 0 1">
-      <joint name="slide" type="slide" axis="1 0 0" range="-1 1" limited="true"/>
-      <geom name="ball" class="ball" type="sphere"/>
-      <site name="tip" pos="0 0 .1"/>
-    </body>
-  </worldbody>
-  <actuator><motor name="push" joint="slide" gear="2" ctrlrange="-1 1" ctrllimited="true"/></actuator>
-  <sensor><framepos objtype="site" objname="tip"/></sensor>
-  <keyframe><key name="home" qpos="0.1"/></keyframe>
-</mujoco>
-"""
+TASK = tiny_task.changed(
+    ("    dt: float", "    dt: float\n    motion: wp.array2d[float] = [[0.0, 1.0]]"),
+    ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    obs[1] = p.motion[0, 1]"),
+    ("hopper.xml", "slide.xml"),
+    ('obs = {"x": 1}', 'obs = {"x": 1, "reference": 1}\n    horizon = 8'),
+)
+SLIDE = text(
+    ARM,
+    f'<default><geom density="500"/><default class="ball"><geom rgba="1 0 0 1"/></default></default>{MOTOR}'
+    '<sensor><framepos objtype="site" objname="tip"/></sensor><keyframe><key name="home" qpos=".1 .2"/></keyframe>',
+)
 SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --mean-episodes 2 --no-video --no-plot"
 
 
@@ -168,18 +141,18 @@ def command(*words: object) -> None:
         raise ProblemError(f"{words[0]} ended with {code}: {err.getvalue()[-300:]}")
 
 
-def attack(case: str) -> str:
-    from minimal_cases import FILES
-
+def attack(case: str) -> None:
     if case in FILES:
-        return read(*FILES[case])
+        read(*FILES[case])
+        return
     name = case.rpartition(" ")[0]
     random = Random(case)
     kind = KINDS[name]
-    return read(name, random.choice(kind.readers), lambda data: kind.mutate(data, random))
+    read(name, random.choice(kind.readers), lambda data: kind.mutate(data, random))
 
 
-def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
+def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> bool:
+    """Change a file, and read it. Return False if the reader refuses the file."""
     kind = KINDS[name]
     shutil.rmtree(CASE, ignore_errors=True)
     shutil.copytree(BASE, CASE)
@@ -188,7 +161,7 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
     if reader in WITHOUT:
         (CASE / WITHOUT[reader]).unlink()
     before = content(CASE)
-    did, error = "worked", None
+    error: BaseException | None = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -196,7 +169,7 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
         except ProblemError as problem:
             raise ProblemError(f"{name}, {reader}: {problem}") from problem
         except (*REFUSALS, RefusedError) as refused:
-            did, error = "refused", refused
+            error = refused
         except KeyboardInterrupt:
             raise
         except BaseException as failure:
@@ -206,7 +179,7 @@ def read(name: str, reader: str, change: Callable[[bytes], bytes]) -> str:
         raise ProblemError(f"{name}, {reader}: code in the file was executed")
     if error is not None:
         _check_refusal(f"{name}, {reader}", kind, error, before)
-    return did
+    return error is None
 
 
 def _check_refusal(where: str, kind: Kind, error: BaseException, before: Mapping[str, bytes]) -> None:
@@ -235,7 +208,7 @@ def warm_up() -> None:
         _make(making)
         making.rename(BASE)
     for reader, name in {reader: name for name, kind in KINDS.items() for reader in kind.readers}.items():
-        assert read(name, reader, lambda data: data) == "worked", f"{reader} fails without damage"
+        assert read(name, reader, lambda data: data), f"{reader} fails without damage"
 
 
 def _make(folder: Path) -> None:

@@ -25,21 +25,20 @@ PATIENCE = 3.0
 """Seconds after which a running case receives a SIGINT."""
 LIMIT = 60.0
 """Seconds after which a case that ignores SIGINT is killed."""
-ROOT = Path(__file__).parents[2]
+FOLDER = Path(__file__).parent
+PATHS = f"{FOLDER.parents[1]}{os.pathsep}{FOLDER.parent}"
 
 
 @dataclasses.dataclass
 class Outcome:
-    """The result of a case: "refused", "worked", "interrupted", or one line that describes a problem."""
-
     case: str
-    did: str
     problem: str = ""
+    """One line. Empty if the case worked, was refused by a documented error, or was interrupted."""
     trace: str = ""
 
 
-Attack = Callable[[str], str]
-"""A function that runs a case. It returns the outcome or raises ProblemError."""
+Attack = Callable[[str], object]
+"""A function that runs a case. It raises ProblemError if the case breaks a rule."""
 
 
 class ProblemError(Exception):
@@ -95,14 +94,15 @@ def _guarded(attack: Attack, case: str) -> Outcome:
     before = signal.signal(signal.SIGALRM, lambda *_: os.kill(os.getpid(), signal.SIGINT))
     try:
         signal.setitimer(signal.ITIMER_REAL, PATIENCE, PATIENCE)
-        return Outcome(case, attack(case))
+        attack(case)
+        return Outcome(case)
     except ProblemError as problem:
         text = "" if problem.error is None else "".join(traceback.format_exception(problem.error))
-        return Outcome(case, "broke a rule", str(problem), text[-4000:])
+        return Outcome(case, str(problem), text[-4000:])
     except KeyboardInterrupt:
-        return Outcome(case, "interrupted")
+        return Outcome(case)
     except BaseException as error:
-        return Outcome(case, "failed", f"the attack failed: {place(error)}", traceback.format_exc()[-4000:])
+        return Outcome(case, f"the attack failed: {place(error)}", traceback.format_exc()[-4000:])
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
@@ -112,10 +112,10 @@ def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outco
     """Run cases in a subprocess that restarts after each crash."""
     outcomes: dict[str, Outcome] = {}
     results = folder / "results.txt"
-    environment = os.environ | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": str(ROOT), "COLUMNS": "120"}
+    environment = os.environ | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": PATHS, "COLUMNS": "120"}
     while left := [case for case in cases if case not in outcomes]:
         results.write_text("")
-        command = [sys.executable, str(Path(__file__).parent / program), "--results", str(results), *left]
+        command = [sys.executable, str(FOLDER / program), "--results", str(results), *left]
         with (folder / "output.txt").open("wb") as output:
             code = subprocess.run(
                 command, cwd=folder, env=environment, stdout=output, stderr=subprocess.STDOUT, check=False
@@ -128,9 +128,9 @@ def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outco
         assert lines, f"{program} did not begin: {code}\n{end}"
         if "begin" in lines[-1]:
             case = lines[-1]["begin"]
-            outcomes[case] = Outcome(case, "died", f"the process ended with code {code}", end)
+            outcomes[case] = Outcome(case, f"the process ended with code {code}", end)
     return outcomes
 
 
 def replay(program: str, case: str) -> str:
-    return f"in an empty folder: PYTHONPATH={ROOT} {sys.executable} {Path(__file__).parent / program} {case!r}"
+    return f"in an empty folder: PYTHONPATH={PATHS} {sys.executable} {FOLDER / program} {case!r}"

@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from file_attacks import REFUSALS
 from guarded import ProblemError
+from minimal_cases import KEYWORDS
 from mutations import VALUES
 
 import lyceum_warp as lw
@@ -98,26 +99,25 @@ CALLS = {
 }
 
 
-def attack(case: str) -> str:
-    from minimal_cases import KEYWORDS
-
+def attack(case: str) -> None:
     if case in KEYWORDS:
-        return call(*KEYWORDS[case])
+        call(*KEYWORDS[case])
+        return
     name = case.rpartition(" ")[0]
     random = Random(case)
     names = CALLS[name].names
     words = random.sample(names, min(len(names), random.choice((1, 1, 1, 2))))
-    return call(name, {word: random.choice(OBJECTS) for word in words})
+    call(name, {word: random.choice(OBJECTS) for word in words})
 
 
-def call(name: str, words: dict[str, Any]) -> str:
+def call(name: str, words: dict[str, Any]) -> None:
     shutil.rmtree(HERE / "run", ignore_errors=True)
     shown = f"{name}({', '.join(f'{word}={_shown(value)}' for word, value in words.items())})"
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
             CALLS[name].function(**CALLS[name].valid() | words)
-            return "worked"
+            return
         except KeyboardInterrupt:
             raise
         except (*REFUSALS, TypeError) as error:
@@ -133,7 +133,6 @@ def call(name: str, words: dict[str, Any]) -> str:
         named.append("there is no run in run")
     if not any(part in text for part in (*named, *(str(v) for v in words.values() if len(str(v)) > 3))):
         raise ProblemError(f"{shown}: the message has neither the argument's name nor its value", refusal)
-    return "refused"
 
 
 def _shown(value: Any) -> str:

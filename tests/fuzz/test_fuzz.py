@@ -4,8 +4,7 @@ A damaged input must either work or cause a documented error. A failure prints t
 """
 
 import functools
-import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection
 from typing import Any
 
 import command_attacks
@@ -15,57 +14,38 @@ import pytest
 from guarded import Outcome, attacks, replay
 from minimal_cases import COMMANDS, FILES, KEYWORDS
 
-KINDS: dict[str, Iterable[str]] = {
-    "file_attacks.py": file_attacks.KINDS, "keyword_attacks.py": keyword_attacks.CALLS,
-    "command_attacks.py": command_attacks.SMALL,
-}  # fmt: skip
-"""The kinds of random cases of each attack program."""
-COUNTS = {"file_attacks.py": 150, "keyword_attacks.py": 200, "command_attacks.py": 50}
-"""How many cases of each kind a program runs."""
-MINIMAL: dict[str, Mapping[str, Any]] = {
-    "file_attacks.py": FILES, "keyword_attacks.py": KEYWORDS, "command_attacks.py": COMMANDS,
-}  # fmt: skip
-
-
-def each(names: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
-    return [(program, name) for program in names for name in names[program]]
+PROGRAMS: dict[str, tuple[Collection[str], int, Collection[str]]] = {
+    "file_attacks.py": (file_attacks.KINDS, 150, FILES),
+    "keyword_attacks.py": (keyword_attacks.CALLS, 200, KEYWORDS),
+    "command_attacks.py": (command_attacks.SMALL, 50, COMMANDS),
+}
+"""The kinds of random cases of each attack program, how many cases of each kind it runs, and its minimal cases."""
 
 
 @pytest.fixture(scope="module")
-def outcomes(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Return ``outcomes(program, random)``, which runs random cases or all minimal cases.
-
-    The cases run in a folder at a constant path.
-    """
-    cache = getattr(pytestconfig, "cache", None)
-    parent = cache.mkdir("fuzz") if cache else tmp_path_factory.mktemp("fuzz")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Return ``outcomes(program, random)``, which runs all random cases or all minimal cases of a program."""
 
     @functools.cache
     def run(program: str, random: bool) -> dict[str, Outcome]:
-        folder = parent / program.removesuffix(".py")
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        cases = [f"{kind} {seed}" for kind in KINDS[program] for seed in range(COUNTS[program])]
-        return attacks(program, cases if random else [*MINIMAL[program]], folder)
+        kinds, count, minimal = PROGRAMS[program]
+        cases = [f"{kind} {seed}" for kind in kinds for seed in range(count)]
+        return attacks(program, cases if random else [*minimal], tmp_path_factory.mktemp("fuzz"))
 
     return run
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("program", "kind"), each(KINDS))
+@pytest.mark.parametrize(("program", "kind"), [(name, kind) for name in PROGRAMS for kind in PROGRAMS[name][0]])
 def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str, kind: str) -> None:
     found = {case: o for case, o in outcomes(program, True).items() if case.rpartition(" ")[0] == kind}
-    assert len(found) == COUNTS[program]
-    bad = [
-        f"{outcome.problem}\n    {replay(program, case)}\n{outcome.trace}"
-        for case, outcome in found.items()
-        if outcome.problem
-    ]
+    assert len(found) == PROGRAMS[program][1]
+    bad = [f"{o.problem}\n    {replay(program, case)}\n{o.trace}" for case, o in found.items() if o.problem]
     assert not bad, "\n".join([f"{len(bad)} of {len(found)} cases", *bad])
 
 
 @pytest.mark.quick("file_attacks.py", "keyword_attacks.py")
-@pytest.mark.parametrize(("program", "name"), each(MINIMAL))
+@pytest.mark.parametrize(("program", "name"), [(name, case) for name in PROGRAMS for case in PROGRAMS[name][2]])
 def test_minimal_case_raises_a_documented_error(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]
     assert not outcome.problem, f"{outcome.problem}\n    {replay(program, name)}\n{outcome.trace}"

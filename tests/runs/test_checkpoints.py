@@ -1,5 +1,4 @@
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -28,26 +27,18 @@ class Mine(torch.nn.Module):
         return self.gain * obs
 
 
-class Foreign:
-    """A class whose instances a checkpoint must not contain."""
-
-
-@pytest.mark.parametrize("kind", ["empty", "truncated", "text", "foreign", "code", "list", "newer", "partial", "shape"])
+@pytest.mark.parametrize("kind", ["truncated", "foreign", "code", "list", "newer", "partial", "shape"])
 def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: str) -> None:
     path, whole = run.policy, run.policy.read_bytes()
     content = read_checkpoint(path, parts=("iteration", "policy"))
     fix = "restore the file from a copy, or train again into another folder"
     match kind:
-        case "empty":
-            path.write_bytes(b"")
         case "truncated":
             path.write_bytes(whole[: len(whole) // 2])
-        case "text":
-            path.write_text("weights: 1, 2, 3\n")
         case "foreign":
             torch.save({"model": torch.zeros(2)}, path)
         case "code":
-            torch.save({"lyceum_warp": FORMAT, "policy": Foreign()}, path)
+            torch.save({"lyceum_warp": FORMAT, "policy": path}, path)
         case "list":
             torch.save([1, 2], path)
         case "newer":
@@ -65,17 +56,6 @@ def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: 
     assert "\n" not in str(caught.value)
 
 
-def read_or_refused(path: Path, data: bytes, bit: int) -> dict[str, Any] | None:
-    damaged = bytearray(data)
-    damaged[bit // 8] ^= 1 << bit % 8
-    path.write_bytes(damaged)
-    try:
-        return read_checkpoint(path)
-    except ValueError as error:
-        assert str(path) in str(error)
-        return None
-
-
 @pytest.mark.quick("61")
 @pytest.mark.parametrize("every", [61, 7])
 def test_flipped_bit_in_a_checkpoint_raises_an_error_or_changes_nothing(run: Run, every: int) -> None:
@@ -83,17 +63,17 @@ def test_flipped_bit_in_a_checkpoint_raises_an_error_or_changes_nothing(run: Run
     saved = read_checkpoint(run.checkpoint)
     weights = saved["policy"].pop("state")
     for bit in range(0, 8 * len(data), every):
-        if (content := read_or_refused(run.checkpoint, data, bit)) is not None:
-            state = content["policy"].pop("state")
-            assert content == saved and state.keys() == weights.keys()
-            assert all(torch.equal(state[name], tensor) for name, tensor in weights.items())
-
-
-def test_missing_checkpoint_raises_an_error_that_names_it(run: Run) -> None:
-    run.policy.unlink()
-    run.checkpoint.unlink()
-    with pytest.raises(FileNotFoundError, match=r"there is no checkpoint .*checkpoint\.pt: train the run first"):
-        load(run)
+        damaged = bytearray(data)
+        damaged[bit // 8] ^= 1 << bit % 8
+        run.checkpoint.write_bytes(damaged)
+        try:
+            content = read_checkpoint(run.checkpoint)
+        except ValueError as error:
+            assert str(run.checkpoint) in str(error)
+            continue
+        state = content["policy"].pop("state")
+        assert content == saved and state.keys() == weights.keys()
+        assert all(torch.equal(state[name], tensor) for name, tensor in weights.items())
 
 
 def test_policy_of_a_custom_class_is_loaded_into_a_given_policy(tmp_path: Path) -> None:

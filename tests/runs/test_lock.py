@@ -65,11 +65,6 @@ def test_run_of_another_process_is_resumed_only_with_take_over(
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
 
 
-def test_take_over_flag_without_resume_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "point_mass", "--take-over", "--out", str(tmp_path / "run")]) == 2
-    refused(capsys, "--take-over has no effect without --resume")
-
-
 def test_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
     with locked(tmp_path):
         pass

@@ -3,24 +3,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from training_runs import QUIET
 
 import lyceum_warp as lw
 from lyceum_warp.cli import main
 from lyceum_warp.runs.folder import Run
 
 DATA = Path(__file__).parent.parent / "data"
-OLD = DATA / "old_run"
-QUIET = ["--no-video", "--no-plot"]
-
-
-@pytest.fixture
-def old_run(tmp_path: Path) -> Path:
-    return Path(shutil.copytree(OLD, tmp_path / "run"))
 
 
 @pytest.mark.parametrize("gamma", [0.9, 0.995])
-def test_value_function_of_an_old_run_gets_the_old_scale(gamma: float, old_run: Path) -> None:
+def test_value_function_of_an_old_run_gets_the_old_scale(gamma: float, tmp_path: Path) -> None:
     """The old run lacks the scale, which was 1 / (1 - gamma)."""
+    old_run = Path(shutil.copytree(DATA / "old_run", tmp_path / "run"))
     content = torch.load(old_run / "checkpoint.pt", weights_only=True)
     content["value"]["shape"] |= {"scale": 1.0 / (1.0 - gamma), "discount": gamma}
     torch.save(content, old_run / "checkpoint.pt")

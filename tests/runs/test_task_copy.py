@@ -21,14 +21,10 @@ SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, m
 
 
 @pytest.fixture
-def folder(pytestconfig: pytest.Config, tmp_path: Path) -> Path:
-    """Return a folder at a constant path, so that Warp reuses compiled kernels."""
-    cache = getattr(pytestconfig, "cache", None)
-    folder = Path(cache.mkdir("kept_task")) if cache else tmp_path
-    shutil.rmtree(folder)
-    shutil.copytree(TASK, folder / "mine", ignore=shutil.ignore_patterns("tables", "__pycache__"))
-    np.save(folder / "mine" / "goal.npy", np.array([0.3, 0.4]))
-    return folder
+def folder(tmp_path: Path) -> Path:
+    shutil.copytree(TASK, tmp_path / "mine", ignore=shutil.ignore_patterns("tables", "__pycache__"))
+    np.save(tmp_path / "mine" / "goal.npy", np.array([0.3, 0.4]))
+    return tmp_path
 
 
 def trained(folder: Path) -> Path:
@@ -60,17 +56,14 @@ def test_run_resumes_after_its_task_was_moved(folder: Path, capsys: pytest.Captu
     shutil.rmtree(out)
     trained(folder)
     (folder / "mine").rename(folder / "moved")
-    try:
-        assert returns(capsys, str(out)) == before
-        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
-        gone, copy = folder / "mine" / "slide.py", out / "task" / "slide.py"
-        refused(capsys, f"{gone} does not exist any more: the run's own copy is used, {copy}")
-        assert metrics(out) == expected
-        warm = ["train", "--from", str(out), "--out", str(folder / "warm"), "--iterations", "1", *QUIET]
-        assert cli.main(warm) == 0
-        assert Run.open(folder / "warm").config["from"]["run"] == str(out)
-    finally:
-        shutil.rmtree(folder / "moved")
+    assert returns(capsys, str(out)) == before
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    gone, copy = folder / "mine" / "slide.py", out / "task" / "slide.py"
+    refused(capsys, f"{gone} does not exist any more: the run's own copy is used, {copy}")
+    assert metrics(out) == expected
+    warm = ["train", "--from", str(out), "--out", str(folder / "warm"), "--iterations", "1", *QUIET]
+    assert cli.main(warm) == 0
+    assert Run.open(folder / "warm").config["from"]["run"] == str(out)
 
 
 URDF = """<robot name="arm"><mujoco><compiler meshdir="../meshes" strippath="true"/></mujoco>
@@ -131,12 +124,9 @@ def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: py
     assert returns(capsys, str(out)) == before
     assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
     mine.rename(folder / "moved")
-    try:
-        assert returns(capsys, str(out)) == before
-        assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
-        assert not list(out.rglob("__pycache__"))
-    finally:
-        shutil.rmtree(folder / "moved")
+    assert returns(capsys, str(out)) == before
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    assert not list(out.rglob("__pycache__"))
 
 
 @pytest.mark.parametrize("moved", [False, True])

@@ -25,12 +25,8 @@ SOURCE = tiny_task.changed(
 
 
 @pytest.fixture(scope="module")
-def made(pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make the runs in a folder with a constant path, so that Warp reuses compiled kernels."""
-    cache = getattr(pytestconfig, "cache", None)
-    folder = Path(cache.mkdir("trust")) if cache else tmp_path_factory.mktemp("trust")
-    shutil.rmtree(folder)
-    folder.mkdir()
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trust")
     (folder / "told.py").write_text(SOURCE)
     np.save(folder / "motion.npy", np.zeros((40, 2), dtype=np.float32))
     for name, task, param in (("own", folder / "told.py", f"motion={folder / 'motion.npy'}"),
@@ -49,9 +45,7 @@ def witness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Copy the run as another user would receive it: at another path, untrusted and without the original files."""
-    folder = made / "theirs"
-    shutil.rmtree(folder, ignore_errors=True)
-    shutil.copytree(made / "own", folder, copy_function=shutil.copy)
+    folder = Path(shutil.copytree(made / "own", tmp_path / "theirs", copy_function=shutil.copy))
     change(folder, task="/home/other/told.py:Told", params={"motion": "/home/other/motion.npy"})
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return folder
@@ -177,8 +171,3 @@ def test_training_continues_if_the_run_cannot_be_added_to_trusted_runs(
     Run.create(tmp_path / "run", {"task": "mine.py"}, files={"mine.py": b""})
     (line,) = caplog.messages
     assert f"need --trust for the run in {tmp_path / 'run'}" in line
-
-
-def test_trust_command_without_a_run_prints_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["train", "point_mass", "--trust", "--out", str(tmp_path / "run")]) == 2
-    refused(capsys, "--trust has no effect without --resume or --from")
