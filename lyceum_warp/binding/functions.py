@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import difflib
+import functools
 import sys
 from collections.abc import Callable, Collection, Mapping
 from typing import Any
@@ -36,7 +37,8 @@ class TaskSource:
         self.functions: dict[str, wp.Function | None] = {
             name: self._function(wanted) for name, wanted in FUNCTIONS.items()
         }
-        self.terms = Terms(task, name, self._term, self.functions, self.world, self.params)
+        term = functools.partial(self._written, accepts=lambda f: isinstance(f, wp.Function) and f.func is not None)
+        self.terms = Terms(task, name, term, self.functions, self.world, self.params)
         if self.functions["observe"] is None:
             raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
         self._check_names()
@@ -103,12 +105,6 @@ class TaskSource:
     @property
     def _has_structs(self) -> bool:
         return not hasattr(self.task, "obs")
-
-    def _term(self, name: str) -> wp.Function | None:
-        term: wp.Function | None = self._written(
-            name, lambda found: isinstance(found, wp.Function) and found.func is not None
-        )
-        return term
 
     def _struct(self, name: str) -> Any:
         struct = self._written(name)

@@ -190,12 +190,12 @@ class Terms:
             raise ValueError(self._unknown(function, name, given))
         if not _fits(expected := function.input_types[name], kind):
             raise ValueError(
-                f"{self._place(function)} takes {name} as {_spelled(expected)}, but {text} is {_spelled(kind)}"
+                f"{self.place(function)} takes {name} as {_spelled(expected)}, but {text} is {_spelled(kind)}"
             )
         return source, text
 
     def _unknown(self, function: wp.Function, name: str, given: Mapping[str, str]) -> str:
-        place = self._place(function)
+        place = self.place(function)
         if name in _STEP:
             return f"{place} takes {name}, but a termination depends only on the state: it may take s and p"
         if name in _OWN:
@@ -208,20 +208,13 @@ class Terms:
     def _result(self, function: wp.Function) -> Any:
         kind = function.adj.arg_types.get("return")
         if kind is None:
-            raise ValueError(f"{self._place(function)} has no type for its result: add one, as -> float")
+            raise ValueError(f"{self.place(function)} has no type for its result: add one, as -> float")
         return kind
 
-    def _place(self, function: wp.Function) -> str:
+    def place(self, function: wp.Function) -> str:
+        """Name a function, the task, and the function's line, for messages."""
         source = FunctionSource(function)
         return f"{source.name} of the task {self._name!r} ({source.place(source.tree)})"
-
-    def check_result(self, function: wp.Function, kind: Any, wanted: tuple[type, ...]) -> None:
-        """Refuse a function whose result has the wrong type."""
-        if not any(_fits(one, kind) for one in wanted):
-            raise ValueError(
-                f"{self._place(function)} returns {_spelled(kind)}, but must return "
-                f"{' or '.join(one.__name__ for one in wanted)}"
-            )
 
 
 class _Body:
@@ -249,8 +242,12 @@ class _Body:
             found = self._terms.lookup(name)
             assert found is not None
             self._terms.functions[name] = found
-        if wanted:
-            self._terms.check_result(*self._values[name], wanted)
+        function, kind = self._values[name]
+        if wanted and not any(_fits(one, kind) for one in wanted):
+            raise ValueError(
+                f"{self._terms.place(function)} returns {_spelled(kind)}, but must return "
+                f"{' or '.join(one.__name__ for one in wanted)}"
+            )
         return f"{name}_"
 
     def number(self, name: str) -> str:

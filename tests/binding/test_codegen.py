@@ -19,12 +19,6 @@ def test_equal_functions_share_kernels(tmp_path: Path) -> None:
     assert kernels(f"{file}:Tiny") is kernels(f"{file}:Slower") is kernels(f"{file}:Tiny")
 
 
-def test_different_functions_have_different_kernels(tmp_path: Path) -> None:
-    other = f"{tiny_task.with_function(EVALUATE.replace('evaluate', 'height'))}\nclass Other(Tiny):\n"
-    file = tiny_task.write(tmp_path, f"{other}    evaluate = height\n")
-    assert kernels(f"{file}:Tiny") is not kernels(f"{file}:Other")
-
-
 def test_copied_task_file_shares_kernel_modules_until_it_changes(tmp_path: Path) -> None:
     (tmp_path / "copy").mkdir()
     file, copy = (tiny_task.write(folder, tiny_task.TINY) for folder in (tmp_path, tmp_path / "copy"))

@@ -96,13 +96,6 @@ def test_sensors_are_added_for_fields_that_need_them_and_otherwise_disabled() ->
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR
 
 
-def test_error_of_an_invalid_model_names_the_model() -> None:
-    spec = ball()
-    spec.worldbody.add_body().add_joint()
-    with pytest.raises(ValueError, match="MuJoCo refuses the model 'ball': "):
-        compile_model(spec, (), PHYSICS)
-
-
 # replicas
 
 

@@ -68,11 +68,6 @@ def test_options_in_params_of_an_old_configuration_are_read_as_options() -> None
     }  # fmt: skip
 
 
-def test_configuration_of_a_user_defined_learner_has_no_hyperparameters() -> None:
-    found = read(BASE | {"algorithm": "mine"})
-    assert found.hyperparameters is None and found.options.nworld == 3
-
-
 def test_processes_on_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("lyceum_warp.runs.configuration.cpu_cores", lambda: 6)
     learner = read(BASE | {"nworld": 4}).learner(Team(1, 2, "cpu", neighbours=2))
