@@ -49,6 +49,7 @@ class Arm:
     qpos: Row[float]
     qvel: Row[float]
     ctrl: Row[float]
+    qfrc_applied: Row[float]
     site_xpos: Row[wp.vec3]
     kept: Row[float] = lw.memory(2)  # the memory contains a sum over the steps, and the random number of the last step
 
@@ -82,7 +83,7 @@ def observe_arm(s: Arm, p: ArmParams, obs: Row[float]):
 def reward_of_arm(s0: Arm, action: Row[float], s1: Arm, p: ArmParams) -> float:
     r = s1.site_xpos[p.tip][2] - s0.site_xpos[p.tip][2] - p.cost * action[0] * action[1]
     r += 0.1 * s0.ctrl[0] - 0.2 * s1.ctrl[0] * s1.ctrl[1]
-    return r + s1.kept[0] * s0.kept[0] + p.gain * s1.kept[1]
+    return r + s1.kept[0] * s0.kept[0] + p.gain * s1.kept[1] + 0.1 * s1.qfrc_applied[1]
 
 
 @wp.func
@@ -101,6 +102,7 @@ def remember_draws(s0: Arm, action: Row[float], s1: Arm, p: ArmParams, rng: Row[
 def remember_once(s: Arm, p: ArmParams, rng: Row[wp.uint32]):
     for i in range(2):
         s.kept[i] = lw.normal(rng)
+        s.qfrc_applied[i] = lw.normal(rng)
 
 
 @wp.func
@@ -132,7 +134,7 @@ class Forgetful(lw.Task):
 
 
 class Keepsake(lw.Task):
-    """Memory is written only at a reset."""
+    """Memory and forces are written only at a reset."""
 
     model, frame_skip, obs = Forgetful.model, 3, Forgetful.obs
     World = Arm
