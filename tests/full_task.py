@@ -132,7 +132,7 @@ def terminated(s: World, p: Params) -> bool:
 
 @wp.func
 def success(s: World, p: Params) -> bool:
-    return s.qpos[0] > 0.5
+    return s.qpos[0] > 0.25
 
 
 @wp.func

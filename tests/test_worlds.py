@@ -1,6 +1,5 @@
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -12,16 +11,8 @@ from lyceum_warp.engines.c import mujoco_engine
 from lyceum_warp.graphs import capture
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels.step_types import OUTCOMES
-from lyceum_warp.tasks.point_mass import PointMass
 
 ENGINES = ["mujoco", "warp"]
-
-
-class Held(PointMass):
-    """A point_mass task whose point must stay at its target for three steps."""
-
-    model = lw.package_model("lyceum_warp", "tasks/point_mass.xml")
-    success_steps = 3
 
 
 def outcomes_with_faults(
@@ -77,46 +68,6 @@ def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pyt
     assert len(shared) > 20 and set(shared) == {3}
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
-
-
-def held_and_plain(engine: str, nworld: int = 16, **options: Any) -> tuple[lw.Env, lw.Env]:
-    """Make two tasks.
-
-    Success takes three steps in the first task, and one step in the second. The goals of the worlds differ.
-    """
-    goals = {"success_distance": np.linspace(0.3, 2.5, nworld)}
-    held, plain = (lw.make(task, engine=engine, nworld=nworld, **goals, **options) for task in (Held, PointMass))
-    for env in (held, plain):
-        state = env.get_state()
-        env.state_space.split(state)["qvel"][:, :2] = torch.linspace(-9.0, 9.0, nworld)[:, None]
-        env.set_state(state)
-    return held, plain
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_success_steps_must_be_consecutive_within_an_episode(engine: str) -> None:
-    held, plain = held_and_plain(engine, horizon=12)
-    rows, rises, falls = torch.zeros(16), 0, 0
-    generator = torch.Generator().manual_seed(0)
-    for i in range(40):
-        action = 2.0 * torch.rand(held.action.shape, generator=generator) - 1.0
-        if i == 20:
-            action[-1] = torch.nan
-        before = held.success.clone()
-        for env in (held, plain):
-            env.step(action)
-        rows = torch.where(plain.success, rows + 1, 0.0)
-        assert torch.equal(held.success, rows >= 3), i
-        rises, falls = rises + int((held.success & ~before).sum()), falls + int((~held.success & before).sum())
-        for name in ("obs", "final_obs", "reward", "eval", "done_reason"):
-            assert torch.equal(getattr(held, name), getattr(plain, name)), f"{name} at step {i}"
-        rows[plain.done] = 0.0
-        state = held.get_state()
-        column = held.state_space.parts["success_steps"]
-        assert torch.equal(state[:, column].squeeze(1), rows.double().clamp(max=3)), i
-        assert torch.equal(state[:, : column.start], plain.get_state())
-    assert rises > 20 and falls > 20
-    assert "success_steps" not in plain.state_space.parts
 
 
 def test_random_numbers_depend_on_the_world_index_over_all_processes() -> None:
