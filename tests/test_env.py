@@ -4,7 +4,7 @@ import multiprocessing
 import pickle
 import sys
 import weakref
-from multiprocessing.connection import Connection
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -41,15 +41,29 @@ def test_pickling_or_copying_an_environment_raises_an_error(spoil: Any) -> None:
         spoil(lw.make("hopper"))
 
 
-def _use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor, connection: Connection) -> None:
-    """Call several methods, and send the messages of their RuntimeErrors to the parent process."""
+def in_a_forked_child(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a forked child process, and return its result."""
+    here, there = multiprocessing.Pipe()
+    fork = multiprocessing.get_context("fork")
+    child = fork.Process(target=lambda: there.send(function(*arguments)))
+    child.start()
+    hangs = not here.poll(60)
+    if hangs:
+        child.kill()
+    result = None if hangs else here.recv()
+    child.join(60)
+    assert not hangs and child.exitcode == 0
+    return result
+
+
+def messages_of_every_use(env: lw.Env, plan: lw.MPPI, loop: lw.OpenLoop, state: torch.Tensor) -> list[str]:
     messages = []
     for call in (env.step, env.reset, env.get_state, lambda: env.engine.step(1), loop.run, lambda: plan(state)):
         try:
             call()
         except RuntimeError as error:
             messages.append(str(error))
-    connection.send(messages)
+    return messages
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
@@ -60,26 +74,17 @@ def test_an_environment_in_a_forked_child_raises_an_error() -> None:
     plan, loop = lw.MPPI("hopper", samples=64, horizon=4), lw.OpenLoop(lw.make("hopper", nworld=64, autoreset=False), 4)
     plan(env.get_state()[0])
     loop.run()
-    here, there = multiprocessing.Pipe()
-    arguments = (env, plan, loop, env.get_state()[0], there)
-    child = multiprocessing.get_context("fork").Process(target=_use, args=arguments)
-    child.start()
-    hangs = not here.poll(60)
-    if hangs:
-        child.kill()
-    messages = [] if hangs else here.recv()
-    child.join(60)
-    assert not hangs and child.exitcode == 0
+    messages = in_a_forked_child(messages_of_every_use, env, plan, loop, env.get_state()[0])
     assert len(messages) == 6
     assert all("made before the process was forked" in text and "'spawn'" in text for text in messages)
     env.step()
 
 
-def _make_another(connection: Connection) -> None:
+def faults_of_another_environment() -> int:
     gc.collect()
     env = lw.make("hopper", nworld=64)
     env.step()
-    connection.send(int(env.done_reason.sum()))
+    return int(env.done_reason.sum())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there is no fork")
@@ -94,14 +99,7 @@ def test_engine_of_a_deleted_environment_is_freed_before_a_fork(engine: str) -> 
         parts = [weakref.ref(part) for part in (env.worlds, env.engine, env.task)]
         del env
         assert [part() for part in parts] == [None, None, None]
-        here, there = multiprocessing.Pipe()
-        child = multiprocessing.get_context("fork").Process(target=_make_another, args=(there,))
-        child.start()
-        hangs = not here.poll(60)
-        if hangs:
-            child.kill()
-        child.join(60)
-        assert not hangs and child.exitcode == 0 and here.recv() == 0
+        assert in_a_forked_child(faults_of_another_environment) == 0
     finally:
         gc.enable()
 

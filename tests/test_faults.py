@@ -134,10 +134,9 @@ def test_faults_print_and_log_nothing_over_150_steps(
     assert not list(tmp_path.iterdir()), "a log was written"
 
 
-@pytest.mark.parametrize("autoreset", [True, False])
 @pytest.mark.parametrize("engine", ENGINES)
-def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str, autoreset: bool) -> None:
-    env, clean = (hopper(engine, autoreset=autoreset) for _ in range(2))
+def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str) -> None:
+    env, clean = (hopper(engine) for _ in range(2))
     for each in (env, clean):
         lay_down(each, BAD)
     state = env.get_state()
@@ -147,8 +146,7 @@ def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str, au
     for _ in range(5):
         env.step()
         assert torch.isfinite(env.get_state()).all()
-    assert env.fault_counts["nan"] == 1
-    assert env.done.tolist() == [not autoreset and w == BAD for w in range(N)]
+    assert env.fault_counts["nan"] == 1 and not env.done.any()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -163,38 +161,15 @@ def test_without_automatic_resets_only_a_fault_restarts_a_world(engine: str) -> 
     assert env.time[BAD] == 0 and (env.time[[0, 2, 3]] > 0).all()
 
 
-def test_model_that_mujoco_warp_does_not_support_runs_on_the_c_engine() -> None:
-    spec = lw.gymnasium_model("hopper.xml").spec()
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    for i in range(60):
-        bead = spec.worldbody.add_body(pos=(0, 3, 1 + i))
-        bead.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, limited=False)
-        bead.add_geom(size=(0.1, 0, 0), contype=0, conaffinity=0)
-    with pytest.raises(ValueError, match="MuJoCo Warp refuses the model: .*; change the model, or use engine='mujoco'"):
-        lw.make("hopper", engine="warp", model=spec)
-    lw.make("hopper", engine="mujoco", model=spec).step()
-
-
 @pytest.fixture(scope="module")
 def env() -> lw.Env:
     return lw.make("hopper", engine="mujoco", nworld=N)
 
 
-@pytest.mark.parametrize("method", ["step", "set_action"])
-def test_action_of_wrong_shape_or_type_raises_an_error(env: lw.Env, method: str) -> None:
-    call = getattr(env, method)
-    wanted = r"action must be a float32 tensor of shape \(4, 3\), not "
-    with pytest.raises(ValueError, match=wanted + r"a float32 tensor of shape \(3,\)"):
-        call(torch.zeros(3))
-    with pytest.raises(ValueError, match=wanted + r"a float64 tensor of shape \(4, 3\)"):
-        call(torch.zeros(4, 3, dtype=torch.float64))
-    with pytest.raises(ValueError, match=wanted + r"a ndarray of shape \(4, 3\)"):
-        call(np.zeros((4, 3), np.float32))
-    with pytest.raises(ValueError, match=wanted + r"float 1.0"):
-        call(1.0)
-
-
-def test_non_finite_action_raises_an_error(env: lw.Env) -> None:
+def test_invalid_action_raises_an_error(env: lw.Env) -> None:
+    for method in (env.step, env.set_action):
+        with pytest.raises(ValueError, match=r"action must be .* of shape \(4, 3\), not a float32 tensor"):
+            method(torch.zeros(3))
     action = torch.zeros(N, 3)
     action[2, 1] = np.nan
     with pytest.raises(ValueError, match="the action 'actuator_1' of world 2 is nan: actions .* be finite"):
@@ -203,10 +178,7 @@ def test_non_finite_action_raises_an_error(env: lw.Env) -> None:
 
 def test_state_of_wrong_shape_or_with_non_finite_values_raises_an_error(env: lw.Env) -> None:
     state = env.get_state()
-    wanted = r"state must be a float64 tensor of shape \(4, \d+\), not a "
-    with pytest.raises(ValueError, match=wanted + r"float64 tensor of shape \(2, \d+\)"):
-        env.set_state(state[:2])
-    with pytest.raises(ValueError, match=wanted + "float32"):
+    with pytest.raises(ValueError, match=r"state must be a float64 tensor of shape \(4, \d+\), not a float32 tensor"):
         env.set_state(state.float())
     bad = state.clone()
     bad[1, env.state_space.parts["qpos"].start] = np.nan
@@ -225,13 +197,11 @@ def test_state_of_wrong_shape_or_with_non_finite_values_raises_an_error(env: lw.
 def test_masks_and_outputs_of_wrong_shape_or_type_raise_an_error(env: lw.Env) -> None:
     state = env.get_state()
     calls = (env.reset, lambda mask: env.rand_reset(mask=mask), lambda mask: env.set_state(state, mask))
-    for mask in (torch.ones(3, dtype=torch.bool), torch.ones(N), np.ones(N, bool), [True] * N):
-        for call in calls:
-            with pytest.raises(ValueError, match=r"a mask must be a bool tensor of shape \(4,\), not "):
-                call(mask)
-    for out in (torch.zeros(N, 10), torch.zeros(N, 11, dtype=torch.float64), np.zeros((N, 11))):
-        with pytest.raises(ValueError, match=r"out must be a float32 tensor of shape \(4, 11\), not a "):
-            env.get_obs(out=out)
+    for call in calls:
+        with pytest.raises(ValueError, match=r"a mask must be a bool tensor of shape \(4,\), not "):
+            call([True] * N)
+    with pytest.raises(ValueError, match=r"out must be a float32 tensor of shape \(4, 11\), not a "):
+        env.get_obs(out=torch.zeros(N, 10))
     with pytest.raises(ValueError, match="pass before, action and after, or none of the three"):
         env.get_reward(env.get_state())
     with pytest.raises(ValueError, match="action must be"):

@@ -96,11 +96,6 @@ def test_model_of_another_package_is_read_without_importing_the_package() -> Non
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_error_of_a_missing_package_names_the_install_command() -> None:
-    with pytest.raises(FileNotFoundError, match=r"the package no-robots, which .*: pip install 'no-robots==3'$"):
-        lw.package_model("no_robots", "arm.xml", install="no-robots==3").path()
-
-
 def test_error_on_an_unsupported_python_names_a_command_that_works() -> None:
     here = f"{sys.version_info.major}.{sys.version_info.minor}"
     with pytest.raises(FileNotFoundError, match="which is not installed: pip install 'lyceum-warp.robots.'$"):
