@@ -182,26 +182,18 @@ def count_steps(s0: PracticedWorld, action: Row[float], s1: PracticedWorld, p: P
     s1.practice[0] = s0.practice[0] + lw.uniform(rng, 0.0, 2.0)
 
 
-class Practiced(lw.Task):
+@wp.func
+def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
+    s.practice[0] = lw.uniform(rng, 1.0, 2.0)
+
+
+class Gifted(lw.Task):
     """A larger ``practice``, which is stored in lasting memory, moves the puck's start further away."""
 
     model = Drawn.model
     frame_skip = 3
     obs = {"position": 1, "practice": 1}
     horizon = 25
-    World = PracticedWorld
-    Params = PuckParams
-    observe, initialize, advance = observe_practice, start_further, count_steps
-
-
-@wp.func
-def draw_practice(s: PracticedWorld, p: PuckParams, rng: Row[wp.uint32]):
-    s.practice[0] = lw.uniform(rng, 1.0, 2.0)
-
-
-class Gifted(Practiced):
-    """Like ``Practiced``, but ``practice`` starts at a random value in each world."""
-
     World = PracticedWorld
     Params = PuckParams
     observe, initialize, advance, startup = observe_practice, start_further, count_steps, draw_practice

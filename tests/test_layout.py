@@ -1,5 +1,6 @@
 import ast
 import functools
+import re
 import subprocess
 import sys
 import textwrap
@@ -148,7 +149,7 @@ def is_own(node: ast.Attribute) -> bool:
 
 def defined_names(tree: ast.AST) -> Iterator[str]:
     for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
             yield node.name
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
             yield node.id
@@ -179,32 +180,11 @@ def test_no_module_uses_private_names_of_another_module() -> None:
 UPSTREAM = "lyceum_warp.support.upstream"
 
 
-def private_names_of_others(tree: ast.AST) -> Iterator[str]:
-    modules = set()
-    for node in ast.walk(tree):
-        found = []
-        if isinstance(node, ast.Import):
-            found = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            found = [f"{node.module}.{alias.name}" for alias in node.names]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
-            found = [ast.unparse(node.args[0]).strip("'")]
-        for name in found:
-            if name.partition(".")[0] not in {"lyceum_warp", *sys.stdlib_module_names}:
-                if isinstance(node, ast.Import):
-                    modules |= {alias.asname or alias.name for alias in node.names}
-                if any(map(is_private, name.split("."))):
-                    yield name
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and is_private(node.attr) and ast.unparse(node.value) in modules:
-            yield ast.unparse(node)
-
-
 def test_private_names_of_other_packages_are_used_only_in_the_upstream_module() -> None:
-    found = {name: names for name, tree in trees().items() if (names := set(private_names_of_others(tree)))}
-    modules = ("collision_convex", "collision_primitive", "collision_sdf", "forward", "util_pkg")
-    known = {"wp._src", *(f"mujoco_warp._src.{module}" for module in modules)}
-    assert found == {UPSTREAM: known}, f"reach private names in {UPSTREAM}"
+    own = {name for name, modules in private_names().items() if modules} | NAMEDTUPLE
+    pattern = re.compile(r"(?:(?<!\bself)(?<!\bcls)(?<!\bos)\.|import )(_[a-z]\w*)")
+    used = {name: set(pattern.findall(ast.unparse(tree))) - own for name, tree in trees().items()}
+    assert {name for name, names in used.items() if names} == {UPSTREAM}, used
 
 
 def test_type_checkers_see_every_public_name() -> None:

@@ -36,10 +36,6 @@ ARM = """
     <motor name="shoulder" joint="shoulder" ctrlrange="-2 3" ctrllimited="true"/>
     <motor name="elbow" joint="elbow" ctrlrange="-1 1" ctrllimited="true"/>
   </actuator>
-  <sensor>
-    <accelerometer name="shock" site="tip"/>
-    <framelinvel name="velocity" objtype="site" objname="tip"/>
-  </sensor>
 </mujoco>
 """
 
@@ -52,12 +48,6 @@ class Arm:
     qfrc_applied: Row[float]
     site_xpos: Row[wp.vec3]
     kept: Row[float] = lw.memory(2)  # the memory contains a sum over the steps, and the random number of the last step
-
-
-@wp.struct
-class SensingArm:
-    qpos: Row[float]
-    sensordata: Row[float]
 
 
 @wp.struct
@@ -111,17 +101,6 @@ def servo(s: Arm, action: Row[float], p: ArmParams, ctrl: Row[float]):
         ctrl[i] = p.gain * action[i] - 0.3 * s.qvel[i] - s.qpos[i]
 
 
-@wp.func
-def observe_sensors(s: SensingArm, p: ArmParams, obs: Row[float]):
-    for i in range(6):
-        obs[i] = s.sensordata[i]
-
-
-@wp.func
-def reward_of_sensors(s0: SensingArm, action: Row[float], s1: SensingArm, p: ArmParams) -> float:
-    return s1.sensordata[2] - 10.0 * s0.sensordata[5] + s0.sensordata[0] + s1.sensordata[3]
-
-
 class Forgetful(lw.Task):
     """The actions are controls, so the C engine computes a rollout in one native call."""
 
@@ -146,17 +125,6 @@ class Servo(Forgetful):
     """Controls depend on the state before the step."""
 
     control = servo
-
-
-class Sensing(lw.Task):
-    """The velocity sensor describes the state, and the acceleration sensor describes the last substep."""
-
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(ARM))
-    frame_skip = 2
-    obs = {"sensors": 6}
-    World = SensingArm
-    Params = ArmParams
-    observe, reward = observe_sensors, reward_of_sensors
 
 
 def under_rk4() -> mujoco.MjSpec:
@@ -215,8 +183,8 @@ def check_against_stepping(loop: OpenLoop, env: lw.Env, rounds: int = 3) -> None
 
 
 @pytest.mark.quick(
-    "adroit_pen-mujoco", "cartpole-mujoco", "go1_velocity-mujoco", "half_cheetah-mujoco", "humanoid_stand-mujoco",
-    "panda_lift-mujoco", "soft_ball-mujoco", "reach-warp",
+    "adroit_pen-mujoco", "cartpole-mujoco", "dm/quadruped_walk-mujoco", "go1_velocity-mujoco", "half_cheetah-mujoco",
+    "humanoid_stand-mujoco", "panda_lift-mujoco", "soft_ball-mujoco", "reach-warp",
 )  # fmt: skip
 @pytest.mark.parametrize("task, engine", [(task, engine) for task in PACKAGE for engine in ENGINES])
 def test_rollout_of_a_task_equals_steps(task: str, engine: str) -> None:
@@ -240,8 +208,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.quick(
-    "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "keepsake-mujoco", "control_worlds-mujoco", "sensors-mujoco",
-    "sensors-warp",
+    "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "keepsake-mujoco", "control_worlds-mujoco", "memory-warp",
 )  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
@@ -254,9 +221,8 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         (Keepsake, True, {}),
         (Servo, False, {}),
         (Servo, False, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "model": under_rk4(), "frame_skip": 2}),
-        (Sensing, False, {}),
     ],
-    ids="memory worlds one_substep rk4 keepsake control control_worlds sensors".split(),
+    ids="memory worlds one_substep rk4 keepsake control control_worlds".split(),
 )
 def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from form_tasks import Gifted, Practiced, Weighed
+from form_tasks import Gifted, Weighed
 from full_task import Full, Settled
 
 import lyceum_warp as lw
@@ -184,9 +184,9 @@ def test_task_with_every_feature_passes_check_task(task: type[lw.Task]) -> None:
     check_task(task, engine="mujoco", steps=60)
 
 
-@pytest.mark.quick("Weighed-warp", "Practiced-warp", "Gifted-mujoco")
+@pytest.mark.quick("Weighed-warp", "Gifted-mujoco", "Gifted-warp")
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-@pytest.mark.parametrize("task", [Weighed, Practiced, Gifted])
+@pytest.mark.parametrize("task", [Weighed, Gifted])
 def test_check_task_accepts_tasks_that_observe_lasting_memory(task: type[lw.Task], engine: str) -> None:
     checks = [check for check in CHECKS if engine == "mujoco" or check.__name__ == "check_reset"]
     check_task(task, engine=engine, nworld=3, steps=60, frame_skip=1, checks=checks)
