@@ -255,7 +255,7 @@ class Env:
         if action is not None:
             check_tensor(action, "action", self.action)
             self.action.copy_(action.detach())
-        for call in self.worlds.step:
+        for call in self.worlds.programs.step:
             call()
 
     # resets
@@ -460,15 +460,12 @@ class Env:
             ValueError: A field is not a model field that differs between worlds, or a value is invalid.
         """
         state = self.get_state()
-        put_rows(self.task.model, fields, self._columns_of_dynamics(state))
+        put_rows(self.task.model, fields, self.state_space.split(state))
         self._check_dynamics(state, fields)
         self.set_state(state, mask)
 
-    def _columns_of_dynamics(self, state: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {field.name: state[:, self.state_space.parts[field.name]] for field in self.task.dynamics}
-
     def _check_dynamics(self, state: torch.Tensor, names: Collection[str]) -> None:
-        columns = self._columns_of_dynamics(state)
+        columns = self.state_space.split(state)
         for field in self.task.dynamics:
             if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
                 raise ValueError(f"{self.task.name!r}: {problem}")

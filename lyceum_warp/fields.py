@@ -176,8 +176,6 @@ def describe(
     belong to the sensor's stage. Fields of the acceleration stage always lag (``Field.lagged``), and fields of the
     integration state never do.
     """
-    if written and name not in INPUTS:
-        raise ValueError(f"the field {name!r} cannot be written before a step: the inputs are {', '.join(INPUTS)}")
     written = written or name == "ctrl"
     if name in SENSED and not _sensed(model, name):
         raise ValueError(

@@ -213,12 +213,3 @@ def _described(name: str, shape: tuple[int, ...], constants: Constants) -> Model
 MOVED_INERTIA = {"body_ipos", "body_iquat"}
 """Fields that move a body's inertial frame. They cannot differ between worlds for bodies that MuJoCo compiled as
 "simple". In such a body, the inertial frame is the body frame."""
-
-
-def check_simple(model: mujoco.MjModel, name: str) -> None:
-    """Refuse to move the inertial frame of a simple body (``body_simple``)."""
-    if name in MOVED_INERTIA and (simple := np.flatnonzero(model.body_simple[1:]) + 1).size:
-        raise ValueError(
-            f"{name} can't differ between worlds while bodies are compiled as simple (the bodies {simple.tolist()}): "
-            'set simple="false" on these bodies'
-        )

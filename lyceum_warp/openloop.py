@@ -241,14 +241,12 @@ class OpenLoop:
         self.worlds.act()
 
     def _judge_step(self, t: int) -> None:
-        worlds, n, device = self.worlds, self.env.nworld, self.env.device
-        kernels = self.env.task.kernels
-        batches, action = [worlds.before, worlds.after, worlds.params], self._actions[t]
-        if kernels.advance_memory is not None:
-            launch_worlds(kernels.advance_memory, n, [*batches, action, worlds.counters], device)
+        worlds, n = self.worlds, self.env.nworld
+        worlds.advance_memory()
         rows = slice(t * n, (t + 1) * n)
-        args = [*batches, worlds.weights, action, self._reward[rows], self._terminated[rows]]
-        launch_worlds(kernels.judge_rows, n, args, device)
+        args = [worlds.before, worlds.after, worlds.params, worlds.weights, worlds.safe_action]
+        args += [self._reward[rows], self._terminated[rows]]
+        launch_worlds(self.env.task.kernels.judge_rows, n, args, self.env.device)
 
     def _end(self, batch: object) -> None:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device

@@ -217,16 +217,12 @@ class Terrain:
         x, y = np.meshgrid(side, side)
         rng = np.random.default_rng((self.seed, level, column))
         if isinstance(kind, str):
-            shape, scale = _KINDS[kind]
-            return shape(x, y, difficulty * self._scale(kind, scale), rng)
+            shape, amount = _KINDS[kind]
+            return shape(x, y, difficulty * float(np.copysign(self.scale.get(kind, amount), amount)), rng)
         heights = np.asarray(kind(x, y, difficulty, rng), dtype=float)
         if heights.shape != x.shape or not np.isfinite(heights).all():
             raise ValueError(f"{kind!r} must return finite heights of shape {x.shape}, not {heights!r}")
         return heights
-
-    def _scale(self, kind: str, default: float) -> float:
-        given = self.scale.get(kind)
-        return default if given is None else float(np.copysign(given, default))
 
 
 def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:

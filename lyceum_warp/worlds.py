@@ -67,12 +67,11 @@ class Worlds(WorldArrays):
                 restore_state=capture.sequence(self.restore_phases()),
             )
         self.programs = self._programs[key]
-        self.step = self.programs.step
 
     def drop_programs(self) -> None:
         """Delete the programs, whose reference cycles would keep threads and memory alive."""
         self._programs.clear()
-        del self.programs, self.step
+        del self.programs
 
     def _make_workers(self) -> Workers | None:
         # Warp's kernels in debug mode are not thread-safe
@@ -176,7 +175,9 @@ class Worlds(WorldArrays):
 
     def read_phases(self) -> list[Phase]:
         """List the phases that write all states into ``state``."""
-        return [Phase("read state", self._read_state)]
+        # with automatic resets, done_reason describes only the last step
+        ended = self._no_fault if self.autoreset else self.outcome.done_reason
+        return [Phase("read state", partial(self.pack_state, ended))]
 
     def restore_phases(self) -> list[Phase]:
         """List the phases that restore the selected worlds from ``state``."""
@@ -324,10 +325,6 @@ class Worlds(WorldArrays):
         self.engine.find_faults(self.mask)
         keep_reason = keep_reason and not self.autoreset
         self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
-
-    def _read_state(self) -> None:
-        # with automatic resets, done_reason describes only the last step
-        self.pack_state(self._no_fault if self.autoreset else self.outcome.done_reason)
 
     # called by Env and OpenLoop
 

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from lyceum_warp.fields import vec10
-from lyceum_warp.model_fields import Constants, ModelField, check_simple, describe_model_field
+from lyceum_warp.model_fields import Constants, ModelField, describe_model_field
 from lyceum_warp.model_files import gymnasium_model
 
 ANT = gymnasium_model("ant.xml").spec().compile()
@@ -77,12 +77,3 @@ def test_geom_positions_affect_constants_if_tendons_wrap_around_geoms() -> None:
     wrapped = mujoco.MjModel.from_xml_string(xml)
     assert Constants.INERTIAL in describe_model_field(wrapped, "geom_pos").constants
     assert Constants.INERTIAL not in describe_model_field(ANT, "geom_pos").constants
-
-
-def test_randomizing_the_inertial_frame_of_a_simple_body_raises_an_error() -> None:
-    ball = mujoco.MjModel.from_xml_string(
-        "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    check_simple(ball, "body_mass")
-    with pytest.raises(ValueError, match=r"body_ipos can't differ .*the bodies \[1\]"):
-        check_simple(ball, "body_ipos")

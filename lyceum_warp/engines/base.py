@@ -12,7 +12,7 @@ import warp as wp
 from lyceum_warp.fields import Field, Stage, describe
 from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels.state import narrow, widen
-from lyceum_warp.model_fields import ModelField, check_simple
+from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import flat, launch_rows
 from lyceum_warp.support.docstrings import document_attributes
 
@@ -92,7 +92,6 @@ class Engine(abc.ABC):
                 raise ValueError(f"the field {field.name!r} is listed twice, as lagged and as current: list it once")
         self.dynamics, self.nominal, self.arrays = {}, {}, {}
         for varied in dynamics:
-            check_simple(model, varied.name)
             self.dynamics[varied.name] = varied
             self.nominal[varied.name] = self._nominal_rows(varied, 1)
         self.fault = wp.zeros(nworld, dtype=int, device=device)
