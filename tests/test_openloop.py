@@ -419,29 +419,12 @@ def test_fault_within_a_rollout_is_reported_at_its_end(task: type[lw.Task]) -> N
     assert not run(loop, state, torch.full_like(actions, 9.81e-4))["fault"].any()
 
 
-def test_rollout_with_automatic_resets_or_an_invalid_horizon_raises_an_error(shared_env: SharedEnv) -> None:
+def test_unsuitable_environment_horizon_or_number_of_states_raises_an_error(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match=r"worlds that do not reset: make\(..., autoreset=False\)"):
         OpenLoop(shared_env("point_mass"), 5)
     env = shared_env("point_mass", autoreset=False)
     for horizon in (0, -1, 2.5, "a"):
         with pytest.raises(ValueError, match="horizon must be a whole number from 1"):
             OpenLoop(env, horizon)  # type: ignore[arg-type]
-
-
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_worlds_are_divided_evenly_among_several_initial_states(engine: str) -> None:
-    env = lw.make("hopper", engine=engine, nworld=6, autoreset=False, seed=1)
-    starts = lw.make("hopper", nworld=3, seed=5, autoreset=False).get_state()
-    loop, alone = OpenLoop(env, 3, states=3), OpenLoop(lw.make("hopper", engine=engine, nworld=2, autoreset=False), 3)
-    assert loop.state is loop.states and loop.states.shape == (3, env.state_space.size)
-    loop.actions.uniform_(-1.0, 1.0, generator=torch.Generator().manual_seed(0))
-    loop.state.copy_(starts)
-    loop.run()
-    for i in range(3):
-        alone.state.copy_(starts[i])
-        alone.actions.copy_(loop.actions[:, 2 * i : 2 * i + 2])
-        alone.run()
-        torch.testing.assert_close(loop.reward[:, 2 * i : 2 * i + 2], alone.reward)
-    with pytest.raises(ValueError, match="nworld=6 must be a multiple of states=4"):
+    with pytest.raises(ValueError, match="nworld=1 must be a multiple of states=4"):
         OpenLoop(env, 3, states=4)

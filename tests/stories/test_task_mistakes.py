@@ -29,62 +29,141 @@ class Params:
 OWN_WORLD = "@wp.struct\nclass World:\n    qpos: Row[float]\n"
 
 
+def line(text: str) -> tuple[str, str]:
+    return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
+
+
+def field(text: str) -> tuple[str, str]:
+    return "    qpos: Row[float]", f"    qpos: Row[float]\n    {text}"
+
+
 def function(text: str) -> tuple[str, str]:
     return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
 
 
-MISTAKES: dict[str, tuple[tuple[str, str], str]] = {
+MASS = field("body_mass: Row[float]")
+RNG = "rng: Row[wp.uint32]"
+STEP = "s0: World, action: Row[float], s1: World, p: Params"
+MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     # the file
     "missing import": (
-        ("import warp as wp", "import warp as wp\nimport not_installed.sub"),
+        [("import warp as wp", "import warp as wp\nimport not_installed.sub")],
         r"task file .*tiny\.py, line 3: No module named 'not_installed': install the missing module, or put it into",
     ),
     "syntax": (
-        ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0"),
+        [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0")],
         r"task file .*tiny\.py, line \d+: SyntaxError: '\[' was never closed",
     ),
     "a class without lw.Task": (
-        ("class Tiny(lw.Task)", "@lw.register\nclass Tiny"),
+        [("class Tiny(lw.Task)", "@lw.register\nclass Tiny")],
         r"line \d+: @lw\.register takes a subclass of lw\.Task, not Tiny: write class Tiny\(lw\.Task\)",
     ),
     # structs
     "World without wp.struct": (
-        ("@wp.struct\nclass World", "class World"),
+        [("@wp.struct\nclass World", "class World")],
         r"the argument s of observe has the type World, which must be decorated with @wp\.struct",
     ),
     "Params without wp.struct": (
-        ("@wp.struct\nclass Params", "class Params"),
+        [("@wp.struct\nclass Params", "class Params")],
         r"the argument p of observe has the type Params, which must be decorated with @wp\.struct",
     ),
     "text in Params": (
-        ("    dt: float", "    dt: float\n    name: str"),
+        [("    dt: float", "    dt: float\n    name: str")],
         r"line \d+: a @wp\.struct has a field of the type str: it can hold float, int, bool, vectors and matrices",
     ),
     # functions
-    "observe without wp.func": (("@wp.func\n", ""), r"observe of the task 'tiny' must be a @wp\.func, not <function"),
+    "observe without wp.func": ([("@wp.func\n", "")], r"observe of the task 'tiny' must be a @wp\.func, not <function"),
     "a reward without return": (
-        function(f"{REWARD} -> float:\n    wp.abs(action[0])"),
+        [function(f"{REWARD} -> float:\n    wp.abs(action[0])")],
         f"reward of the task 'tiny' has no return: write it as {WRITE_REWARD}",
     ),
     "a function of another file": (
-        (OWN_WORLD, "from other_rewards import World, reward\n"),
+        [(OWN_WORLD, "from other_rewards import World, reward\n")],
         r"reward of the task 'tiny' takes Params from .*other_rewards\.py, but the task uses Params from .*tiny\.py"
         r": import World and Params from the same file, derive the task's struct from the other \(class Params\(",
     ),
     "a function of another file with its own structs": (
-        ("class Tiny", "from other_rewards import reward\n\nclass Tiny"),
+        [("class Tiny", "from other_rewards import reward\n\nclass Tiny")],
         r"reward of the task 'tiny' takes World from .*other_rewards\.py, but the task uses World from .*tiny\.py",
+    ),
+    # attributes, fields and writes
+    "a name like no field": ([field("wheels: Row[float]")], "there is no field 'wheels': .*MuJoCo's names"),
+    "a negative mass": (
+        [MASS, function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[1] = s.body_mass[1] - 9.0")],
+        r"'tiny': body_mass\[1\] of world 0 is -\S+ and must be positive \(its nominal value is 3\S*\)",
+    ),
+    "drawn twice": (
+        [MASS, function(f"def startup(s: World, p: Params, {RNG}):\n    s.body_mass[1] = 2.0"),
+         function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[2] = 2.0")],
+        "the model field 'body_mass' of the task 'tiny' is written by startup and by resets or events",
+    ),
+    "a group that no function fills": (
+        [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "critic": {"x": 1}}')],
+        r"observe_critic\(s: World, p: Params, obs: Row\[float\]\)",
+    ),
+    "a group of two words": (
+        [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "my group": {"x": 1}}')],
+        "obs of the task 'tiny' has the group 'my group': a group's name must be a Python name, such as 'critic'",
+    ),
+    "groups without a policy": (
+        [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
+        "must be a dict of parts and sizes, or a dict of such dicts for groups, including 'policy'",
+    ),
+    "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
+    "a comma in a metric's name": (
+        [line('metrics = ("a,b",)'), function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
+        "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
+    ),
+    "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
+    "a keyframe by its number": (
+        [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of a keyframe .*, such as 'home', not 0",
+    ),
+    "actions without control": ([line('actions = {"speed": 1}')], "defines its own actions, so it needs control"),
+    "actions without sizes": (
+        [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
+    ),
+    "memory of no numbers": (
+        [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
+    ),
+    "memory with the name of a field": (
+        [field("qvel: Row[float] = lw.memory()")], r"memory World\.qvel of the task 'tiny' has the name of an existing",
+    ),
+    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], r"World\.step .* has the name of"),
+    "memory of size 0": ([field("level: Row[float] = lw.memory(0)")], r"size of World\.level must be a whole number"),
+    "memory with the size of no table": (
+        [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table in Params",
+    ),
+    "a reward that writes": (
+        [function(f"def reward({STEP}) -> float:\n    s1.qpos[0] = 1.0\n    return 0.0")],
+        r"reward of the task 'tiny' writes s1\.qpos \(.*tiny\.py, line 20\): ",
+    ),
+    "advance that writes an input": (
+        [field("xfrc_applied: Row[wp.spatial_vector]"),
+         function(f"def advance({STEP}, {RNG}):\n    s1.xfrc_applied[1] = wp.spatial_vector()")],
+        r"advance of the task 'tiny' writes s1\.xfrc_applied \(.*tiny\.py, line 21\): .* is written by control",
+    ),
+    "control that writes the state": (
+        [function("def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    s.qpos[0] = 0.0")],
+        r"control of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): .* is written by initialize or randomize",
+    ),
+    "a substep that writes the model": (
+        [MASS, function("def substep(s: World, p: Params):\n    s.body_mass[1] = 2.0")],
+        r"substep of the task 'tiny' writes s\.body_mass \(.*tiny\.py, line \d+\): .* is written by startup",
+    ),
+    "observe that writes": (
+        [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    s.qpos[0] = 0.0")],
+        r"observe of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): observe may write obs",
     ),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize(("changes", "message"), MISTAKES.values(), ids=MISTAKES)
 def test_mistake_in_a_task_file_raises_a_one_line_error(
-    change: tuple[str, str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    changes: list[tuple[str, str]], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tiny_task.write(tmp_path, OTHER_FILE, "other_rewards.py")
     monkeypatch.syspath_prepend(tmp_path)
-    file = tiny_task.write(tmp_path, tiny_task.changed(change))
+    file = tiny_task.write(tmp_path, tiny_task.changed(*changes))
     with pytest.raises((ValueError, ImportError, FileNotFoundError), match=message) as caught:
         lw.make(file)
     assert "\n" not in str(caught.value)
