@@ -55,12 +55,3 @@ def test_number_of_passed_knots_is_proportional_to_the_steps(horizon: int, count
         wp.launch(knots.pass_knots, 1, [steps, horizon, count, phase, passed], device="cpu")
         time, total = time + shift, total + int(passed.numpy()[0])
         assert total == time * count // horizon and phase.numpy()[0] == time * count % horizon
-
-
-@pytest.mark.parametrize("spline", SPLINES)
-@pytest.mark.parametrize("horizon, count", [(12, 4), (13, 4), (7, 5), (5, 5), (9, 1), (128, 32)])
-def test_plan_has_enough_knots_for_its_last_step_at_every_phase(horizon: int, count: int, spline: str) -> None:
-    number = knots.knot_count(horizon, count, spline)
-    last = max(((horizon - 1) * count + time * count % horizon) // horizon for time in range(horizon))
-    assert number == last + {"zero": 1, "linear": 2, "cubic": 4}[spline]
-    assert number <= count + 4

@@ -45,12 +45,6 @@ def draws(counters: np.ndarray) -> np.ndarray:
     return values.numpy()
 
 
-def test_equal_counters_give_equal_random_numbers_in_any_order() -> None:
-    counters = np.array(list(itertools.product(range(3), range(4), range(3), range(3))))
-    order = np.random.default_rng(0).permutation(len(counters))
-    np.testing.assert_array_equal(draws(counters)[order], draws(counters[order]))
-
-
 def test_random_vector_equals_its_elements_drawn_one_by_one() -> None:
     rng = wp.array(np.repeat(np.arange(100), 2)[:, None], dtype=wp.uint32, device="cpu")
     one, many = (wp.zeros((100, 5), dtype=float, device="cpu") for _ in range(2))

@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from checks import check_uniform, put_at_random
+from checks import check_uniform
 
 import lyceum_warp as lw
 
@@ -164,54 +164,3 @@ def test_random_rotations_are_uniform_and_independent() -> None:
                 np.arctan2(q[:, third], q[:, fourth]) / np.pi,
             ]
         check_uniform(np.stack(columns, axis=1))
-
-
-FREE = """
-<mujoco>
-  <worldbody>
-    <body><freejoint/><geom size=".1 .2 .3" type="box"/><site name="middle"/>
-      <body pos="0 0 1"><joint name="turn"/><geom size=".1"/></body>
-    </body>
-  </worldbody>
-  <actuator><motor joint="turn"/></actuator>
-  <sensor><velocimeter site="middle"/></sensor>
-</mujoco>
-"""
-
-
-@wp.struct
-class Free:
-    qvel: lw.Row[float]
-    xquat: lw.Row[lw.quat]
-    sensordata: lw.Row[float]
-
-
-@wp.struct
-class FreeParams:
-    dt: float
-
-
-@wp.func
-def observe_velocity(s: Free, p: FreeParams, obs: lw.Row[float]):
-    velocity = lw.quat_rotate_inverse(s.xquat[1], wp.vec3(s.qvel[0], s.qvel[1], s.qvel[2]))
-    for i in range(3):
-        obs[i] = velocity[i]
-        obs[3 + i] = s.sensordata[i]
-
-
-class Floating(lw.Task):
-    model = staticmethod(lambda: mujoco.MjSpec.from_string(FREE))
-    obs = {"computed": 3, "measured": 3}
-    World = Free
-    Params = FreeParams
-    observe = observe_velocity
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_velocity_in_a_body_frame_equals_that_of_a_velocimeter(engine: str) -> None:
-    env = lw.make(Floating, engine=engine, nworld=8)
-    put_at_random(env, np.random.default_rng(0), 1.0, 2.0)
-    env.step()
-    obs = env.obs.numpy()
-    assert np.abs(obs[:, 3:]).min(axis=0).max() > 1e-3
-    np.testing.assert_allclose(obs[:, :3], obs[:, 3:], atol=2e-5)

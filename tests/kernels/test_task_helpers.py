@@ -15,14 +15,6 @@ def tolerances(x: wp.array[float], bounds: wp.vec2, margin: float, sigmoid: int,
     out[i] = lw.tolerance(x[i], bounds, margin, sigmoid, v)
 
 
-@wp.kernel
-def default_tolerances(x: wp.array[float], out: wp.array2d[float]):
-    i = wp.tid()
-    out[i, 0] = lw.tolerance(x[i], wp.vec2(0.0, 0.5))
-    out[i, 1] = lw.tolerance(x[i], wp.vec2(0.0, 0.5), margin=2.0)
-    out[i, 2] = lw.tolerance(x[i], wp.vec2(0.0, 0.5), margin=2.0, sigmoid=lw.Sigmoid.LINEAR, value_at_margin=0.0)
-
-
 def tolerance(x: np.ndarray, bounds: tuple[float, float], margin: float, sigmoid: int, v: float) -> np.ndarray:
     out = wp.zeros(len(x), dtype=float, device="cpu")
     args = [wp.array(x, dtype=float, device="cpu"), wp.vec2(*bounds), margin, int(sigmoid), v, out]
@@ -43,19 +35,6 @@ def test_tolerance_equals_that_of_dm_control(name: str) -> None:
                 np.testing.assert_allclose(tolerance(x, bounds, margin, SIGMOIDS[name], v), wanted, atol=2e-6)
     wanted = rewards.tolerance(x, (-1.0, 0.5), 0.0)
     np.testing.assert_array_equal(tolerance(x, (-1.0, 0.5), 0.0, SIGMOIDS[name], 0.1), wanted)
-
-
-def test_tolerance_has_the_defaults_of_dm_control() -> None:
-    rewards = pytest.importorskip("dm_control.utils.rewards", reason="dm_control is the oracle of tolerance")
-    x = np.linspace(-5.0, 5.0, 101, dtype=np.float32)
-    out = wp.zeros((len(x), 3), dtype=float, device="cpu")
-    wp.launch(default_tolerances, len(x), [wp.array(x, dtype=float, device="cpu"), out], device="cpu")
-    wanted = [
-        rewards.tolerance(x, (0.0, 0.5)),
-        rewards.tolerance(x, (0.0, 0.5), 2.0),
-        rewards.tolerance(x, (0.0, 0.5), 2.0, "linear", 0.0),
-    ]
-    np.testing.assert_allclose(out.numpy(), np.stack(wanted, axis=1), atol=2e-6)
 
 
 @wp.struct

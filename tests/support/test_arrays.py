@@ -1,9 +1,8 @@
 import pytest
-import torch
 import warp as wp
 
 from lyceum_warp.kernels import state
-from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, torch_view
+from lyceum_warp.support.arrays import flat, launch_several_rows
 
 
 @pytest.mark.parametrize(("dtype", "shape", "columns"), [(float, (2, 3), 3), (wp.vec3, (2, 4), 12), (int, 2, 1)])
@@ -18,25 +17,6 @@ def test_flat_view_has_one_row_per_world_in_the_same_memory(dtype: type, shape: 
 def test_flat_view_keeps_the_memory_alive() -> None:
     alias = flat(wp.full((2, 3), 5.0, dtype=float, device="cpu"))
     assert alias.numpy().tolist() == [[5.0] * 3] * 2
-
-
-def test_torch_view_shares_memory_with_the_warp_array() -> None:
-    array = wp.zeros((2, 3), dtype=float, device="cpu")
-    torch_view(array).fill_(2.0)
-    assert array.numpy().tolist() == [[2.0] * 3] * 2
-
-
-def test_launch_rows_writes_only_masked_rows() -> None:
-    source, target = (wp.full((3, 4), value, dtype=float, device="cpu") for value in (1.0, 2.0))
-    mask = wp.array([True, False, True], dtype=bool, device="cpu")
-    launch_rows(state.copy_rows, mask, source, target)
-    assert torch_view(target)[:, 0].tolist() == [1.0, 2.0, 1.0]
-
-
-def test_launch_over_an_empty_array_does_nothing() -> None:
-    empty = wp.zeros((3, 0), dtype=float, device="cpu")
-    launch_rows(state.copy_rows, wp.full(3, True, dtype=bool, device="cpu"), empty, empty)
-    assert torch.equal(torch_view(empty), torch.zeros(3, 0))
 
 
 @pytest.mark.parametrize("widths", [[1], [3, 2, 1, 4], [2, 0, 1, 3, 2, 1, 5]])

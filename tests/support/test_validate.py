@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lyceum_warp.support.validate import check_kind, check_tensor, described, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import check_kind, check_tensor, finite_number, layer_sizes, whole_number
 
 
 @pytest.mark.parametrize("value", [3, 3.0, np.int64(3), np.float32(3), torch.tensor(3)])
@@ -62,8 +62,3 @@ def test_tensor_must_have_the_shape_and_type_of_the_buffer() -> None:
             check_tensor(value, "action", buffer)
     with pytest.raises(ValueError, match=r"action must be on cpu, not on meta: move it with \.to\(\)"):
         check_tensor(torch.ones(2, 3, device="meta"), "action", buffer)
-
-
-def test_description_of_a_value_contains_its_type() -> None:
-    assert described(3) == "int 3"
-    assert described(torch.zeros(2)) == "a float32 tensor of shape (2,)"
