@@ -162,13 +162,6 @@ def test_kernels_with_tiles_have_separate_tiles_in_every_thread() -> None:
     assert not wrong
 
 
-def test_phases_are_called_directly_if_graphs_are_disabled() -> None:
-    digits = Digits()
-    phases = [digits.phase(1), digits.phase(2)]
-    calls = graphs(enabled=False).sequence(phases)
-    assert calls == tuple(phase.run for phase in phases)
-
-
 def test_changed_launches_are_captured_again_after_calling_forget() -> None:
     digits, made = Digits(), graphs()
     digit = [1]

@@ -1,7 +1,3 @@
-import os
-import runpy
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -10,53 +6,6 @@ import warp as wp
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-
-SCRIPT = """
-import warp as wp
-from lyceum_warp.graphs.compile_ahead import compile_ahead
-from lyceum_warp.support.warp_log import start_warp
-
-start_warp()
-
-@wp.kernel(module="unique", enable_backward=False)
-def one(a: wp.array[float]):
-    a[wp.tid()] = 1.0
-
-@wp.kernel(module="unique", enable_backward=False)
-def two(a: wp.array[float]):
-    a[wp.tid()] = 2.0
-
-@wp.kernel(module="unique", enable_backward=False)
-def never(a: wp.array[float]):
-    a[wp.tid()] = 3.0
-
-def launches():
-    a = wp.zeros(4, dtype=float)
-    wp.launch(one, 4, [a])
-    wp.launch(two, 4, [a])
-    wp.launch(two, 4, [a])
-    wp.launch(never, 0, [a])
-
-print(len(compile_ahead(launches, wp.get_device("cpu"), "a test")))
-"""
-
-
-@pytest.mark.long
-def test_kernels_are_compiled_once_with_progress_messages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    script, cache = tmp_path / "script.py", tmp_path / "cache"
-    script.write_text(SCRIPT)
-    env = {**os.environ, "WARP_CACHE_PATH": str(cache)}
-    done = subprocess.run([sys.executable, script], env=env, capture_output=True, text=True, check=True)
-    lines = [line for line in done.stderr.splitlines() if "CUDA" not in line]
-    assert done.stdout.strip() == "2"
-    assert lines[0] == "compiling kernels of a test for cpu: 0 of 2 modules, 0 s"
-    (folder,) = {path.parent.parent for path in cache.rglob("*.o")}
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(folder))
-    runpy.run_path(str(script))
-    said = capsys.readouterr()
-    assert (said.out.strip(), said.err) == ("0", "")
 
 
 @pytest.mark.long
