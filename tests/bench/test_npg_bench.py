@@ -1,4 +1,3 @@
-import contextlib
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -52,19 +51,6 @@ def test_rollouts_through_gymnasium_equal_rollouts_of_the_package() -> None:
         assert torch.equal(ours.episode_return[:until, world].isnan(), fed.episode_return[:until, world].isnan())
     later = fed.done.cumsum(0).roll(1, 0) > 0
     assert not fed.episode_return[1:][later[1:]].isnan().any()
-
-
-@pytest.mark.parametrize("mode", ["sync", "async"])
-def test_gymnasium_rollout_continues_the_step_counts_of_the_worlds(mode: str) -> None:
-    env = lw.make("swimmer", nworld=2, nthread=1)
-    state = env.get_state()
-    state[:, env.state_space.parts["step"]] = torch.tensor([[995.0], [998.0]], dtype=torch.float64)
-    env.set_state(state)
-    with contextlib.closing(npg.vector("swimmer", 2, mode)) as envs:
-        fed = npg.GymnasiumRollout(env, 8, envs, seed=0, segments=True)
-        fed.collect(lw.GaussianPolicy(8, 2), torch.zeros(8, 2, 2))
-    assert fed.done.nonzero().tolist() == [[1, 1], [4, 0]] and not fed.terminated.any()
-    assert fed.step[:, 0].tolist() == [995, 996, 997, 998, 999, 0, 1, 2]
 
 
 @pytest.mark.quick("npg")

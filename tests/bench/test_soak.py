@@ -6,7 +6,6 @@ from typing import Any
 import experiment
 import pytest
 import soak
-import torch
 
 import lyceum_warp as lw
 from lyceum_warp.binding.functions import TaskSource
@@ -50,30 +49,6 @@ def test_variant_of_one_of_several_tasks_uses_this_tasks_struct(tmp_path: Path) 
     assert (
         soak.Faults("dm/finger_turn_hard", 0, 8, 8, "auto", "cpu", False, 0.0, 0).state(tmp_path, 1).parent == tmp_path
     )
-
-
-@pytest.mark.long
-def test_soak_chunks_equal_an_uninterrupted_run_bit_for_bit(work: Path, tmp_path: Path) -> None:
-    for name, steps in (("two", "4800"), ("one", "9600")):
-        run(tmp_path / f"{name}.jsonl", *FAULTS, "--steps", steps, "--work", str(work))
-    ends = [torch.load(work / f"point_mass-auto-cpu-16-{steps}-0-same-bits-{chunk}.pt", weights_only=True)
-            for steps, chunk in ((4800, 2), (9600, 1))]  # fmt: skip
-    assert ends[0].keys() == ends[1].keys()
-    assert all(torch.equal(end, ends[1][name]) for name, end in ends[0].items())
-
-
-@pytest.mark.long
-def test_soak_run_continues_on_another_machine_from_stored_states(
-    work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = (*FAULTS, "--steps", "1600", "--work", str(work))
-    first = run(tmp_path / "here.jsonl", *words)
-    assert run(tmp_path / "there.jsonl", *words)[0]["found"] == first[1]["found"]
-    for file in work.glob("*.pt"):
-        file.unlink()
-    (tmp_path / "here.jsonl").write_text((tmp_path / "here.jsonl").read_text().splitlines(keepends=True)[0])
-    assert len(run(tmp_path / "here.jsonl", *words)) == 1
-    assert "skipped: there is no " in capsys.readouterr().out
 
 
 @pytest.mark.long
