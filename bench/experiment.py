@@ -255,6 +255,14 @@ def key(case: Mapping[str, Any]) -> str:
 # shared helpers
 
 
+def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
+    """Group rows by the named entries of their cases."""
+    found: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault(tuple(row.case.get(name) for name in names), []).append(row)
+    return found
+
+
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
     """Divide each contestant's value by the value of the contestant ``unit`` in the same repeat."""
     values: dict[str, dict[int, float]] = {}
@@ -431,7 +439,8 @@ def _values(result: Mapping[str, Any]) -> str:
 
 def main(experiment: Experiment, argv: Sequence[str] | None = None) -> int:
     """Run an experiment and return its exit code: 1 if a case failed, 2 for bad input, 130 after Ctrl-C, else 0."""
-    options = tyro.cli(experiment.options, prog=f"lyceum-warp bench {experiment.name}", args=argv)
+    prog, description = f"lyceum-warp bench {experiment.name}", experiment.summary
+    options = tyro.cli(experiment.options, prog=prog, description=description, args=argv)
     return guarded(lambda: run(experiment, options), experiment.name)
 
 

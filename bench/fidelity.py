@@ -41,8 +41,6 @@ APART = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Options of the comparison of engines."""
-
     steps: int = 1000
     """Number of compared steps; at most the length of an episode."""
     nworld: int = 128

@@ -69,8 +69,6 @@ BESIDE = {
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Test whether a robot walks: measure its motion under fixed commands, and compare it with limits."""
-
     policy: tuple[Path, ...] = ()
     """Folders of runs on a velocity task, for example g1_velocity."""
     which: str = "last"

@@ -10,7 +10,6 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 
 import lyceum_warp as lw
 from lyceum_warp.algos.dense import DensePolicy
-from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.rollout_buffer import Rollout
 
@@ -38,12 +37,6 @@ class GymnasiumRollout(Rollout):
         self.now, _ = self.envs.reset()
         self.elapsed.zero_()
         self.running_return.zero_()
-
-    def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("the step counts of Gymnasium's environments can be set only once")
-
-    def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
-        raise NotImplementedError("Gymnasium's environments can restart only at the end of an episode")
 
     @torch.no_grad()
     def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:

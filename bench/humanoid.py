@@ -43,11 +43,6 @@ CONTESTANTS = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(experiment.Options):
-    """Humanoids controlled by a planner in real time."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Case:
     task: str
     contestant: str
@@ -68,7 +63,7 @@ def settings(task: str) -> str:
     return ", ".join(f"{name} {value}" for name, value in (*planning.settings.items(), *planning.options.items()))
 
 
-def cases(options: Options) -> list[Case]:
+def cases(options: experiment.Options) -> list[Case]:
     """List the episodes; contestants take turns."""
     tasks = choose(options.tasks, TASKS, ("humanoid_stand",) if options.short else (), what="task")
     contestants = choose(options.contestants, CONTESTANTS, what="contestant")
@@ -85,7 +80,7 @@ def estimate(case: Case) -> float:
 
 
 @torch.no_grad()
-def measure(case: Case, options: Options) -> dict[str, Any]:
+def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
     """Run an episode."""
     params = STARTS | TASKS[case.task]
     with experiment.cores(case.threads):
@@ -104,8 +99,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         "speed": ((positions[-1, 0] - positions[0, 0]) / (done.steps * done.timestep)).item(),
         "up_share": up.float().mean().item(), "up_at_the_end": bool(up[-round(0.05 * len(up)) :].all()),
         "plans": report.plans, "misses": report.misses, "plan_ms": report.plan_p50_ms,
-        "plan_p99_ms": report.plan_p99_ms, "plan_max_ms": report.plan_max_ms,
-        "late_steps": int(done.late.sum()), "oldest_action_steps": int(done.age_steps.max()),
+        "plan_max_ms": report.plan_max_ms, "oldest_action_steps": int(done.age_steps.max()),
     }  # fmt: skip
 
 
@@ -121,12 +115,10 @@ def success(task: str, one: dict[str, Any]) -> bool:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    groups: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        kind = tuple(row.case[name] for name in ("task", "contestant", "threads", "settings"))
-        groups.setdefault(kind, []).append(row.result)
+    groups = experiment.grouped(rows, "task", "contestant", "threads", "settings")
     lines = []
-    for (task, name, threads, settings_of_plans), found in groups.items():
+    for (task, name, threads, settings_of_plans), same in groups.items():
+        found = [row.result for row in same]
         plans, misses = (sum(one[key] for one in found) for key in ("plans", "misses"))
         lines.append([
             task, CONTESTANTS[name], str(threads), settings_of_plans,
@@ -152,7 +144,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = experiment.Experiment(
     name="humanoid", summary="Humanoids planned in real time: standing, walking, getting up.",
-    cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
+    cases=cases, estimate=estimate, measure=measure, tables=tables,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -37,8 +37,6 @@ CONTESTANTS = {"mujoco": "C engine", "warp": "Warp engine"}
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Planning times under real-time control, by task, samples, horizon, engine and device."""
-
     samples: tuple[int, ...] = ()
     """Numbers of samples; by default 16, 64, 256 and 1024."""
     horizons: tuple[int, ...] = ()

@@ -42,8 +42,6 @@ JUDGED, RECENT, WALKED = 16, 100, (256, 500)
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Time until NPG or PPO reaches a target return."""
-
     algorithm: Literal["npg", "ppo"] | None = None
     """Algorithm; by default, the one listed in TARGETS for the task."""
     settings: tuple[str, ...] = ("default",)
@@ -164,10 +162,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo"):
-            groups.setdefault(row.case["setting"], []).append(row)
+    groups = experiment.grouped(rows, "task", "algorithm", "setting")
+    groups = {setting: same for (*what, setting), same in groups.items() if what == ["go1_velocity", "ppo"]}
     if not groups:
         return None
     made = new_figure("learning", 6.5, 3.9)

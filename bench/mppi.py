@@ -49,8 +49,6 @@ ON_WARP = ("mppi_warp", "mppi_warp_together")
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Episodes controlled by MPPI, and planning times."""
-
     parts: tuple[str, ...] = ()
     """Parts: plans, episodes; by default both."""
     episodes: int = 100

@@ -88,8 +88,6 @@ TRPO = {"swimmer": _TRPO | {"gamma": 0.9999}, "hopper": _TRPO, "walker2d": _TRPO
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Learning curves of NPG, PPO and TRPO."""
-
     threads: int | None = 2
     """Cores per case. Learners of stable-baselines3 use only one core, and so do learners on a GPU."""
     samples: int = 1_000_000

@@ -56,8 +56,6 @@ COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Seconds and samples from process start until a policy reaches a threshold."""
-
     cache: tuple[Literal["warm", "cold"], ...] = ("warm",)
     """State of the cache of compiled kernels."""
     seconds: float = 540.0
@@ -168,10 +166,7 @@ def timed(
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        kind = tuple(row.case[name] for name in ("task", "target", "device", "cache", "flags"))
-        groups.setdefault(kind, []).append(row)
+    groups = experiment.grouped(rows, "task", "target", "device", "cache", "flags")
     lines = []
     for (task, target, device, cached, flags), same in groups.items():
         results = [row.result for row in same]

@@ -121,8 +121,6 @@ class Soak({parent}):
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Very long runs: inject faults, measure memory, and kill training runs."""
-
     parts: tuple[str, ...] = ()
     """Parts: faults, random, memory, kills; by default all."""
     engine: str = "auto"
@@ -404,7 +402,6 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
         "injected": dict(zip(KINDS, injected.sum(0).tolist()[1:], strict=True)),
         "found": dict(zip(KINDS, found, strict=True)), "beside": beside, "other": other,
         "counts_agree": counts == env.fault_counts,
-        "twin_faults": sum(twin.fault_counts.values()) if case.compared else 0,
         "compared": compared, "different": different, "not_finite": infinite, "steps": steps * case.nworld,
         "memory": samples, "steps_per_second": steps * case.nworld / seconds,
     }  # fmt: skip
@@ -479,12 +476,11 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
     start = [*program, case.task, *case.words.split(), *quiet, "--seed", str(case.seed), "--out"]
     subprocess.run([*start, str(straight)], check=True, stdout=subprocess.DEVNULL)
     resume = [*program, "--resume", str(killed), "--iterations", str(len(table(straight))), *quiet]
-    draws, kills, restarts, code = random.Random(case.seed), 0, 0, -1
+    draws, kills, code = random.Random(case.seed), 0, -1
     while code < 0:
         saved = (killed / "checkpoint.pt").exists()
-        if killed.exists() and not saved:
-            restarts += 1
-            shutil.rmtree(killed)
+        if not saved:
+            shutil.rmtree(killed, ignore_errors=True)
         rows = len(table(killed))
         process = subprocess.Popen(resume if saved else [*start, str(killed)], stdout=subprocess.DEVNULL)
         try:
@@ -498,7 +494,7 @@ def kill(case: Kills, options: Options) -> dict[str, Any]:
         code = process.wait()
     policies = [lw.load(folder).state_dict() for folder in (straight, killed)]
     return {
-        "kills": kills, "restarts": restarts, "exit_code": code, "iterations": len(table(straight)),
+        "kills": kills, "exit_code": code, "iterations": len(table(straight)),
         "equal_rows": table(straight) == table(killed),
         "equal_policy": all(torch.equal(value, policies[1][name]) for name, value in policies[0].items()),
     }  # fmt: skip

@@ -51,8 +51,6 @@ CPU_WORLDS = 512
 
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
-    """Environment steps per second of lyceum_warp, native C and other libraries."""
-
     parts: tuple[str, ...] = ()
     """Parts: sampling, suite, single, cores, worlds, kept; by default all."""
     seconds: float = 1.0
@@ -142,14 +140,11 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str, *by: str) -> dict[tuple[Any, ...], list[Row]]:
-    found: dict[tuple[Any, ...], list[Row]] = {}
     order = {task: place for place, task in enumerate(TASKS)}
     mine = [row for row in rows if row.case["part"] == part]
     mine.sort(key=lambda row: (order.get(row.case["task"], len(order)), row.case["task"], row.case["threads"],
                                row.case["worlds"]))  # fmt: skip
-    for row in mine:
-        found.setdefault(tuple(row.case.get(name) for name in by), []).append(row)
-    return found
+    return experiment.grouped(mine, *by)
 
 
 def rates(rows: Sequence[Row], contestant: str) -> list[float]:

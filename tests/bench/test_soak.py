@@ -77,10 +77,6 @@ def test_killed_and_resumed_training_equals_uninterrupted_training(work: Path, t
     assert len(memory["memory"]) == soak.SAMPLES and memory["bytes_per_env"] < 1e6
 
 
-def test_memory_growth_excludes_the_first_sample() -> None:
-    assert soak.slope([[100, 9**9], [200, 3000], [300, 5000], [400, 7000]], 1) == pytest.approx(20.0)
-
-
 def test_soak_run_with_random_actions_counts_faults_without_injecting_any(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
