@@ -170,9 +170,3 @@ def test_a_value_function_moves_to_the_device_of_the_plans(samples: int) -> None
         plan = lw.MPPI("hopper", device=CUDA, horizon=2, samples=samples, nthread=1, value=value)
         assert plan.env.device.is_cpu == (samples == 8)
         assert torch.isfinite(plan(plan.state_of())).all()
-
-
-def test_rollouts_of_few_samples_run_on_the_cpu() -> None:
-    assert lw.MPPI("reach", device=CUDA, samples=8).env.engine.name == "mujoco"
-    assert lw.MPPI("reach", device=CUDA, samples=8, nthread=1, nconmax=16).env.device.is_cpu
-    assert lw.MPPI("reach", device=CUDA, samples=64, nthread=1).env.engine.name == "warp"

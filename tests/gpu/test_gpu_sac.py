@@ -1,4 +1,3 @@
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -68,12 +67,6 @@ def test_learner_captures_new_graphs_after_loading_a_state() -> None:
         first, second = next(one), next(other)
         assert second.critic_loss == pytest.approx(first.critic_loss, rel=2e-2, abs=1e-3)
         assert second.temperature == pytest.approx(first.temperature, rel=1e-3)
-
-
-def test_sac_run_resumes_on_a_gpu(tmp_path: Path) -> None:
-    for iterations, resume in ((2, False), (4, True)):
-        run = lw.train(made(), tmp_path / "run", iterations=iterations, resume=resume)
-    assert [row["iteration"] for row in run.rows()] == [1, 2, 3, 4]
 
 
 def test_sac_learns_on_a_gpu() -> None:
