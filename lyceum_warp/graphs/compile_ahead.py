@@ -16,8 +16,8 @@ from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.upstream import is_compiled
 
 
-def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> list[str]:
-    """Compile the uncached kernels that a function launches, report progress on stderr, and return the modules' names.
+def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str) -> None:
+    """Compile the uncached kernels that a function launches, and report progress on stderr.
 
     The function runs without its kernels, so its arrays may contain garbage afterwards. ``purpose``, such as "hopper",
     is part of the report.
@@ -27,7 +27,7 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
     wanted = list(dict.fromkeys((module, _block(device, block)) for module, block in modules))
     missing = [(module, block) for module, block in wanted if not is_compiled(module, block, device)]
     if not missing:
-        return []
+        return
     with LongWork(f"compiling kernels of {purpose} for {device.alias}", "modules", wait=0.0) as report:
         report(0, len(missing))
         pool = concurrent.futures.ThreadPoolExecutor(min(cpu_cores(), len(missing)))
@@ -41,7 +41,6 @@ def compile_ahead(function: Callable[[], None], device: wp.Device, purpose: str)
                 report(done, len(missing))
         finally:
             pool.shutdown(cancel_futures=True)  # cancel remaining modules after an error or Ctrl-C
-    return [module.name for module, _ in missing]
 
 
 def _block(device: wp.Device, block: int | None) -> int:

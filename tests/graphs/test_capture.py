@@ -49,16 +49,6 @@ def test_consecutive_phases_become_one_graph_in_the_second_call() -> None:
     assert digits.calls == 6  # the first call launches kernels, and the second call captures graphs
 
 
-def test_engine_calls_without_launches_run_between_graphs() -> None:
-    digits = Digits()
-    phases = [digits.phase(1), digits.phase(2), digits.phase(3, engine=True), digits.phase(4)]
-    calls = graphs(capture_engine=False).sequence(phases)
-    assert len(calls) == 3
-    assert calls[1] is phases[2].run
-    assert [digits.after(calls) for _ in range(4)] == [1234] * 4
-    assert digits.calls == 2 * 3 + 4
-
-
 @wp.kernel(enable_backward=False)
 def follow(digit: int, number_inout: wp.array[int], first: int):
     w = first + wp.tid()
