@@ -17,7 +17,7 @@ from lyceum_warp.engines import memory
 from lyceum_warp.engines.deterministic import order_kernels as order
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
-from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
+from lyceum_warp.engines.deterministic.sort_memory import Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.fields import describe
 
@@ -201,12 +201,3 @@ def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch)
         assert scratch.allocate(300) == -300
         scratch.deallocate(-300, 300)
     assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048
-
-
-def test_scratch_memory_for_many_worlds_is_extrapolated_from_few_worlds() -> None:
-    def capture(nworld: int) -> Scratch:
-        return types.SimpleNamespace(peak=1000 + 7 * nworld, largest=100 + 3 * nworld)  # type: ignore[return-value]
-
-    sizes = ScratchSizes.probe(capture)
-    assert sizes == ScratchSizes(fixed=1000, each=7, most=(LARGEST_BUFFER - 100) // 3)
-    assert sizes.bytes_of(10**6) == 7_001_000

@@ -4,6 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
+from test_refresh import WholeWarpEngine
 from toy_engine import ToyEngine
 
 from lyceum_warp.engines.base import Engine
@@ -157,12 +158,6 @@ def test_rollout_uses_the_model_fields_of_each_state(
                 np.testing.assert_array_equal(planner.arrays[name].numpy(), source.arrays[name].numpy())
         source.reset(worlds())
         source.set_state(state, worlds())
-
-
-class WholeWarpEngine(WarpEngine):
-    """A Warp engine whose ``settle`` runs forward passes of all worlds."""
-
-    partial_refresh = False
 
 
 @pytest.mark.parametrize("engine", [*ENGINES, WholeWarpEngine])

@@ -123,7 +123,9 @@ def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) 
         put(engine, state, only(engine, 1, 2))
         check_current(engine)
         np.testing.assert_array_equal(state_of(engine)[1:3], state[1:3])
+        before = state_of(engine)
         begin(engine, only(engine, 3), steps)
+        np.testing.assert_array_equal(state_of(engine)[:3], before[:3])
         check_current(engine, whole=True, worlds=slice(3, 4))
         check_current(engine)
         begin(engine, everyone(engine), steps)
@@ -175,27 +177,15 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
 
 
 @pytest.mark.quick("mujoco", "warp")
-def test_refresh_does_not_extend_the_history_of_a_sensor(kind: type[Engine]) -> None:
-    engine = make(kind, "histories")
-    parts = mujoco.mj_stateSize(engine.model, mujoco.mjtState.mjSTATE_HISTORY.value)
-    assert parts > 0
+def test_reset_clears_the_histories_of_sensors(kind: type[Engine]) -> None:
+    used, fresh = make(kind, "histories"), make(kind, "histories")
+    assert mujoco.mj_stateSize(used.model, mujoco.mjtState.mjSTATE_HISTORY.value) > 0
     for _ in range(4):
-        engine.step(1)
-        before = state_of(engine)
-        engine.refresh_current(everyone(engine))
-        np.testing.assert_array_equal(state_of(engine), before)
-        engine.refresh(only(engine, 1))
-        size = engine.integration_size
-        np.testing.assert_array_equal(state_of(engine)[:, :size], before[:, :size])
-    before = state_of(engine)
-    begin(engine, only(engine, 2), 5)
-    others = [0, 1, 3]
-    np.testing.assert_array_equal(state_of(engine)[others], before[others])
-    fresh = make(kind, "histories")
-    for made in (engine, fresh):
-        begin(made, everyone(made), 6)
-        made.step(2)
-    np.testing.assert_array_equal(state_of(engine), state_of(fresh))
+        used.step(1)
+    for engine in (used, fresh):
+        begin(engine, everyone(engine), 6)
+        engine.step(2)
+    np.testing.assert_array_equal(state_of(used), state_of(fresh))
 
 
 @pytest.mark.quick("mujoco", "warp")
@@ -247,9 +237,3 @@ def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:
             rows = np.concatenate([engine.arrays[field.name].numpy() for engine in apart])
             np.testing.assert_array_equal(together.arrays[field.name].numpy(), rows, err_msg=f"{field.name} {lagged}")
             assert len(np.unique(rows.reshape(4, -1), axis=0)) == 4, field.name
-    early = early_sensor_columns(model)  # all other sensors keep the values of the last substep
-    for state, shown in zip(together.batch.state, together.arrays["sensordata"].numpy(), strict=True):
-        data = mujoco.MjData(model)
-        mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_forward(model, data)
-        np.testing.assert_array_equal(shown[early], data.sensordata[early].astype(np.float32))

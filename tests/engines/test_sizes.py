@@ -95,28 +95,6 @@ def test_randomized_fields_that_add_contacts_log_a_warning(
     assert not caplog.messages
 
 
-EQUALITIES = {"connect": 3, "weld": 6, "joint": 1, "tendon": 1}
-JOINED = """<mujoco><option gravity="0 0 0"/><worldbody>
-<body name="a"><joint name="a" range="-1 1" limited="true"/><geom size=".1" contype="0"/></body>
-<body name="b" pos="1 0 0"><joint name="b" range="-1 1" limited="true"/><joint axis="0 1 0"/><joint axis="1 0 0"/>
-<geom size=".1" contype="0"/></body></worldbody>
-<tendon><fixed name="t" limited="true" range="-1 1"><joint joint="a" coef="1"/></fixed></tendon>
-<equality>{}</equality></mujoco>"""
-OBJECTS = {
-    "connect": '<connect body1="a" body2="b" anchor=".1 0 .1" active="{}"/>',
-    "weld": '<weld body1="a" body2="b" active="{}"/>',
-    "joint": '<joint joint1="a" active="{}"/>',
-    "tendon": '<tendon tendon1="t" active="{}"/>',
-}
-
-
-@pytest.mark.parametrize("kind", OBJECTS)
-def test_buffers_have_rows_for_inactive_constraints_of_every_type(kind: str) -> None:
-    model = mujoco.MjModel.from_xml_string(JOINED.format(10 * OBJECTS[kind].format("false")))
-    without = mujoco.MjModel.from_xml_string(JOINED.format(""))
-    assert probe_sizes(model)[1] - probe_sizes(without)[1] == -(-10 * EQUALITIES[kind] // 8) * 8
-
-
 def test_buffers_have_rows_for_every_limit_if_ranges_are_randomized() -> None:
     joints = "".join(
         f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)

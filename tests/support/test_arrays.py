@@ -14,11 +14,6 @@ def test_flat_view_has_one_row_per_world_in_the_same_memory(dtype: type, shape: 
     assert alias.ptr == array.ptr
 
 
-def test_flat_view_keeps_the_memory_alive() -> None:
-    alias = flat(wp.full((2, 3), 5.0, dtype=float, device="cpu"))
-    assert alias.numpy().tolist() == [[5.0] * 3] * 2
-
-
 @pytest.mark.parametrize("widths", [[1], [3, 2, 1, 4], [2, 0, 1, 3, 2, 1, 5]])
 def test_several_arrays_are_copied_to_separate_targets_in_masked_worlds(widths: list[int]) -> None:
     mask = wp.array([True, False, True], dtype=bool, device="cpu")
@@ -29,3 +24,8 @@ def test_several_arrays_are_copied_to_separate_targets_in_masked_worlds(widths: 
     launch_several_rows(state.narrow_four, mask, list(zip(wide, back, strict=True)))
     for k, (width, copied) in enumerate(zip(widths, back, strict=True)):
         assert copied.numpy().tolist() == [[0.5 + k] * width, [0.0] * width, [0.5 + k] * width]
+
+
+def test_flat_view_keeps_the_memory_alive() -> None:
+    alias = flat(wp.full((2, 3), 5.0, dtype=float, device="cpu"))
+    assert alias.numpy().tolist() == [[5.0] * 3] * 2

@@ -28,11 +28,6 @@ main(["check", "hopper", "--device", "cuda"])
     assert "NVIDIA CUDA driver" in error
 
 
-@WITHOUT_GPU
-def test_warp_alone_prints_that_the_driver_is_missing() -> None:
-    assert "CUDA" in printed("import warp as wp; wp.config.log_level = wp.LOG_WARNING; wp.init()")[1]
-
-
 def test_other_output_at_the_start_of_warp_is_still_printed() -> None:
     program = """
 import logging, os, sys
