@@ -96,13 +96,8 @@ def separate_captures() -> None:
         setattr(wp._src.context.Runtime, name, _PerThread())
 
 
-class _Tiles(threading.local):
-    """Whether this thread launched a kernel with tiles."""
-
-    launched = False
-
-
-tiles = _Tiles()
+tiles = threading.local()
+"""Its attribute ``launched`` says whether this thread launched a kernel with tiles since the attribute was cleared."""
 TILES_ON_CPU = threading.RLock()
 """A thread holds this lock while it launches a tiled kernel on the CPU. On x86, the address of a kernel's tiles is in a
 static variable, so two threads would overwrite each other's tiles."""

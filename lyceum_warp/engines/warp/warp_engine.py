@@ -79,7 +79,6 @@ class WarpEngine(Engine):
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
             self.d = self._make_data(nworld)
-        self.naconmax = self.d.naconmax
         with wp.ScopedDevice(device):
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
             self._history = wp.zeros_like(self.d.history)
@@ -261,7 +260,7 @@ class WarpEngine(Engine):
         with self._on_device():
             mjw.get_state(self.m, self.d, self._state, _SPEC)
         values = {name: self.arrays[name].numpy() for name in self.dynamics}
-        room = {"nconmax": self.naconmax / self.nworld, "njmax": self.njmax}
+        room = {"nconmax": self.d.naconmax / self.nworld, "njmax": self.njmax}
         warn_of_little_room(self.model, self._state.numpy(), self.dynamics.values(), values, **room)
 
     def reset(self, mask: wp.array) -> None:
