@@ -211,22 +211,24 @@ def test_worlds_with_different_models_need_more_memory(engine: type[Engine]) -> 
 SLIDERS = """<mujoco><worldbody>
 <body><joint type="slide" axis="1 0 0" armature=".5"/><joint type="slide" axis="0 0 1"/>
 <geom size=".1" mass="1"/></body>
-<body><joint axis="0 1 0"/><geom size=".1" mass="1"/></body>
+<body><joint name="h" axis="0 1 0"/><geom size=".1" mass="1"/></body>
 <body><joint type="slide" axis="1 0 0"/><geom size=".1" mass="1"/>
 <body><joint type="slide" axis="0 0 1"/><geom size=".1" mass="2"/></body></body>
-</worldbody></mujoco>"""
+</worldbody><actuator><motor joint="h"/></actuator></mujoco>"""
 
 
-def test_inverse_weights_equal_those_of_a_compiled_model() -> None:
+def test_derived_constants_equal_those_of_a_compiled_model() -> None:
     """MuJoCo sets the inverse weight to 0 if a body cannot move in a direction."""
     model = mujoco.MjModel.from_xml_string(SLIDERS)
-    engine = make(WarpEngine, "body_mass", nworld=2, model=model)
+    engine = make(WarpEngine, "body_mass", "actuator_gear", nworld=2, model=model)
     for scale in (1.0, 2.0):
         engine.arrays["body_mass"].numpy()[1] = scale * model.body_mass
+        engine.arrays["actuator_gear"].numpy()[1] = scale * model.actuator_gear
         engine.apply_model(worlds(2))
         wanted = copy.copy(model)
         wanted.body_mass[:] = (scale * model.body_mass).astype(np.float32)
+        wanted.actuator_gear[:] = scale * model.actuator_gear
         mujoco.mj_setConst(wanted, mujoco.MjData(wanted))
-        for name in ("body_invweight0", "dof_invweight0"):
+        for name in ("body_invweight0", "dof_invweight0", "actuator_acc0"):
             found = getattr(engine.m, name).numpy()[1]  # type: ignore[attr-defined]
             np.testing.assert_allclose(found, getattr(wanted, name), rtol=1e-5, err_msg=name)
