@@ -1,14 +1,12 @@
 import dataclasses
 import json
 import os
-import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import experiment
-import overview
 import plot
 import pytest
 import tables
@@ -117,13 +115,6 @@ def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 14) == 1
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
-
-
-def test_overview_lists_the_experiments(capsys: pytest.CaptureFixture[str]) -> None:
-    overview.main()
-    out = capsys.readouterr().out
-    assert "--short" in out and "lyceum-warp bench plot" in out
-    assert all(re.search(rf"^{name} +\S", out, re.MULTILINE) for name in experiment.NAMES)
 
 
 def test_results_file_with_invalid_lines_raises_an_error(

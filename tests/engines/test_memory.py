@@ -72,9 +72,3 @@ def test_memory_estimate_of_the_c_engine_covers_its_worlds(fields: tuple[str, ..
     most = nworld * 1.5 * env.bytes_per_world + 30e6
     assert most < nworld * 100_000
     assert resident() - before < most
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_bytes_per_world_do_not_depend_on_the_number_of_worlds(engine: str) -> None:
-    few, many = (lw.make("point_mass", engine=engine, nworld=n).bytes_per_world for n in (2, 64))
-    assert few == many > 0

@@ -14,10 +14,6 @@ def many() -> MPPI:
     return MPPI("point_mass", horizon=8, samples=4000, noise=[0.02, 0.05], temperature=1e9)
 
 
-def first_state(seed: int) -> torch.Tensor:
-    return lw.make("reach", seed=seed).get_state()[0]
-
-
 def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
     many.reset(0)
     draws = []
@@ -69,7 +65,7 @@ def test_noise_of_a_sample_does_not_depend_on_the_number_of_samples() -> None:
 @pytest.mark.parametrize("temperature", [1e-6, 1e-30])
 def test_plan_with_low_temperature_equals_the_best_sample(temperature: float) -> None:
     plan = MPPI("reach", temperature=temperature)
-    plan(first_state(0))
+    plan(lw.make("reach", seed=0).get_state()[0])
     best = plan.returns.argmax()
     assert plan.weights[best] == 1 and plan.weights.sum() == 1
     assert torch.equal(plan.actions, plan.sampled[:, best])
@@ -79,7 +75,7 @@ def test_plan_with_low_temperature_equals_the_best_sample(temperature: float) ->
 @pytest.mark.parametrize("temperature", [1e9, 1e60])
 def test_plan_with_high_temperature_is_the_mean_of_all_samples(temperature: float) -> None:
     plan = MPPI("reach", temperature=temperature)
-    plan(first_state(0))
+    plan(lw.make("reach", seed=0).get_state()[0])
     torch.testing.assert_close(plan.actions, plan.sampled.mean(1))
     assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
 
