@@ -34,8 +34,6 @@ TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
 }
 """By task: algorithm, target return, worlds, samples per iteration, and iterations between evaluations (0: none)."""
 
-SETTINGS: dict[str, dict[str, Any]] = {"default": {}, "desired_kl 0.01": {"desired_kl": 0.01}}
-
 JUDGED, RECENT, WALKED = 16, 100, (256, 500)
 """Number of episodes in an evaluation, number of episodes in a mean return, and (worlds, steps) of the walking test."""
 
@@ -44,8 +42,6 @@ JUDGED, RECENT, WALKED = 16, 100, (256, 500)
 class Options(experiment.Options):
     algorithm: Literal["npg", "ppo"] | None = None
     """Algorithm; by default, the one listed in TARGETS for the task."""
-    settings: tuple[str, ...] = ("default",)
-    """Names of the settings to run: default, or "desired_kl 0.01" (PPO only)."""
     seconds: float = 300.0
     """Maximum duration of a run in seconds."""
 
@@ -54,7 +50,6 @@ class Options(experiment.Options):
 class Case:
     task: str
     algorithm: str
-    setting: str
     seed: int
     nworld: int
     target: float
@@ -64,20 +59,18 @@ class Case:
 
 def cases(options: Options) -> list[Case]:
     tasks = choose(options.tasks, TARGETS, ("hopper",) if options.short else (), what="task")
-    settings = choose(options.settings, SETTINGS, what="setting")
     return [
-        Case(task, options.algorithm or TARGETS[task][0], setting, seed, 8 if options.short else TARGETS[task][2],
+        Case(task, options.algorithm or TARGETS[task][0], seed, 8 if options.short else TARGETS[task][2],
              TARGETS[task][1], 1.0 if options.short else options.seconds, options.device)
-        for task in tasks for setting in settings for seed in options.seeds or range(1 if options.short else 3)
+        for task in tasks for seed in options.seeds or range(1 if options.short else 3)
     ]  # fmt: skip
 
 
 def learner(case: Case, nworld: int, **changes: Any) -> Any:
     env = lw.make(case.task, nworld=nworld, seed=case.seed, device=case.device)
-    words = {**changes, **SETTINGS[case.setting]}
     if case.algorithm == "ppo":
-        return lw.PPO(env, config=lw.PPOConfig(**words), seed=case.seed)
-    return lw.NPG(env, config=lw.NPGConfig(**words), seed=case.seed)
+        return lw.PPO(env, config=lw.PPOConfig(**changes), seed=case.seed)
+    return lw.NPG(env, config=lw.NPGConfig(**changes), seed=case.seed)
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
@@ -147,35 +140,34 @@ WALK = {"velocity_error": "velocity error, m/s", "yaw_rate_error": "yaw rate err
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    lines, tasks, settings = [], list(TARGETS), list(SETTINGS)
+    lines, tasks = [], list(TARGETS)
     walk = {name: title for name, title in WALK.items() if any(name in row.result for row in rows)}
-    for row in sorted(rows, key=lambda row: (tasks.index(row.case["task"]), settings.index(row.case["setting"]))):
+    for row in sorted(rows, key=lambda row: tasks.index(row.case["task"])):
         case, result = row.case, row.result
         reached = f"{result['seconds']:.1f}" if result["reached"] else f"not in {result['seconds']:.0f}"
         lines.append([
-            case["task"], case["algorithm"].upper(), case["setting"], f"{case['nworld']:,}", f"{case['target']:,g}",
+            case["task"], case["algorithm"].upper(), f"{case['nworld']:,}", f"{case['target']:,g}",
             str(case["seed"]), reached, f"{result['samples'] / 1e6:.1f}",
             *(f"{result[name]:.3g}" if name in result else "" for name in walk),
         ])  # fmt: skip
-    header = ["task", "algorithm", "setting", "worlds", "target", "seed", "seconds", "million samples", *walk.values()]
+    header = ["task", "algorithm", "worlds", "target", "seed", "seconds", "million samples", *walk.values()]
     return [Table("Seconds of sampling and learning until the mean return reaches a target.", header, lines)]
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    groups = experiment.grouped(rows, "task", "algorithm", "setting")
-    groups = {setting: same for (*what, setting), same in groups.items() if what == ["go1_velocity", "ppo"]}
-    if not groups:
+    runs = [row for row in rows if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo")]
+    if not runs:
         return None
     made = new_figure("learning", 6.5, 3.9)
     axes = made.subplots()
-    for (setting, same), (color, marker, line) in zip(groups.items(), STYLES, strict=False):
-        for k, row in enumerate(same):
-            _, seconds, returns = zip(*row.result["curve"], strict=True)
-            axes.plot(seconds, returns, color=color, linestyle=line, marker=marker, markevery=0.15, markersize=4,
-                      linewidth=1.3, label=f"lyceum_warp, {setting}" if k == 0 else None)  # fmt: skip
+    color, marker, line = STYLES[0]
+    for k, row in enumerate(runs):
+        _, seconds, returns = zip(*row.result["curve"], strict=True)
+        axes.plot(seconds, returns, color=color, linestyle=line, marker=marker, markevery=0.15, markersize=4,
+                  linewidth=1.3, label="lyceum_warp" if k == 0 else None)  # fmt: skip
     with (experiment.RESULTS / "ppo-go1_velocity-mjlab.csv").open(newline="") as file:
         points = [(float(row["seconds"]), float(row["return_recent"])) for row in csv.DictReader(file)]
-    color, marker, line = STYLES[len(groups)]
+    color, marker, line = STYLES[1]
     axes.plot(*zip(*points, strict=True), color=color, linestyle=line, marker=marker, label="mjlab 1.6.0 with rsl_rl")
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("seconds of sampling and learning")

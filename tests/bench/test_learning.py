@@ -18,7 +18,7 @@ def test_learning_run_ends_at_its_target(
     result = json.loads(out.read_text())["result"]
     assert result["reached"] and result["curve"][-1][0] == result["samples"]
     assert result["curve"][-1][1] == pytest.approx(result["seconds"], abs=1e-4) and result["curve"][-1][2] >= 0.0
-    assert f"| hopper | {algorithm.upper()} | default | 8 | 0 | 0 |" in capsys.readouterr().out
+    assert f"| hopper | {algorithm.upper()} | 8 | 0 | 0 |" in capsys.readouterr().out
 
 
 def test_standing_robot_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -27,7 +27,7 @@ def test_standing_robot_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(learning, "WALKED", (8, 50))
     env = lw.make("go1_velocity", nworld=2)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    case = learning.Case("go1_velocity", "ppo", "default", 0, 8, 80.0, 1.0, "cpu")
+    case = learning.Case("go1_velocity", "ppo", 0, 8, 80.0, 1.0, "cpu")
     found = learning.walk(case, policy)
     assert 0.1 < found["velocity_error"] < 2.0 and found["falls_per_world_second"] >= 0.0
 
