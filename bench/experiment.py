@@ -85,6 +85,16 @@ class Options:
 
 
 @dataclasses.dataclass(frozen=True)
+class Stored:
+    """Options of the programs that read stored results."""
+
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """Names of the experiments; by default all that have results."""
+    results: Path = RESULTS
+    """Folder with the results, to which the program writes."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Row:
     """One result, stored as a line of the results file."""
 

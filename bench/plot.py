@@ -1,24 +1,12 @@
 """Draw the figures of experiments from stored results, as PNG files."""
 
-import dataclasses
 import sys
-from pathlib import Path
 
 import experiment
 import tyro
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Draw a figure for each experiment and machine with stored results."""
-
-    names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Names of the experiments; by default all that have results."""
-    results: Path = experiment.RESULTS
-    """Folder with the results; the figures are written to it."""
-
-
-def main(options: Options) -> int:
+def main(options: experiment.Stored) -> int:
     for name, path in experiment.stored(options.names, options.results).items():
         draw = experiment.load(name).figure
         for machine, rows in experiment.by_machine(experiment.read(path)).items() if draw else ():
@@ -30,5 +18,5 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Options, prog="lyceum-warp bench plot")
+    options = tyro.cli(experiment.Stored, prog="lyceum-warp bench plot", description=__doc__)
     sys.exit(experiment.guarded(lambda: main(options), "plot"))

@@ -1,8 +1,6 @@
 """Write the tables of experiments from stored results as results/NAME.md."""
 
-import dataclasses
 import sys
-from pathlib import Path
 
 import experiment
 import tyro
@@ -10,17 +8,7 @@ import tyro
 from lyceum_warp.support.files import replaced
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Write a page of tables for each experiment with stored results."""
-
-    names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Names of the experiments; by default all that have results."""
-    results: Path = experiment.RESULTS
-    """Folder with the results; the pages are written to it."""
-
-
-def main(options: Options) -> int:
+def main(options: experiment.Stored) -> int:
     for name, path in experiment.stored(options.names, options.results).items():
         found = experiment.load(name)
         parts = [f"# {name}", f"{found.summary} Written by `lyceum-warp bench tables {name}` from `{path.name}`."]
@@ -40,5 +28,5 @@ def main(options: Options) -> int:
 
 
 if __name__ == "__main__":
-    options = tyro.cli(Options, prog="lyceum-warp bench tables")
+    options = tyro.cli(experiment.Stored, prog="lyceum-warp bench tables", description=__doc__)
     sys.exit(experiment.guarded(lambda: main(options), "tables"))

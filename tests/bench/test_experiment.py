@@ -151,17 +151,17 @@ def test_figures_and_tables_are_made_from_stored_results(
 ) -> None:
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
-    assert plot.main(plot.Options(("toy",), tmp_path)) == 0
+    assert plot.main(experiment.Stored(("toy",), tmp_path)) == 0
     drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
     assert len(drawn) == 1
     for _ in range(2):
-        assert plot.main(plot.Options(("toy",), tmp_path)) == tables.main(tables.Options((), tmp_path)) == 0
+        assert plot.main(experiment.Stored(("toy",), tmp_path)) == tables.main(experiment.Stored((), tmp_path)) == 0
         text = (tmp_path / "toy.md").read_text()
         assert text.startswith("# toy\n") and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1
     assert drawn == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
     assert not toy.measured
     with pytest.raises(FileNotFoundError, match="run an experiment first"):
-        plot.main(plot.Options((), tmp_path / "empty"))
+        plot.main(experiment.Stored((), tmp_path / "empty"))
 
 
 @pytest.mark.long

@@ -39,7 +39,7 @@ def test_throughput_is_measured_once_and_written_as_a_table(tmp_path: Path, caps
     assert run("throughput", out, *words) == 0 and len(lines(out)) == len(rows)
     assert "6 of 6 cases are stored" in capsys.readouterr().out
 
-    assert plot.main(plot.Options(("throughput",), tmp_path)) == 0
+    assert plot.main(experiment.Stored(("throughput",), tmp_path)) == 0
     assert len([*tmp_path.glob("throughput-*.png")]) == 1
 
 
