@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from form_tasks import Practiced
+from form_tasks import Gifted
 from plain_mppi import Plain
 from rail_task import Picky, rail
 from varied_task import Params as VariedParams
@@ -371,7 +371,7 @@ def test_random_events_differ_between_samples_and_iterations() -> None:
         drawn.append(obs[:, 1].double())  # a sum of random numbers, one for each step
         return obs[:, 0]
 
-    plan = MPPI(Practiced, horizon=3, samples=200, iterations=2, seed=4, value=value)
+    plan = MPPI(Gifted, horizon=3, samples=200, iterations=2, seed=4, value=value)
     state = plan.state_of()
     plan(state), plan(state)
     found = torch.stack(drawn[-4:])
