@@ -58,7 +58,7 @@ class Options(experiment.Options):
     block: int = 10
     """Number of episodes that a contestant runs per turn."""
     seconds: float = 20.0
-    """Seconds for the plans of a case; at least ten plans are made."""
+    """Seconds for which a case makes plans; it makes at least ten."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Render the gallery: MUJOCO_GL=egl python docs/gallery.py [--runs FOLDER] [TASK ...].
 
-The policy of a run in FOLDER controls its task; the default is a pretrained policy. MPPI controls the other tasks. The
-program writes animations and results into docs/images/gallery/, and then the page gallery.md. By default, it renders
-all tasks.
+If FOLDER contains a run, its policy controls the run's task. Otherwise, a pretrained policy does. MPPI controls the
+other tasks. The program writes animations and results into docs/images/gallery/, and then the page gallery.md. By
+default, it renders all tasks.
 """
 
 import argparse

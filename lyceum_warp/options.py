@@ -1,7 +1,7 @@
 """Define the options of an environment and of its physics.
 
-``EnvOptions`` and ``PhysicsOptions`` determine the arguments of ``make``, ``replicate`` and MPPI, the command line and
-the help texts. To add an option, add a field to one of these classes.
+A field of ``EnvOptions`` or ``PhysicsOptions`` is an argument of ``make``, ``replicate`` and MPPI, and a flag of the
+command line. To add an option, add a field to one of these classes.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""Compute the tables of a walking robot from its compiled model, and prepare models for walking.
+"""Find a walking robot's feet, joints and mirror image in its compiled model, and prepare models for walking.
 
 Functions with the arguments ``(model, p)`` are for ``lw.from_model``. The parameters ``p.joints`` and ``p.feet`` are
 indices of the joints and of the feet's sites. The base is the body of the first joint, which must be a free joint.

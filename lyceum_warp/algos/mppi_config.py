@@ -142,7 +142,7 @@ class MPPIConfig:
         }
         if adapts and np.ndim(self.noise) == 2:
             raise ValueError(
-                f"noise of update={self.update!r} must be standard deviations, not a covariance {self.noise!r}"
+                f"noise of update={self.update!r} must be standard deviations; a covariance was given: {self.noise!r}"
             )
         if self.update == "cem":
             chosen["elites"] = min(self.samples, max(2, self.samples // 10))

@@ -78,7 +78,7 @@ class NPGIteration(OnPolicyIteration):
 
 @document_attributes
 class NPG(OnPolicyLearner):
-    """Learns a policy by NPG, as an infinite iterator of ``NPGIteration``.
+    """Infinite iterator of ``NPGIteration`` that learns a policy by NPG.
 
     Example:
         >>> for it in NPG(env):

@@ -63,7 +63,7 @@ class PPOIteration(OnPolicyIteration):
 
 @document_attributes
 class PPO(OnPolicyLearner):
-    """Learns a policy by PPO, as an infinite iterator of ``PPOIteration``.
+    """Infinite iterator of ``PPOIteration`` that learns a policy by PPO.
 
     Example:
         >>> for it in PPO(env, config=PPOConfig(hidden=(64, 64))):

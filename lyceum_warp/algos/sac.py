@@ -67,7 +67,7 @@ class SACIteration(SampledIteration):
 
 @document_attributes
 class SAC(Learner):
-    """Learns a policy by SAC, as an infinite iterator of ``SACIteration``.
+    """Infinite iterator of ``SACIteration`` that learns a policy by SAC.
 
     In an iteration, every world makes ``num_steps`` steps, and each step is followed by ``updates`` updates. On a GPU,
     the updates after a step run as one CUDA graph, including the sampling of their batches.

@@ -36,7 +36,7 @@ class TwinCritic(Normalized):
     """
 
     shape: dict[str, Any]
-    """Arguments that make critics with the same structure."""
+    """Constructor arguments of critics with the same structure."""
     group: str
     """The group of observations that the critics use."""
 

@@ -142,7 +142,7 @@ class EpisodeCollector:
             on_abort(self.trajectory(wall_seconds, done_reason=0))
 
     def trajectory(self, wall_seconds: float, done_reason: int) -> Trajectory:
-        """Make the trajectory of all complete steps."""
+        """Return a trajectory with all complete steps."""
         steps = len(self._outcomes)  # an interrupted step has no outcome, so omit it
         rewards, evals, success = zip(*self._outcomes, strict=True)
         actions, applied, ages, late = zip(*self._applied[:steps], strict=True)

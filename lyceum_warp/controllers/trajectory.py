@@ -1,4 +1,4 @@
-"""Store one episode of a controlled world in memory and in files: ``lw.Trajectory``."""
+"""Define ``lw.Trajectory``, which stores one episode of a controlled world and can be saved in a file."""
 
 import dataclasses
 import json

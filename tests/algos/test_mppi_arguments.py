@@ -136,7 +136,7 @@ def test_ambiguous_argument_name_raises_an_error_that_names_config_and_params() 
         ({"nworld": 1}, "a planner takes no option nworld: samples is the number of its worlds"),
         ({"elites": 4}, "elites=4 is a setting of update='cem', not of update='mppi'"),
         ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
-        ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' must be standard deviations, not a covariance"),
+        ({"update": "cem", "noise": np.eye(7)}, "must be standard deviations; a covariance was given"),
         ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be one standard deviation, or one for each"),
         ({"models": 4}, "models=4 needs a task that draws model fields, but 'reach' draws none: write model"),
     ],

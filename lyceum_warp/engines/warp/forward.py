@@ -162,7 +162,7 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
 
 
 def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
-    """Return the parts that position and velocity sensors need, or None if they need a full forward pass."""
+    """Return the parts that position and velocity sensors need, or None if these sensors need a full forward pass."""
     wanted: set[Part] = set()
     camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
     for i in range(model.nsensor):

@@ -21,7 +21,7 @@ from lyceum_warp.viz.video import Recorder
 FPS = 30
 _PICTURE_SIZE = (1280, 960)
 _WIDTH = 2.0  # width of lines, in pixels
-_MOST_WAITING = 4 * FPS  # maximum number of queued poses, because the rendering subprocess starts slowly
+_MOST_WAITING = 4 * FPS  # poses queue up while the rendering subprocess starts; this is their maximum number
 _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
