@@ -122,6 +122,8 @@ def train(
     check_kind("learner", learner, Learner, "as lw.NPG(env)")
     check_kind("folder", folder, str | Path, "as 'runs/mine'")
     check_kind("callback", callback, Callable | None, "a function")
+    check_kind("entries", entries, Mapping | None, "as {'note': 'first try'}")
+    check_kind("display", display, Display | None, "a Display of lyceum_warp.training")
     check_flag("resume", resume)
     check_flag("take_over", take_over)
     check_flag("tensorboard", tensorboard)

@@ -194,9 +194,9 @@ class Trajectory:
                     scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
                     _check_scalars(scalars, content)
                     return cls(**content, **scalars)
-        except OSError:
-            raise
         except Exception as error:  # numpy and zipfile raise many types of errors
+            if isinstance(error, OSError) and error.filename is not None:
+                raise  # the file cannot be opened
             reason = first_sentence(error)
             raise ValueError(f"{path} is broken, or is not a trajectory of lyceum_warp ({reason})") from error
         raise unknown_format(path, info["format"], FORMAT)
