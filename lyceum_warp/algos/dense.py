@@ -49,6 +49,7 @@ class DensePasses:
         self.activation = activation
         self._activate, self._times_slope = _ACTIVATIONS[activation]
         self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
+        self._pulled = [torch.empty_like(parameter) for parameter in self.parameters]
         self._rows = 0
         self._buffers: list[list[torch.Tensor]] = []
         self._allocate(0)
@@ -115,7 +116,7 @@ class DensePasses:
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor] | None = None) -> list[torch.Tensor]:
         """Compute J^T u at the last inputs, in ``out`` or in new tensors; u has the shape (rows, outputs)."""
-        out = [torch.empty_like(parameter) for parameter in self.parameters] if out is None else list(out)
+        out = list(self._pulled if out is None else out)
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
             # compute the product or its transpose, whichever has longer rows, because this is faster
