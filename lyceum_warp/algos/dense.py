@@ -115,7 +115,7 @@ class DensePasses:
         return self.derivatives[-1]
 
     def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor] | None = None) -> list[torch.Tensor]:
-        """Compute J^T u at the last inputs, in ``out`` or in new tensors; u has the shape (rows, outputs)."""
+        """Compute J^T u at the last inputs, in ``out`` or in own buffers; u has the shape (rows, outputs)."""
         out = list(self._pulled if out is None else out)
         for i in reversed(range(len(self.weights))):
             x, weight = self._inputs[i], self.weights[i]
