@@ -313,7 +313,7 @@ def failure(error: Exception) -> dict[str, Any]:
 
 
 def compute(unit: dict[str, Any], file: Path) -> dict[str, Any]:
-    """Call the function that the unit names, and write its arrays. If it fails, write the arrays that are complete."""
+    """Run a unit of work, and write its arrays to ``file``. If it fails, write the arrays that are complete."""
     numbers, answer = Numbers(), {}
     try:
         PARTS[unit.pop("part")](numbers, **unit)

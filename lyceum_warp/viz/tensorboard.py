@@ -54,8 +54,8 @@ class TensorBoard:
     Args:
         folder: The folder, which need not exist. Pass this folder, or a parent folder, to ``tensorboard --logdir``.
         env: The environment of the run. Episode_Reward/NAME is the sum of a reward term over an episode, divided by the
-            time limit in seconds. Episode_Termination/NAME is the number of episodes that the function NAME ends in
-            one step of all worlds, on average.
+            time limit in seconds. Episode_Termination/NAME is the mean number of episodes that the function NAME
+            ends per step of all worlds.
 
     Raises:
         ImportError: The package tensorboard is not installed.

@@ -41,7 +41,7 @@ def test_every_injected_fault_is_found_and_counted(
     assert re.search(r"\| point_mass, cpu \| 16 \| 9,?600 \|", capsys.readouterr().out)
 
 
-def test_variant_of_one_of_several_tasks_uses_this_tasks_struct(tmp_path: Path) -> None:
+def test_soak_variant_uses_the_struct_of_its_task(tmp_path: Path) -> None:
     file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
     own = TaskSource(find_task(file), "soak")
     observe = own.functions["observe"]
