@@ -63,6 +63,8 @@ def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Modu
         if different := _difference(module, saved["state"]):
             fix = _FIX if given is None else "pass a policy with the same structure as the run's policy"
             raise ValueError(f"its {name} has different parameters ({different}): {fix}")
+        if given is None and (wrong := [part for part, x in saved["state"].items() if not x.isfinite().all()]):
+            raise ValueError(f"its {name}'s {wrong[0]!r} is not finite: {_FIX}")
         module = _made(name, saved) if given is None else given
         module.load_state_dict(saved["state"])
     except ValueError as error:

@@ -71,6 +71,9 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "policy.pt of sizes of 10^9": ("policy.pt", "load", _shape(nobs=10**9)),
     "policy.pt with widths that are a number": ("policy.pt", "load", _shape(hidden=3)),
     "best.pt without the value of its score": ("best.pt", "resume", _top(score={})),
+    "best.pt with a scale that is not finite": (
+        "best.pt", "from best", _saved(lambda content: content["value"]["state"].update(scale=torch.tensor(torch.nan)))
+    ),
     "checkpoint.pt whose iteration is a list": ("checkpoint.pt", "resume alone", _top(iteration=[1])),
     "checkpoint.pt whose state is of another iteration": ("checkpoint.pt", "resume alone", _top(iteration=7)),
     "checkpoint.pt whose policy is a list": ("checkpoint.pt", "resume alone", _top(policy=[])),
