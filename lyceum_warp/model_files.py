@@ -194,3 +194,5 @@ def read_spec(path: Path) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
+    except RuntimeError as error:  # MuJoCo's parser does not say which C++ exception it caught
+        raise ValueError(f"MuJoCo can't read the model {path}: is one of its sizes too large? ({error})") from error

@@ -3,6 +3,7 @@
 import keyword
 import math
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -173,7 +174,12 @@ class BoundTask:
         of_model = [name for name in named if name not in own]
         self.spec = _read_spec(task, model)
         """The model before ``edit_model``."""
-        self.model = models.compile_model(_edited(task, self.spec), own, physics, varied={*of_model, *dynamics})
+        edited, given = _edited(task, self.spec), task.model if model is None else model
+        try:
+            self.model = models.compile_model(edited, own, physics, varied={*of_model, *dynamics})
+        except ValueError as error:
+            file = given if isinstance(given, str | Path) else getattr(given, "file", None)
+            raise ValueError(f"{file or f'the model of the task {self.name!r}'}: {error}") from error
         skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.frame_skip = whole_number(f"frame_skip of the task {self.name!r}", skip, low=1)
         self.timestep: float = self.model.opt.timestep * self.frame_skip

@@ -138,7 +138,7 @@ def compile_model(
             warnings.simplefilter("always")
             model = spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo refuses the model {spec.modelname!r}: {error}") from error
+        raise ValueError(f"MuJoCo refuses the model: {error}") from error
     for warning in caught:  # most warnings concern Gymnasium's XML, which users cannot change
         log.info("%s: %s", spec.modelname, warning.message)
     return model

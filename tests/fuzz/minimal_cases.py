@@ -47,6 +47,10 @@ def _info(**changes: Any) -> Callable[[bytes], bytes]:
     return changed
 
 
+def _inside(element: bytes) -> Callable[[bytes], bytes]:
+    return lambda data: data.replace(b"<worldbody>", element + b"<worldbody>", 1)
+
+
 def _header(data: bytes) -> bytes:
     """Declare a shape of 40 GB in the header of an array file."""
     return data.replace(b"(40, 2), }        ", b"(9999999999,), }  ")
@@ -82,6 +86,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     ),
     "an episode whose state_parts have numbers": ("episode.npz", "episodes", _info(state_parts={"time": 3})),
     "an episode whose options have another engine": ("episode.npz", "episodes", _info(source=_SOURCE)),
+    "a model that asks for 900 GB": ("model.xml", "make", _inside(b'<size memory="900G"/>')),
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
