@@ -86,6 +86,7 @@ FILES: dict[str, tuple[str, str, Change]] = {
     ),
     "an episode whose state_parts have numbers": ("episode.npz", "episodes", _info(state_parts={"time": 3})),
     "an episode whose options have another engine": ("episode.npz", "episodes", _info(source=_SOURCE)),
+    "a model with a name that is not UTF-8": ("kept model", "eval kept", lambda data: data.replace(b"arm", b"\xff")),
     "a model that asks for 900 GB": ("model.xml", "make", _inside(b'<size memory="900G"/>')),
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
