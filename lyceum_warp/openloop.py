@@ -97,7 +97,8 @@ class OpenLoop:
             self._models[name] = wp.array(nominal[name], dtype=wp.float64, device=env.device)
         rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
-        check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=f"horizon {self.horizon}")
+        length = f"horizon {self.horizon} with frame_skip {task.frame_skip}"
+        check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=length)
         with wp.ScopedDevice(env.device):
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)

@@ -103,6 +103,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "an environment that is a text": ("control_async", {"env": "hopper"}),
     "a time feature of 10^9 powers": ("ValueFunction", {"time_orders": 10**9}),
     "10^9 plants": ("CEM", {"plants": 10**9}),
+    "10^9 substeps in a step": ("CEM", {"frame_skip": 10**9}),
     "10^9 episodes": ("evaluate", {"episodes": 10**9}),
     "a horizon of 10^9 steps": ("OpenLoop", {"horizon": 10**9}),
     "a period of 2^63 seconds": ("control_async", {"period": 2**63}),
