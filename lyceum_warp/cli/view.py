@@ -154,10 +154,8 @@ def _kind(what: tuple[str, ...]) -> str:
     if first.suffix == ".npz":
         return "episodes"
     if first.is_dir():
-        if not (first / "config.json").is_file() and any(first.glob("*.npz")):
-            return "episodes"
-        run = Run.open(first)
-        kind = "episodes" if "planner" in run.config else "run"
+        # a folder of lyceum-warp plan has a configuration like a run, but no policy
+        kind = "episodes" if any(first.glob("*.npz")) and not (first / "policy.pt").is_file() else "run"
     else:
         kind = "task"
     if len(what) > 1 and kind != "episodes":

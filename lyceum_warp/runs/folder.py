@@ -147,7 +147,7 @@ class Run:
 
         Raises:
             FileNotFoundError: The folder has no run.
-            ValueError: The configuration cannot be read, or was written by a newer release.
+            ValueError: The configuration cannot be read, or was written by a newer release or ``lyceum-warp plan``.
         """
         path = Path(folder) / _CONFIG
         if not path.is_file():
@@ -159,6 +159,11 @@ class Run:
             raise ValueError(f"{path} is not the configuration of a run of lyceum_warp ({error!r})") from error
         if not isinstance(number, int) or number != FORMAT:
             raise unknown_format(path, number, FORMAT)
+        if "planner" in config:
+            raise ValueError(
+                f"{path} is the configuration of a planner, whose folder has no policy: pass the folder of a training "
+                f"run, or show the planner's episodes (lyceum-warp view {folder})"
+            )
         algorithm = config.get("algorithm")
         own = {str(algorithm): dict, f"{algorithm}_seed": _COUNT}
         try:

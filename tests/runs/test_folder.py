@@ -112,6 +112,7 @@ def test_previous_checkpoint_remains_after_a_save(run: Run, caplog: pytest.LogCa
     *((config, "is not the configuration of a run") for config in ("{", [], {}, "text")),
     *(({"format": number}, f"has format {number!r}, and .* reads formats up to 1: pip install --upgrade")
       for number in (FORMAT + 1, "one")),
+    ({"planner": {}}, "is the configuration of a planner, .* pass the folder of a training run"),
     ({"task": 3}, "is damaged: task must be"),
     ({"kept": []}, r"is damaged: kept must be of type dict, not \[\]"),
     ({"kept": {"file": 3}}, "file must be of type str, not 3"),
