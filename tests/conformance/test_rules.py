@@ -95,6 +95,10 @@ def in_every_world(method: Function) -> Function:
     return event
 
 
+def only_after_resets(method: Function) -> Function:
+    return lambda self, mask, names=None: method(self, mask) if names is None else None
+
+
 def once_a_step(method: Function) -> Function:
     def phases(self: Worlds, substeps: int | None = None) -> list[Phase]:
         return [Phase("physics", lambda: self.engine.step(self.task.frame_skip), engine=True), method(self)[-1]]
@@ -149,6 +153,7 @@ FULL_BREAKS: list[Break] = [
     ("success_steps", Worlds, "_hold_success", nothing),
     ("events", Worlds, "_event", in_every_world),
     ("events", Worlds, "_mark_changes", nothing),
+    ("events", MujocoEngine, "commit", only_after_resets),
     ("substep", Worlds, "physics_phases", once_a_step),
     ("lasting_memory", Worlds, "_clear", clear_all_but("lasting_memory")),
     ("inputs", MujocoEngine, "__init__", then(lambda engine: setattr(engine, "_written", []))),
