@@ -107,14 +107,15 @@ def _draw(count: int, rng: wp.array[wp.uint32]) -> int:
 def next_level(level: int, walked: float, commanded: float, patch: float, levels: int, rng: wp.array[wp.uint32]) -> int:
     """Raise, keep or lower the terrain level for the next episode, as in Rudin et al. (2021).
 
-    A robot that walked more than half a patch moves up one level. Any other robot that walked less than half the
-    commanded distance moves down one level. Level 0 is the lowest. A robot that moves up from the highest level gets
-    a random level. Source: arXiv 2109.11978, section 3.2.
+    A robot that ends its episode more than half a patch from the centre of its patch moves up one level. Any other
+    robot that ends it less than half the commanded distance from the centre moves down one level. Level 0 is the
+    lowest. A robot that moves up from the highest level gets a random level. Source: arXiv 2109.11978, section 3.2.
 
     Args:
         level: The level of the episode that ended, from 0.
-        walked: Distance between the robot's positions at the start and the end of the episode, m.
-        commanded: Commanded speed times the duration of a whole episode, m. If it is 0, the level does not fall.
+        walked: Horizontal distance of the robot from the centre of the patch at the end of the episode, m.
+        commanded: Commanded speed at the end of the episode times the duration of a whole episode, m. If it is 0, the
+            level does not fall.
         patch: Length of a patch's side, m: ``lw.Terrain.patch``.
         levels: Number of levels: ``lw.Terrain.levels``.
         rng: The world's random numbers.
@@ -178,7 +179,8 @@ def follow_walk(
         commanded: Output: the commanded distance, m.
         origins: ``lw.Terrain.origins``.
         position: Position of the robot.
-        distance: Commanded speed times the duration of a whole episode, m. If it is 0, the level does not fall.
+        distance: Commanded speed at this step times the duration of a whole episode, m. If it is 0, the level does not
+            fall.
     """
     way = position - origins[int(level[0]), int(column[0])]
     walked[0] = wp.length(wp.vec2(way[0], way[1]))
