@@ -93,6 +93,8 @@ def test_invalid_train_arguments_make_no_folder(env: lw.Env, tmp_path: Path) -> 
         ({"keep_every": -1}, "keep_every must be"),
         ({"save_every": 1.5}, "save_every must be"),
         ({"target_return": float("nan")}, "target_return must be a number"),
+        ({"entries": "note"}, "entries must be of type Mapping"),
+        ({"display": True}, "display must be of type Display"),
     ]:
         with pytest.raises(ValueError, match=message):
             lw.train(npg, tmp_path / "run", **words)  # type: ignore[arg-type]

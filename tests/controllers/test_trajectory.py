@@ -58,7 +58,10 @@ def test_damaged_trajectory_file_raises_an_error(episode: Trajectory, tmp_path: 
     whole, broken = path.read_bytes(), tmp_path / "broken.npz"
     half = len(whole) // 2
     data = states.header_offset + 100 + states.compress_size // 2
-    for content in (b"", b"no zip", whole[:half], whole[:-1], whole[:data] + b"????????" + whole[data + 8 :]):
+    for content in (
+        b"", b"no zip", whole[:half], whole[:-1], whole[:data] + b"????????" + whole[data + 8 :],
+        whole[:-6] + b"????" + whole[-2:],  # the archive's directory lies beyond the end of the file
+    ):  # fmt: skip
         broken.write_bytes(content)
         with pytest.raises(ValueError, match=r"broken\.npz is broken, or is not a trajectory"):
             Trajectory.load(broken)
