@@ -24,6 +24,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.task_copy import TABLES, is_table, json_value, run_env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.validate import whole_number
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
 """Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
@@ -115,9 +116,8 @@ class Configuration:
         of this configuration. New networks are made if none are given. For ``trust``, see ``run_env``.
         """
         try:
-            if self.threads < 1:
-                raise ValueError(f"threads must be at least 1, not {self.threads}")
-            torch.set_num_threads(self.threads)
+            # OpenMP ends the process if it cannot start so many threads
+            torch.set_num_threads(whole_number("threads", self.threads, low=1, high=1024))
             nworld = team.share(self.options.nworld)
             own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
             options = self.options.changed(own)

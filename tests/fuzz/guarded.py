@@ -112,7 +112,7 @@ def attacks(program: str, cases: Sequence[str], folder: Path) -> dict[str, Outco
     """Run cases in a subprocess that restarts after each crash."""
     outcomes: dict[str, Outcome] = {}
     results = folder / "results.txt"
-    environment = os.environ | {"MALLOC_ARENA_MAX": "1", "PYTHONPATH": PATHS, "COLUMNS": "120"}
+    environment = os.environ | {"MALLOC_ARENA_MAX": "1", "OMP_STACKSIZE": "64k", "PYTHONPATH": PATHS, "COLUMNS": "120"}
     while left := [case for case in cases if case not in outcomes]:
         results.write_text("")
         command = [sys.executable, str(FOLDER / program), "--results", str(results), *left]
