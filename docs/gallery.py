@@ -78,8 +78,8 @@ SHOWS = {
         camera=FreeCamera(track=1, distance=3.5, azimuth=90.0, elevation=-8.0),
     ),
     "arm_hand_pickup": Show(replan_every=2),
-    "dm/acrobot_swingup": Show(start=6.0, seconds=3.0, seed=1),
-    "dm/acrobot_swingup_sparse": Show(start=6.0, seconds=3.0, replan_every=2),
+    "dm/acrobot_swingup": Show(start=2.0, seconds=3.0, seed=1),
+    "dm/acrobot_swingup_sparse": Show(start=3.5, seconds=3.0, seed=1),
     "dm/ball_in_cup_catch": Show(seconds=2.5),
     "dm/cartpole_balance": Show(seconds=2.5),
     "dm/cartpole_swingup_sparse": Show(

@@ -202,14 +202,15 @@ def test_margin_of_point_mass_is_the_size_of_its_target() -> None:
     assert env.task.params["margin"] == env.task.params["target_size"] == pytest.approx(0.1)
 
 
-def test_reward_of_acrobot_depends_on_the_energy_if_energy_weight_is_set(shared_env: SharedEnv) -> None:
-    env = shared_env("dm/acrobot_swingup", nworld=3, autoreset=False, energy_weight=2.0)
+def test_energy_weight_of_acrobot_rewards_energy_but_not_a_spinning_lower_arm(shared_env: SharedEnv) -> None:
+    env = shared_env("dm/acrobot_swingup", nworld=4, autoreset=False, energy_weight=2.0)
     state = env.get_state()
     parts = env.state_space.split(state)
-    parts["qpos"].copy_(torch.tensor([[0.0, 0.0], [torch.pi, 0.0], [torch.pi, 0.0]]))
-    parts["qvel"].copy_(torch.tensor([[0.0, 0.0], [0.0, 0.0], [3.85, 0.0]]))  # 20 J
+    parts["qpos"].copy_(torch.tensor([[0.0, 0.0]] + 3 * [[torch.pi, 0.0]]))
+    # 20 J of a swing, and 16 J of a spin
+    parts["qvel"].copy_(torch.tensor([[0.0, 0.0], [0.0, 0.0], [3.85, 0.0], [-6.28, 20.0]]))
     rewards = env.get_reward(state, env.action, state)
-    np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0], atol=0.1)
+    np.testing.assert_allclose(rewards, [3.0, 0.0, 1.0, 0.0], atol=0.1)
 
 
 def test_balance_effort_of_acrobot_is_the_effort_of_optimal_feedback(shared_env: SharedEnv) -> None:
