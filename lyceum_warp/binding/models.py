@@ -139,9 +139,11 @@ def compile_model(
             model = spec.compile()
     except ValueError as error:
         raise ValueError(f"MuJoCo refuses the model: {error}") from error
-    for name in model.names.decode(errors="replace").split("\0"):
-        if "\ufffd" in name:  # MuJoCo would raise a UnicodeDecodeError at each later use of the name
-            raise ValueError(f"the name {name!r} is not UTF-8: save the model's file as UTF-8")
+    try:
+        model.names.decode()
+    except UnicodeDecodeError as error:  # each later use of the name would raise it
+        name = model.names[: error.end].rsplit(b"\0", 1)[-1]
+        raise ValueError(f"the name {name!r} is not UTF-8: save the model's file as UTF-8") from error
     for warning in caught:  # most warnings concern Gymnasium's XML, which users cannot change
         log.info("%s: %s", spec.modelname, warning.message)
     return model

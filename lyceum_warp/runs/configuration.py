@@ -116,7 +116,7 @@ class Configuration:
         of this configuration. New networks are made if none are given. For ``trust``, see ``run_env``.
         """
         try:
-            # OpenMP ends the process if it cannot start so many threads
+            # OpenMP aborts the process if it cannot create the threads
             torch.set_num_threads(whole_number("threads", self.threads, low=1, high=1024))
             nworld = team.share(self.options.nworld)
             own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}

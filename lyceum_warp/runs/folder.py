@@ -147,7 +147,7 @@ class Run:
 
         Raises:
             FileNotFoundError: The folder has no run.
-            ValueError: The configuration cannot be read, or was written by a newer release or ``lyceum-warp plan``.
+            ValueError: The configuration cannot be read, is from a newer release, or is that of a planner.
         """
         path = Path(folder) / _CONFIG
         if not path.is_file():

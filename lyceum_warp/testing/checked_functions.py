@@ -70,7 +70,7 @@ class CheckedFunctions:
         return len(self.places) - 1
 
     def number(self, function: wp.Function) -> int:
-        """Return the index of a function's copy. Make the copy if there is none yet."""
+        """Return the index of a function's copy, and create the copy on first use."""
         if function not in self._numbers:
             number = self._numbers[function] = len(self._numbers)
             for overload in overloads(function):

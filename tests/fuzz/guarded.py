@@ -33,7 +33,7 @@ PATHS = f"{FOLDER.parents[1]}{os.pathsep}{FOLDER.parent}"
 class Outcome:
     case: str
     problem: str = ""
-    """One line. Empty if the case worked, was refused by a documented error, or was interrupted."""
+    """What went wrong, in one line; empty if the case worked, raised a documented error, or was interrupted."""
     trace: str = ""
 
 

@@ -196,7 +196,7 @@ def check(steps: list[Step]) -> None:
 
 
 def trace(steps: list[Step]) -> list[tuple[Any, ...]]:
-    """Return numbers that tell runs of Gymnasium's environment apart."""
+    """Return a fingerprint of the rollout in Gymnasium's environment."""
     return [(step.gym_obs.shape, step.gym_obs.sum(), step.gym_reward, step.gym_terminated) for step in steps]
 
 

@@ -202,7 +202,7 @@ def move_rows(
 
 @wp.kernel(enable_backward=False)
 def move_addresses(ncontact_in: wp.array[int], rank_in: wp.array2d[int], nmax: int, contacts: Contacts):
-    """Update the constraint rows' indices, which each contact stores; launched over (naconmax, rows per contact)."""
+    """Update the indices of constraint rows in each contact; launched over (naconmax, rows per contact)."""
     c, i = wp.tid()
     if c < wp.min(ncontact_in[0], nmax):
         row = contacts.efc_address[c, i]

@@ -77,10 +77,10 @@ def observe(s: World, p: Params, obs: Row[float]):
 
 @wp.func
 def missing_energy(s: World, p: Params) -> float:
-    """Subtract the arms' energy, computed as if the elbow locked, from their energy at rest in the upright pose, J.
+    """Compute the energy, in J, that the arms would lack to reach the upright pose if the elbow locked now.
 
-    A locking elbow stops the spin of the lower arm, but keeps the angular momentum about the shoulder. If the spin
-    counted as energy, some plans would keep the lower arm spinning, and would never reach the upright pose.
+    Locking the elbow stops the spin of the lower arm, but conserves the angular momentum about the shoulder. If the
+    spin counted as energy, some plans would keep the lower arm spinning, and would never reach the upright pose.
     """
     coupling = p.inertia[2] * wp.cos(s.qpos[1])
     inertia = p.inertia[0] + 2.0 * coupling
