@@ -1,6 +1,9 @@
 import pytest
+import torch
+from conftest import SharedEnv
 
 import lyceum_warp as lw
+from lyceum_warp.algos.symmetry import Reflected, reflections
 
 PARTS = {"gravity": slice(0, 3), "foot_height": slice(3, 5)}
 
@@ -24,3 +27,22 @@ def test_error_of_a_missing_reflection_names_the_part() -> None:
         lw.Mirror({"gravity": (1, -1, 1)}).columns(PARTS, task="walker")
     with pytest.raises(ValueError, match="has a reflection of 2 columns for 'gravity', which has 3"):
         lw.Mirror({"gravity": (1, -1)}).columns(PARTS, task="walker")
+
+
+def test_mirror_image_of_an_ant_moves_like_the_ant(shared_env: SharedEnv) -> None:
+    env = shared_env("ant", nworld=8, exclude_current_positions_from_observation=False, autoreset=False)
+    mirror = {name: Reflected(found) for name, found in reflections(env).items()}
+    actions = 2.0 * torch.rand(31, *env.action.shape, generator=torch.Generator().manual_seed(0)) - 1.0
+    for action in actions[:30]:  # until legs touch the floor
+        env.step(action)
+    assert (env.obs[:, 29:] != 0.0).any()
+    state, parts, image = env.get_state(), env.state_space.parts, mirror["obs"](env.obs)
+    env.step(actions[30])
+    obs, reward = env.obs.clone(), env.reward.clone()
+    state[:, parts["qpos"]], state[:, parts["qvel"]] = image[:, :15].double(), image[:, 15:29].double()
+    env.set_state(state)
+    env.step(mirror["action"](actions[30]))
+    torch.testing.assert_close(env.obs, mirror["obs"](obs), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(env.reward, reward, atol=1e-4, rtol=1e-4)
+    without_xy = Reflected(reflections(shared_env("ant", nworld=8))["obs"])
+    assert torch.equal(without_xy(obs[:, 2:]), mirror["obs"](obs)[:, 2:])

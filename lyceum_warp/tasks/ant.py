@@ -6,6 +6,10 @@ cones. With pyramidal cones, MuJoCo Warp's contact frame differs from MuJoCo's f
 are valid, but trajectories diverge. With ``cone="elliptic"``, both engines agree.
 """
 
+from typing import Any
+
+import mujoco
+import numpy as np
 import warp as wp
 
 import lyceum_warp as lw
@@ -109,3 +113,16 @@ class Ant(lw.Task):
             "velocity": 14,
             "contact_force": 78 * p.include_cfrc_ext_in_observation,
         }
+
+    @staticmethod
+    def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
+        # of the legs 1 to 4, the mirror exchanges 1 with 4 and 2 with 3; each leg has a hip and an ankle
+        joints = np.array([6, 7, 4, 5, 2, 3, 0, 1]), [-1, 1] * 4
+        bodies = np.array([0, 10, 11, 12, 7, 8, 9, 4, 5, 6, 1, 2, 3])
+        torso = [1, -1, 1, 1, -1, 1, -1][2 * p.exclude_current_positions_from_observation :]
+        return lw.Mirror({
+            "position": ([*range(len(torso)), *len(torso) + joints[0]], [*torso, *joints[1]]),
+            "velocity": ([*range(6), *6 + joints[0]], [1, -1, 1, -1, 1, -1, *joints[1]]),
+            "contact_force": ([6 * i + k for i in bodies for k in range(6)], [-1, 1, -1, 1, -1, 1] * 13),
+            "action": ([2, 3, 0, 1, 6, 7, 4, 5], joints[1]),  # the first control acts on leg 4
+        })  # fmt: skip
