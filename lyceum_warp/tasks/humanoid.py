@@ -5,6 +5,10 @@ four passes of a substep. Gymnasium computes ``cfrc_ext`` again after the last p
 differ from Gymnasium's while feet touch the ground. The solver is Newton instead of the model's PGS.
 """
 
+from typing import Any
+
+import mujoco
+import numpy as np
 import warp as wp
 
 import lyceum_warp as lw
@@ -110,3 +114,22 @@ class Humanoid(lw.Task):
             "actuator_force": 17 * p.include_qfrc_actuator_in_observation,
             "contact_force": 78 * p.include_cfrc_ext_in_observation,
         }
+
+    @staticmethod
+    def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
+        # the waist's three joints, the right and the left leg, the right and the left arm
+        limbs = [7, 8, 9, 10, 3, 4, 5, 6, 14, 15, 16, 11, 12, 13], [*[1] * 8, *[-1, -1, 1] * 2]
+        joints = np.array([0, 1, 2, *limbs[0]]), [-1, 1, -1, *limbs[1]]
+        bodies = np.array([0, 1, 2, 6, 7, 8, 3, 4, 5, 11, 12, 9, 10])
+        base = [1, -1, 1, 1, -1, 1, -1][2 * p.exclude_current_positions_from_observation :]
+        spatial = ([6 * i + k for i in bodies for k in range(6)], [-1, 1, -1, 1, -1, 1] * 13)
+        return lw.Mirror({
+            "position": ([*range(len(base)), *len(base) + joints[0]], [*base, *joints[1]]),
+            "velocity": ([*range(6), *6 + joints[0]], [1, -1, 1, -1, 1, -1, *joints[1]]),
+            # moments and products of inertia (xx, yy, zz, xy, xz, yz), mass times position, and mass
+            "inertia": ([10 * i + k for i in bodies for k in range(10)], [1, 1, 1, -1, 1, -1, 1, -1, 1, 1] * 13),
+            "body_velocity": spatial,
+            "actuator_force": joints,
+            "contact_force": spatial,
+            "action": (joints[0], [1, -1, -1, *limbs[1]]),  # the order of the waist's controls is y, z, x
+        })  # fmt: skip
