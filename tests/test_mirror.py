@@ -34,7 +34,7 @@ def test_error_of_a_missing_reflection_names_the_part() -> None:
 
 
 class SymmetricHumanoid(Humanoid):
-    """In Gymnasium's model, two joints of the right leg differ from those of the left leg."""
+    """Gymnasium's humanoid, except that the joints of the right leg have the constants of the left leg."""
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
