@@ -10,7 +10,7 @@ def test_resumed_run_adds_to_the_measured_seconds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ("--algorithm", "npg", "--mean-every", "1", "--nworld", "2", "--samples", "100", "--mean-episodes", "2")
-    monkeypatch.setitem(records.RECORDS, "point_mass", (-1e4, {"cpu": flags}))
+    monkeypatch.setitem(records.RECORDS, "point_mass", {"cpu": (-1e4, flags)})
     words = ["--tasks", "point_mass", "--seeds", "3", "--out", str(tmp_path / "records.jsonl"), "--runs", str(tmp_path)]
     assert experiment.main(records.EXPERIMENT, [*words, "--seconds", "0"]) == 0
     assert "point_mass-cpu-warm-3 has not reached -10000" in capsys.readouterr().out
