@@ -57,7 +57,9 @@ RECORDS: dict[str, dict[str, tuple[float, tuple[str, ...]]]] = {
     "hopper": {"cpu": (1500.0, NPG), "cuda": (1500.0, LARGE)},
     "walker2d": {"cpu": (3000.0, NPG), "cuda": (3000.0, LARGE)},
     "half_cheetah": {"cpu": (4000.0, NPG), "cuda": (4000.0, LARGE)},
-    "humanoid": {"cuda": (4500.0, (*NPG, "--nworld", "8192", "--samples", "131072"))},
+    "ant": {"cpu": (1000.0, NPG)},
+    "humanoid": {"cpu": (400.0, NPG), "cuda": (4500.0, (*NPG, "--nworld", "8192", "--samples", "131072"))},
+    "humanoid_standup": {"cpu": (60000.0, NPG)},
     **{name: {"cuda": (900.0, SUITE)} for name in package_task_names() if name.startswith("dm/")},
 }
 """Maps each task and device to its threshold, and to the flags for `lyceum-warp train`."""
@@ -143,7 +145,8 @@ def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]
         yield dict(os.environ)
         return
     with tempfile.TemporaryDirectory() as empty:
-        yield os.environ | {"WARP_CACHE_PATH": f"{empty}/warp", "CUDA_CACHE_PATH": f"{empty}/cuda"}
+        caches = {"WARP_CACHE_PATH": "warp", "CUDA_CACHE_PATH": "cuda", "TORCHINDUCTOR_CACHE_DIR": "inductor"}
+        yield os.environ | {name: f"{empty}/{folder}" for name, folder in caches.items()}
 
 
 def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[bytes]":
