@@ -40,7 +40,7 @@ FEW_WORLDS = (
     "--hidden", "128", "128", "--value-hidden", "128", "128",
 )  # fmt: skip
 TWO_CORES = ("--algorithm", "ppo", "--mean-every", "20", *FEW_WORLDS)
-"""Command-line flags for walking robots on few CPU cores. Few episodes end in an iteration, so their mean is noisy."""
+"""Command-line flags for walking robots on few CPU cores. The threshold is a return without exploration noise."""
 GO1_TWO_CORES = (
     *WALKING, *FEW_WORLDS, "--param", "track_linear_velocity=6", "--param", "action_rate_l2=-0.02",
     "--param", "foot_clearance=-0.5", "--param", "foot_swing_height=0",
