@@ -51,7 +51,8 @@ STRONG_TRACKING = (
     "--param", "track_linear_velocity=6", "--param", "action_rate_l2=-0.02", "--param", "foot_clearance=-0.5",
     "--param", "foot_swing_height=0",
 )  # fmt: skip
-"""Reward weights for few samples. With the default weights, robots learn to stand instead of walking."""
+"""Reward weights for few samples. With the default weights, some robots learn to stand instead of
+walking."""
 STRONG_TRACKING_GAIT = (
     "--param", "track_linear_velocity=10", "--param", "track_angular_velocity=5", "--param", "gait_clock=8",
     "--param", "growing_action_rate_l2=-0.02", "--param", "growing_joint_velocity_l2=0",
