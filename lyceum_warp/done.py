@@ -17,7 +17,7 @@ class Done(enum.IntFlag):
     TERMINATED = 1
     """The task's ``terminated`` returned True."""
     TRUNCATED = 2
-    """The time limit was reached. ``env.truncated`` also includes faults."""
+    """The time limit was reached, or the task's ``truncated`` returned True. ``env.truncated`` also includes faults."""
     NAN = 4
     """A state or a control is NaN or larger than 1e10, or task memory is not finite."""
     CONTACT_OVERFLOW = 8

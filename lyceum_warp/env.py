@@ -97,7 +97,7 @@ class Env:
     terminated: torch.Tensor
     """Whether the task ended the episode, (nworld,), bool."""
     truncated: torch.Tensor
-    """Whether the time limit or a fault ended the episode, (nworld,), bool."""
+    """Whether the time limit, the task's ``truncated`` or a fault ended the episode, (nworld,), bool."""
     metrics: dict[str, torch.Tensor]
     """The task's metrics of the last step by name, each (nworld,), float32."""
     episode_metrics: dict[str, torch.Tensor]

@@ -98,6 +98,9 @@ FUNCTIONS = {
                      "The evaluation metric, separate from the reward. Default: the reward.", "return 0.0"),
         TaskFunction("terminated", "s: World, p: Params", bool,
                      "Whether the state ends the episode. Default: False.", "return False"),
+        TaskFunction("truncated", "s: World, p: Params", bool,
+                     "Whether the episode ends without a failure, such as at the end of a clip. Learners then "
+                     "bootstrap from the last observation. Planners ignore it. Default: False.", "return False"),
         TaskFunction("success", "s: World, p: Params", bool,
                      "Whether the state meets the task's goal; ``success_steps`` may require several steps in a row. "
                      "Default: False.", "return False"),
@@ -123,7 +126,9 @@ FUNCTIONS = {
                      writes={"s1": "memory"}),
         TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", None,
                      "Writes what one transition adds to sums over all worlds. ``ended`` is True at an episode's end. "
-                     "It is called only in environments with automatic resets. Default: none."),
+                     "With ``terminated`` as its last argument, the function can tell failures from truncations. "
+                     "It is called only in environments with automatic resets. Default: none.",
+                     optional="terminated: bool"),
         TaskFunction("share", "shared: Shared, sums: Sums, p: Params", None,
                      "Updates the memory that all worlds share, from the sums since the last update. "
                      "``env.update_shared`` calls this function. Default: no change."),
@@ -465,6 +470,9 @@ class Task:
     """Names of functions that end the episode if one of them returns True. They replace ``terminated``. Their arguments
     are ``s``, ``p``, and any others that a term may have. Each function is also a metric: 1 if it returns True after
     the step, and 0 otherwise."""
+    truncations: ClassVar[tuple[str, ...]] = ()
+    """Names of functions that end the episode without a failure, such as at the end of a clip or of the ground. They
+    replace ``truncated``. Their arguments and metrics are those of ``terminations``."""
     metrics: ClassVar[tuple[str, ...]] = ()
     """Names of the metrics that ``measure`` writes. Without ``measure``, each is the name of a function that returns a
     float or a bool. Its arguments may be those of a term."""

@@ -118,7 +118,8 @@ class WorldArrays:
         self._judging = parts if self.device.is_cuda else 1  # threads per transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
-        self._found.terminated, self._found.success = wp.zeros(n, dtype=bool), wp.zeros(n, dtype=bool)
+        for name in ("terminated", "truncated", "success"):
+            setattr(self._found, name, wp.zeros(n, dtype=bool))
         self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
         self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)

@@ -77,6 +77,11 @@ def too_fast_before(s0: World) -> bool:
 
 
 @wp.func
+def arrived(place: float, target: float, qvel: Row[float]) -> bool:
+    return wp.abs(place - target) < 0.02 and qvel[0] > 0.0
+
+
+@wp.func
 def observe(s: World, p: Params, obs: Row[float]):
     obs[0] = s.qpos[0]
 
@@ -96,5 +101,6 @@ class Terms(lw.Task):
     obs = {"x": 1}
     rewards = {"near": 1, "fast": 0.5, "effort": -0.1, "change": 0.25}
     terminations = ("outside", "too_fast")
+    truncations = ("arrived",)
     metrics = ("distance", "too_fast_before")
     horizon = 50

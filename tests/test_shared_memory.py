@@ -14,6 +14,7 @@ from lyceum_warp.testing import check_task
 @wp.struct
 class Shared:
     mean_angle: Row[float] = lw.part()
+    turns: Row[float] = lw.part()  # episodes that ended by speed
     falls: Row[float] = lw.part("levels")
 
 
@@ -21,6 +22,7 @@ class Shared:
 class Sums:
     steps: Row[float] = lw.part()
     angle: Row[float] = lw.part()
+    turns: Row[float] = lw.part()
     falls: Row[float] = lw.part("levels")
 
 
@@ -36,6 +38,7 @@ class World:
 class Params:
     dt: float
     limit: float = 0.2
+    fastest: float = 2.0  # rad/s
     levels: wp.array[float] = [0.0, 0.5, 1.0]
 
 
@@ -56,21 +59,29 @@ def terminated(s: World, p: Params) -> bool:
 
 
 @wp.func
+def truncated(s: World, p: Params) -> bool:
+    return wp.abs(s.qvel[1]) > p.fastest
+
+
+@wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
     s.level[0] = wp.floor(lw.uniform(rng, 0.0, float(p.levels.shape[0])))
 
 
 @wp.func
-def tally(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums):
+def tally(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums, terminated: bool):
     sums.steps[0] = 1.0
     sums.angle[0] = s1.qpos[1]
-    if ended:
+    if terminated:
         sums.falls[int(s1.level[0])] = 1.0
+    elif ended:
+        sums.turns[0] = 1.0
 
 
 @wp.func
 def share(shared: Shared, sums: Sums, p: Params):
     shared.mean_angle[0] = sums.angle[0] / sums.steps[0]
+    shared.turns[0] = sums.turns[0]
     for i in range(p.levels.shape[0]):
         shared.falls[i] = 0.5 * shared.falls[i] + 0.5 * sums.falls[i]
 
@@ -89,14 +100,15 @@ def env() -> Iterator[lw.Env]:
     yield lw.make(Balance, nworld=8, seed=0)
 
 
-def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor]:
+def steps(env: lw.Env, count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(3)
-    angles, ended = [], []
+    angles, fallen, cut = [], [], []
     for _ in range(count):
         env.step(6.0 * torch.rand(env.nworld, 1, generator=generator) - 3.0)
         angles.append(env.final_obs[:, 0].clone())
-        ended.append(env.done.clone())
-    return torch.stack(angles), torch.stack(ended)
+        fallen.append(env.terminated.clone())
+        cut.append(env.truncated & ~env.terminated)
+    return torch.stack(angles), torch.stack(fallen), torch.stack(cut)
 
 
 def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -> None:
@@ -105,12 +117,13 @@ def test_shared_memory_is_updated_from_sums_over_worlds_and_steps(env: lw.Env) -
     level = env.state_space.split(env.get_state())["level"][:, 0].long()
     for _ in range(2):
         before = env.shared["falls"].clone()
-        angles, ended = steps(env, 30)
+        angles, fallen, cut = steps(env, 30)
         assert torch.equal(env.shared["falls"], before)
         env.update_shared()
-        falls = torch.zeros(3).index_add_(0, level, ended.sum(0).float())
-        assert falls.sum() > 5
+        falls = torch.zeros(3).index_add_(0, level, fallen.sum(0).float())
+        assert falls.sum() > 5 and cut.sum() > 5
         torch.testing.assert_close(env.shared["falls"], 0.5 * before + 0.5 * falls)
+        assert env.shared["turns"].item() == cut.sum()
         torch.testing.assert_close(env.shared["mean_angle"], angles.mean().view(1), atol=2e-6, rtol=0.0)
 
 
@@ -154,7 +167,7 @@ def test_getters_replicas_and_planners_use_shared_memory(env: lw.Env) -> None:
     for other in (planner, few):
         assert torch.equal(other.shared["falls"], env.shared["falls"])
     steps(planner, 3)
-    assert not planner.get_shared()[4:].any()  # without automatic resets, the sums do not change
+    assert not planner.get_shared()[5:].any()  # without automatic resets, the sums do not change
     before = planner.get_state()
     planner.step(torch.zeros(8, 1))
     expected = 1.0 - (planner.field("qpos")[:, 1] - 0.5).abs()
@@ -187,9 +200,9 @@ def test_resumed_training_gives_the_same_shared_memory(tmp_path: Path, env: lw.E
 def test_sums_of_shared_memory_are_added_across_processes(env: lw.Env) -> None:
     env.rand_reset(seed=7)
     env.set_shared(torch.zeros_like(env.get_shared()))
-    _, ended = steps(env, 30)
+    _, fallen, _ = steps(env, 30)
     env.update_shared(lambda sums: sums.mul_(2))  # simulate another process that computed the same sums
-    assert env.shared["falls"].sum() == ended.sum()
+    assert env.shared["falls"].sum() == fallen.sum()
 
 
 def test_task_with_shared_memory_passes_check_task() -> None:

@@ -182,7 +182,7 @@ def transfer(
     found = [_compared(*pair, played[pair[0]], played[pair[1]], margin) for pair in pairs]
     if warp:
         found.insert(0, _compared("C engine", warp_name, played[f"{own} physics"], played[warp_name], margin))
-    if env.task.functions["terminated"] is None and not env.task.task.terminations:
+    if not env.task.ends_by("terminated"):
         found = [dataclasses.replace(one, differences=one.differences[:2]) for one in found]
     return Transfer(task=env.task.name, episodes=episodes, seed=seed, comparisons=tuple(found))
 

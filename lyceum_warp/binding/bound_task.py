@@ -159,7 +159,7 @@ class BoundTask:
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
         self.metrics = self.source.terms.metrics
-        """The names of all metrics: first the reward terms, then the task's ``metrics``, then the terminations."""
+        """The names of all metrics: the reward terms, the task's ``metrics``, the terminations and the truncations."""
         self._check_class()
         memory = self.source.memory
         own_names = [*memory, *(["shared"] if self.source.shared is not None else [])]
@@ -211,6 +211,10 @@ class BoundTask:
     def params(self) -> dict[str, Any]:
         """The values of the parameters. A parameter that differs between worlds is an array."""
         return self.parameters.values
+
+    def ends_by(self, function: str) -> bool:
+        """Whether the task can end an episode by its function ``terminated`` or ``truncated``, written or generated."""
+        return self.functions[function] is not None or function in self.source.terms.combined
 
     @property
     def reward_text(self) -> str:

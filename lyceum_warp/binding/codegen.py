@@ -117,7 +117,7 @@ def kernels_of(
             scope = _generated(source, groups, memory, structs)
             scope["terms"] = source.terms.generated(f"<lyceum_warp {source.path} terms>")
             found = dict(source.functions)
-            found["terminated"] = scope["terms"].get("terminated", found["terminated"])
+            found |= {name: scope["terms"].get(name, found[name]) for name in ("terminated", "truncated")}
             functions = {name: function or scope.get(f"no_{name}") for name, function in found.items()}
             written = [name for name, function in found.items() if function is not None]
             module = free_module_name(f"lyceum_warp.generated.{source.kernel_name}")

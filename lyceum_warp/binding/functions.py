@@ -145,8 +145,8 @@ class TaskSource:
         field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
         if field is None and tally is None and share is None:
             return None, None
-        structs = [list(function.input_types.values())[i] for function, i in ((tally, -1), (share, 1))
-                   if isinstance(function, wp.Function) and len(function.input_types) > 1]  # fmt: skip
+        structs = [list(function.input_types.values())[i] for function, i in ((tally, 5), (share, 1))
+                   if isinstance(function, wp.Function) and len(function.input_types) > i]  # fmt: skip
         if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
             raise ValueError(
                 f"the task {self.name!r} lacks a part of shared memory: it needs the structs Shared and Sums, a field "

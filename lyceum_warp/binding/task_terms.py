@@ -19,7 +19,10 @@ _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
 """Maps each possible argument of a reward term or metric to a variable of the generated text."""
 
 _STATE = {"s": "s", "s1": "s", "p": "p"}
-"""Maps each possible argument of a termination to a variable of the generated text."""
+"""Maps each possible argument of an end to a variable of the generated text."""
+
+_ENDS = {"terminations": "terminated", "truncations": "truncated"}
+"""Maps each attribute with functions that end an episode to the function that combines them."""
 
 _OWN = ("weights", "metrics", "total")
 """Names that terms cannot have, because the generated text uses them."""
@@ -28,7 +31,7 @@ _HEAD = "s0: World, action: Row[float], s1: World, p: Params, weights: Row[float
 
 
 class Terms:
-    """The terms of a task: ``rewards``, ``terminations``, and the metrics that have a function of their own."""
+    """The terms of a task: ``rewards``, the ends of episodes, and the metrics that have a function of their own."""
 
     def __init__(
         self,
@@ -41,21 +44,24 @@ class Terms:
     ) -> None:
         self._name, self.lookup, self._world, self._params = name, lookup, world, params
         self.weights = self._checked_weights(task.rewards)
-        self.terminations = self._names("terminations", task.terminations)
+        self.ends = {name: self._names(name, getattr(task, name)) for name in _ENDS}
         self._reward, self._measure = written["reward"], written["measure"]
         functions = self._names("metrics", task.metrics, written=self._measure is not None)
-        for attribute, kind in (("rewards", "reward"), ("rewards", "measure"), ("terminations", "terminated")):
+        for attribute, kind in (("rewards", "reward"), ("rewards", "measure"), *_ENDS.items()):
             if getattr(task, attribute) and written[kind]:
                 raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: remove one of them")
         self.functions: dict[str, wp.Function] = {}
         self.text = ""
         """The source of the generated functions."""
-        self.metrics = (*self.weights, *task.metrics, *self.terminations)
-        if self.weights or self.terminations or functions:
-            self.text = self._written_text(functions, len(task.metrics) - len(functions))
+        self.combined = {_ENDS[attribute] for attribute, names in self.ends.items() if names}
+        """Names of the generated functions that end an episode."""
+        ends = [name for names in self.ends.values() for name in names]
+        self.metrics = (*self.weights, *task.metrics, *ends)
+        if self.weights or ends or functions:
+            self.text = self._written_text((*functions, *ends), len(task.metrics) - len(functions))
 
     def generated(self, file: str) -> dict[str, wp.Function]:
-        """Generate those functions of ``reward``, ``score`` and ``terminated`` that the task does not define.
+        """Generate those of ``reward``, ``score``, ``terminated`` and ``truncated`` that the task does not define.
 
         ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` names
         the generated text in error messages.
@@ -66,8 +72,8 @@ class Terms:
         scope |= {"__name__": f"lyceum_warp.generated.terms.{self._name}", **self.functions}
         scope |= {"reward": self._reward, "measure": self._measure}
         run_source(self.text, file, scope)
-        made = {"reward": bool(self.weights), "score": True, "terminated": bool(self.terminations)}
-        return {name: scope[name] for name, own in made.items() if own}
+        names = {"score", *self.combined, *(["reward"] if self.weights else [])}
+        return {name: scope[name] for name in names}
 
     def _checked_weights(self, rewards: Any) -> dict[str, float]:
         if not isinstance(rewards, Mapping):
@@ -125,17 +131,16 @@ class Terms:
         start = len(self.weights) + first
         for i, metric in enumerate(metrics, start):
             lines.append(f"metrics[{i}] = {body.number(metric)}")
-        for i, termination in enumerate(self.terminations, start + len(metrics)):
-            lines.append(f"metrics[{i}] = {body.number(termination)}")
         if self.weights:
             lines += [*self._total(body, found), "return p.dt * total"]
         else:
             lines.append("return reward(s0, action, s1, p)" if self._reward else "return 0.0")
         parts.append(body.function(f"score({_HEAD}, metrics: Row[float]) -> float", lines))
-        if self.terminations:
-            body = _Body(self, _STATE)
-            ends = " or ".join(body.value(termination, bool) for termination in self.terminations)
-            parts.append(body.function("terminated(s: World, p: Params) -> bool", [f"return {ends}"]))
+        for attribute, names in self.ends.items():
+            if names:
+                body = _Body(self, _STATE)
+                any_end = " or ".join(body.value(name, bool) for name in names)
+                parts.append(body.function(f"{_ENDS[attribute]}(s: World, p: Params) -> bool", [f"return {any_end}"]))
         return "\n\n".join(parts)
 
     def _total(self, body: "_Body", values: Mapping[str, str]) -> list[str]:
@@ -197,7 +202,7 @@ class Terms:
     def _unknown(self, function: wp.Function, name: str, given: Mapping[str, str]) -> str:
         place = self.place(function)
         if name in _STEP:
-            return f"{place} takes {name}, but a termination depends only on the state: it may take s and p"
+            return f"{place} takes {name}, but the end of an episode depends only on the state: it may take s and p"
         if name in _OWN:
             return f"{place} takes {name}, which is a name of the generated text: rename it"
         known = [*given, *self._params.vars, *self._world.vars, *FunctionSource(function).scope]

@@ -44,6 +44,7 @@ class Findings:
     reward: wp.array[float]
     eval: wp.array[float]
     terminated: wp.array[bool]
+    truncated: wp.array[bool]
     success: wp.array[bool]
     fault: wp.array2d[int]
     """Bits of the faults, one row for each part of ``judge``, (parts, nworld)."""

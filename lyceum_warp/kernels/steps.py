@@ -13,6 +13,7 @@ from lyceum_warp.kernels.transitions import judge_kernels, rollout_kernels
 
 ACTION = wp.constant(int(Done.ACTION))
 MODEL = wp.constant(int(Done.MODEL))
+TERMINATED = wp.constant(int(Done.TERMINATED))
 NAN = wp.constant(int(Done.NAN))
 ALL_FAULTS = wp.constant(int(FAULTS))
 
@@ -217,6 +218,7 @@ def shared_kernels(task: TaskCode) -> None:
     """Make the kernels that sum and update the memory shared by all worlds."""
     Batch, Params, view = task.Batch, task.Params, task.view  # noqa: N806
     tally, share = task.functions["tally"], task.functions["share"]
+    tells_failures = "tally" in task.written and "terminated" in tally.input_types
     view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
 
     @task.kernel_for("tally")
@@ -235,8 +237,12 @@ def shared_kernels(task: TaskCode) -> None:
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
         if (reason_in[w] & ALL_FAULTS) == 0:
-            p = params[w % params.shape[0]]
-            tally(view(before, w), action_in[w], view(after, w), p, reason_in[w] != 0, view_sums(share_out[w]))
+            s0, s1, p = view(before, w), view(after, w), params[w % params.shape[0]]
+            ended, sums = reason_in[w] != 0, view_sums(share_out[w])
+            if wp.static(tells_failures):
+                tally(s0, action_in[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
+            else:
+                tally(s0, action_in[w], s1, p, ended, sums)
         for i in range(share_out.shape[1]):
             if share_out[w, i] != 0.0 and wp.isfinite(share_out[w, i]):
                 wp.atomic_add(sum_inout, i, wp.int64(wp.round(wp.float64(share_out[w, i]) * wp.float64(UNIT))))

@@ -29,8 +29,8 @@ def judge_kernels(task: TaskCode) -> None:
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
     finite_group, copy_observations = task.finite_group, task.copy_observations
-    reward, measure, evaluate, terminated, success = (
-        task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "success")
+    reward, measure, evaluate, terminated, truncated, success = (
+        task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "truncated", "success")
     )
     score, has_score = task.terms.get("score"), "score" in task.terms
     has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
@@ -87,6 +87,7 @@ def judge_kernels(task: TaskCode) -> None:
                 s1 = view(after, w)
                 if part == ENDS:
                     found_out.terminated[w] = terminated(s1, p)
+                    found_out.truncated[w] = truncated(s1, p)
                     found_out.success[w] = success(s1, p)
                     if wp.static(has_evaluate):
                         found_out.eval[w] = evaluate(s1, p)
@@ -187,7 +188,7 @@ def judge_kernels(task: TaskCode) -> None:
             reason = fault
             if found.terminated[w]:
                 reason = TERMINATED
-            if horizon > 0 and step_in[w] >= horizon:
+            if (horizon > 0 and step_in[w] >= horizon) or (fault == 0 and found.truncated[w]):
                 reason = reason | TRUNCATED
         if keep_reason:
             reason = reason | out.done_reason[w]

@@ -22,7 +22,7 @@ def _check_flags(ctx: Context, env: Env) -> None:
 
 
 def check_truncation(ctx: Context) -> None:
-    """An episode is truncated at the horizon.
+    """An episode is truncated at the horizon, and earlier only by the task's ``truncated``.
 
     ``final_obs`` is then its last observation, and ``obs`` the first observation of the next episode.
     """
@@ -36,7 +36,8 @@ def check_truncation(ctx: Context) -> None:
             b.step(action)
             steps += 1
             _check_flags(ctx, a)
-            ctx.equal(a.truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
+            truncated = a.truncated if not a.task.ends_by("truncated") else a.truncated & (steps >= horizon)
+            ctx.equal(truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
             going, state = ~a.done & ctx.calm(a), a.get_state()
             # automatic resets change no value before a world's first episode ends
             for name, obs in a.obs_groups.items():
@@ -45,7 +46,9 @@ def check_truncation(ctx: Context) -> None:
                 ctx.equal(final[going], obs[going], f"the final group {name} of worlds that go on")
                 ctx.equal(a.get_obs(state, group=name), obs, f"get_obs of the group {name} after automatic resets")
             ctx.equal(a.reward[alive], b.reward[alive], "reward against the one without automatic resets")
-            ctx.equal(a.terminated[alive], b.terminated[alive], "terminated with and without automatic resets")
+            for name in ("terminated", "truncated"):
+                with_resets, without = (getattr(env, name)[alive] for env in (a, b))
+                ctx.equal(with_resets, without, f"{name} with and without automatic resets")
             alive &= ~a.done
             ctx.that((a.time[a.done] == 0).all(), f"time is {a.time.tolist()} where done is {a.done.tolist()}")
             count = state[:, a.state_space.parts["step"]].squeeze(1)

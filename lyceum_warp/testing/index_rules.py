@@ -60,6 +60,7 @@ class _Run:
         self.rows["sums"] = self._array((n, self.worlds.sums.size), wp.float32)
         self.rows["shared"] = self._array((n, self.worlds.shared.shape[1]), wp.float32)
         self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
+        self.rows["terminated"] = wp.array([True, False], dtype=bool, device=self.env.device)
 
     def steps(self) -> None:
         env = self.env

@@ -127,7 +127,8 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
     task, seconds = env.task.task, env.horizon * env.timestep
     rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
-        f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld)) for name in task.terminations
+        f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld))
+        for name in (*task.terminations, *task.truncations)
     }
 
 

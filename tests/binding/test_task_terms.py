@@ -22,16 +22,16 @@ def stepped(env: lw.Env, steps: int = 12) -> list[dict[str, np.ndarray]]:
         action = torch.rand((env.nworld, env.action_space.size), generator=generator) * 2 - 1
         env.step(action)
         after = {name: part.numpy() for name, part in env.state_space.split(env.get_state()).items()}
-        shown = {"reward": env.reward, "terminated": env.terminated, **env.metrics}
+        shown = {"reward": env.reward, "terminated": env.terminated, "truncated": env.truncated, **env.metrics}
         found.append({f"{name}0": part for name, part in before.items()} | after | {"action": action.numpy()})
         found[-1] |= {name: buffer.numpy().copy() for name, buffer in shown.items()}
     return found
 
 
 @ENGINES
-def test_rewards_metrics_and_terminations_equal_their_formulas(engine: str) -> None:
+def test_rewards_metrics_and_ends_equal_their_formulas(engine: str) -> None:
     env = lw.make(Terms, nworld=6, engine=engine, autoreset=False, seed=1)
-    ended = np.zeros(6, dtype=bool)
+    ended, cut = np.zeros((2, 6), dtype=bool)
     for s in stepped(env, 40):
         wanted = {
             "near": np.exp(-np.abs(s["qpos"][:, 0] - 0.3)), "fast": 2 * 0.5 * np.abs(s["qvel"][:, 0]),
@@ -47,7 +47,12 @@ def test_rewards_metrics_and_terminations_equal_their_formulas(engine: str) -> N
         assert np.array_equal(s["too_fast_before"] == 1, np.abs(s["qvel0"][:, 0]) > 3)
         ended |= outside | fast
         assert np.array_equal(s["terminated"], ended), "an end stays set without automatic resets"
-    assert list(env.metrics) == [*Terms.rewards, *Terms.metrics, *Terms.terminations] and ended.any()
+        arrived = (np.abs(s["qpos"][:, 0] - 0.3) < 0.02) & (s["qvel"][:, 0] > 0)
+        assert np.array_equal(s["arrived"] == 1, arrived)
+        cut |= arrived
+        assert np.array_equal(s["truncated"], cut)
+    assert list(env.metrics) == [*Terms.rewards, *Terms.metrics, *Terms.terminations, *Terms.truncations]
+    assert ended.any() and cut.any() and not cut.all()
 
 
 @ENGINES
@@ -114,7 +119,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "a termination that asks for the action": (
         term("def fell(action: Row[float]) -> bool:\n    return action[0] > 1.0", 'terminations = ("fell",)'),
-        r"fell of the task 'tiny' \(.*\) takes action, but a termination depends only on the state",
+        r"fell of the task 'tiny' \(.*\) takes action, but the end of an episode depends only on the state",
     ),
     "terms that need each other": (
         term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',

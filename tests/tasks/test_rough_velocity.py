@@ -103,7 +103,7 @@ def test_robot_outside_the_field_ends_the_episode(task: str, env: lw.Env) -> Non
     env.state_space.split(state)["qpos"][0, 0] = 100.0
     env.set_state(state)
     env.step()
-    assert env.terminated.nonzero().flatten().tolist() == [0]
+    assert env.truncated.nonzero().flatten().tolist() == [0] and not env.terminated.any()
     assert env.metrics["left_field"].tolist() == [1.0] + (NWORLD - 1) * [0.0]
 
 

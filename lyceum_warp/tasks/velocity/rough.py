@@ -109,4 +109,4 @@ class Rough(walking.Velocity):
     """A robot that follows velocity commands on rough ground."""
 
     metrics = (*walking.Velocity.metrics, "terrain_level")
-    terminations = (*walking.Velocity.terminations, "left_field")
+    truncations = ("left_field",)
