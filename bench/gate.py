@@ -26,6 +26,7 @@ from experiment import Experiment, Row, Table
 
 import lyceum_warp as lw
 from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.curriculum import start_episodes
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.tasks.velocity.g1 import LEGS
 
@@ -116,6 +117,10 @@ class Steps:
     """``qvel`` after the step, (steps, nworld, nv)."""
 
 
+def curriculum(folder: Path, options: Options) -> lw.Curriculum:
+    return (None if options.task else lw.load_curriculum(folder, which=options.which)) or lw.Curriculum()
+
+
 @torch.no_grad()
 def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: int, start: torch.Tensor) -> Steps:
     """Run a policy from the states ``start``, under a command for each world. A robot that falls starts again."""
@@ -148,7 +153,8 @@ def calm(env: lw.Env) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def home(env: lw.Env) -> torch.Tensor:
+def home(env: lw.Env, memory: lw.Curriculum) -> torch.Tensor:
+    start_episodes(env, None, memory)
     env.reset()
     state = env.get_state()
     env.state_space.split(state)["push_timer"][:] = NEVER
@@ -164,7 +170,8 @@ def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
     quiet = calm(worlds(folder, 1, options))
     commands = [command for command in BATTERY for _ in range(case.starts)]
     env = worlds(folder, len(commands), options, **quiet)
-    start = home(env)
+    memory = curriculum(folder, options)
+    start = home(env, memory)
     noise = 2.0 * torch.rand(env.nworld, env.model.nq - 7, generator=torch.Generator().manual_seed(0)) - 1.0
     env.state_space.split(start)["qpos"][:, 7:] += JOINT_NOISE * noise
     played = play(env, policy, commands, case.steps, start)
@@ -172,7 +179,7 @@ def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
     by_command = perf.mean(0).reshape(len(BATTERY), -1).mean(1)
 
     env = worlds(folder, 1, options, **quiet)
-    walk = play(env, policy, [GAIT], 2 * case.steps, home(env))
+    walk = play(env, policy, [GAIT], 2 * case.steps, home(env, memory))
     legs, params = len(LEGS), env.task.params
     change = walk.action.diff(dim=0)[:, 0, :legs] * torch.tensor(params["action_scale"][:legs]) / 0.25
     velocity = walk.velocity[:, 0]
@@ -181,7 +188,7 @@ def nano_g1(case: Case, folder: Path, options: Options) -> dict[str, Any]:
         "roll_pitch_rate": 2**0.5 * rms(velocity[:, 3:5]), "yaw_rate": rms(velocity[:, 5]),
         "joint_velocity": rms(velocity[:, params["joint_dof"][:legs].tolist()]),
         "worst_perf": float(by_command.min()), "yaw_rate_error": float(played.yaw_rate_error.mean()),
-        "perf_by_command": by_command.tolist(),
+        "perf_by_command": by_command.tolist(), "memory": memory.text,
     }  # fmt: skip
 
 
@@ -189,10 +196,11 @@ def walks(case: Case, folder: Path, options: Options) -> dict[str, Any]:
     """Run 100 episodes of the task with fixed commands, once without and once with pushes."""
     policy = lw.load(folder, which=options.which)
     commands = [command for command in COMMANDS for _ in range(case.starts)]
-    found: dict[str, Any] = {}
+    memory = curriculum(folder, options)
+    found: dict[str, Any] = {"memory": memory.text}
     for prefix, params in (("", {"push_seconds": [NEVER, NEVER]}), ("pushed_", {})):
         env = worlds(folder, len(commands), options, **params)
-        env.rand_reset()
+        start_episodes(env, None, memory)
         played = play(env, policy, commands, case.steps, env.get_state())
         found |= {
             f"{prefix}falls": int(played.fell.any(0).sum()),
@@ -229,7 +237,11 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             lines.append([text, f"{result[name]:.3g}", f"{kind} {limit:g}", verdict])
         lines += [[text, f"{result[name]:.3g}", "", ""] for name, text in BESIDE.items() if name in result]
         verdict = "passes" if result["passed"] else "does not pass"
-        title = f"{case['task']}: the policy {case['policy'][:8]} of {case['run']} {verdict}."
+        memory = f", begun at {result['memory']}" if result.get("memory") else ""
+        title = (
+            f"{case['task']}: the policy {case['policy'][:8]} of {case['run']} {verdict} on the C engine under exact "
+        )
+        title += f"physics{memory}."
         made.append(Table(title, ["", "measured", "limit", ""], lines))
     return made
 

@@ -3,6 +3,7 @@
 # fmt: off
 # isort: off
 from . import terms as terms, walkers as walkers
+from lyceum_warp.curriculum import Curriculum as Curriculum
 from lyceum_warp.algos.evaluation import Episodes as Episodes, evaluate as evaluate
 from lyceum_warp.algos.learner import Iteration as Iteration, Learner as Learner
 from lyceum_warp.algos.mppi_config import MPPIConfig as MPPIConfig
@@ -55,7 +56,8 @@ from lyceum_warp.model_files import (
     menagerie_model as menagerie_model, package_model as package_model, playground_model as playground_model)
 from lyceum_warp.openloop import OpenLoop as OpenLoop
 from lyceum_warp.options import EnvOptions as EnvOptions, PhysicsOptions as PhysicsOptions
-from lyceum_warp.runs.folder import load as load, load_value as load_value
+from lyceum_warp.runs.folder import (
+    load as load, load_curriculum as load_curriculum, load_value as load_value)
 from lyceum_warp.runs.pretrained_runs import pretrained_run as pretrained_run
 from lyceum_warp.task import (
     Planning as Planning, Row as Row, Task as Task, Training as Training, act as act, actuator as actuator,

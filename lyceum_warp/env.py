@@ -106,6 +106,8 @@ class Env:
     """``episode_metrics`` as one tensor, (nworld, number of metrics)."""
     shared: dict[str, torch.Tensor]
     """The memory that all worlds share: a tensor for each field of ``Shared``. Only ``update_shared`` changes it."""
+    lasting: dict[str, torch.Tensor]
+    """Lasting memory by name, such as a curriculum's level, each (nworld, size). ``rand_reset(seed=...)`` clears it."""
     success: torch.Tensor
     """Whether the goal was met in each of the last ``success_steps`` steps, (nworld,), bool."""
     done: torch.Tensor
@@ -181,6 +183,9 @@ class Env:
             memory = torch_view(worlds.shared)[0]
             self.shared = {name: memory[part.start : part.start + part.size]
                            for name, part in self.task.shared.get("Shared", {}).items()}  # fmt: skip
+            lasting = torch_view(worlds.lasting_memory)
+            self.lasting = {name: lasting[:, part.start : part.start + part.size]
+                            for name, part in self.task.memory["lasting_memory"].items()}  # fmt: skip
             self.reward_space = self.eval_space = Space()
             self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
             self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
@@ -272,17 +277,22 @@ class Env:
         for call in worlds.programs.reset:
             call()
 
-    def rand_reset(self, seed: int | None = None, mask: torch.Tensor | None = None) -> None:
+    def rand_reset(
+        self, seed: int | None = None, mask: torch.Tensor | None = None, *, first_world: int | None = None
+    ) -> None:
         """Reset worlds to random initial states, and zero their actions.
 
         Args:
             seed: Seed of the worlds' random streams. By default, each world continues its stream.
             mask: Worlds to change, (nworld,) bool; by default all.
+            first_world: Index of the first world in the random streams; by default the option ``first_world``. World i
+                gets the stream of world ``first_world + i``.
         """
         worlds = self.worlds
         worlds.set_mask(mask)
         if seed is not None:
-            worlds.seed_streams(whole_number("seed", seed, low=0))
+            first = self.first_world if first_world is None else first_world
+            worlds.seed_streams(whole_number("seed", seed, low=0), first)
         self.action.masked_fill_(worlds.mask_view[:, None], 0.0)
         for call in worlds.programs.rand_reset:
             call()

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import mujoco
+import numpy as np
 import warp as wp
 
 from lyceum_warp.options import PhysicsOptions
@@ -531,10 +532,11 @@ class Task:
         """
 
     @staticmethod
-    def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+    def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """Return metadata for ONNX files, such as a robot's gains. The values must be convertible to JSON.
 
-        The argument ``model`` is the compiled model, and ``p`` has the parameters as attributes.
+        The argument ``model`` is the compiled model, and ``p`` has the parameters as attributes. ``memory`` has the
+        shared memory, each (size,), and the lasting memory, each (nworld, size), at the end of training.
         """
         return {}
 

@@ -107,12 +107,14 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
     return float(home_qpos(model)[2])
 
 
-def deployment(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Collect the names, gains and poses that a robot needs to run a velocity policy, for ``lw.Task.deployment``.
 
-    All lists are in the order of ``joints``.
+    All lists are in the order of ``joints``. The ranges of commands cover the curriculum's stages that training has
+    reached.
     """
     actuators, stages = servos(model, p), np.asarray(p.stages)
+    stages = stages[stages[:, 0] <= max(memory["env_steps"].max(), stages[0, 0])]
     # the joint's own damping adds to the servo's damping
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))

@@ -46,7 +46,6 @@ class Worlds(WorldArrays):
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
         super().__init__(task, engine)
-        self.first_world = options.first_world
         self._workers = self._make_workers()
         self._programs: dict[tuple[int, bool, bool], Programs] = {}
         horizon = task.task.horizon if options.horizon is None else options.horizon
@@ -334,10 +333,10 @@ class Worlds(WorldArrays):
         self._judged.zero_()
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
 
-    def seed_streams(self, seed: int) -> None:
+    def seed_streams(self, seed: int, first_world: int = 0) -> None:
         """Restart the random streams of the selected worlds, and call the task's ``startup``."""
         self._seed.fill_(seed)
-        args = [self.mask, self._seed, self.first_world, self.counters.key, self.counters.episode]
+        args = [self.mask, self._seed, first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._clear(self.mask, "lasting_memory")
         self._make_nominal(self.mask, [field.name for field in self.task.dynamics])

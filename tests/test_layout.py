@@ -26,6 +26,7 @@ LEVELS = {
     "worlds": 5,
     "env": 6,
     "openloop": 7,
+    "curriculum": 7,
     "algos": 8, "controllers": 8, "testing": 8,
     "runs": 9,
     "tuning": 10,

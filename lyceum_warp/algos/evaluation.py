@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
@@ -10,6 +10,7 @@ import torch
 from lyceum_warp.algos.distributed import Team
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
+from lyceum_warp.curriculum import Curriculum, start_episodes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
@@ -43,12 +44,27 @@ class Episodes:
     """1.0 for each episode that ended by termination, otherwise 0.0. Time limits and faults are not terminations."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """Each metric of the task, summed over the steps of an episode."""
+    curriculum: Curriculum = dataclasses.field(default_factory=Curriculum)
+    """The curriculum at which the episodes began; its ``lasting`` memory has one row for each episode."""
 
     def first(self, count: int) -> "Episodes":
         """Select the first ``count`` episodes."""
-        names = [field.name for field in dataclasses.fields(self) if field.name != "metrics"]
-        metrics = {name: sums[:count] for name, sums in self.metrics.items()}
-        return dataclasses.replace(self, metrics=metrics, **{name: getattr(self, name)[:count] for name in names})
+        return self.select(slice(count))
+
+    def select(self, rows: Any) -> "Episodes":
+        """Select episodes by an index, a slice or a mask, (episodes,) bool."""
+        parts = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        curriculum = dataclasses.replace(
+            self.curriculum, lasting={name: values[rows] for name, values in self.curriculum.lasting.items()}
+        )
+        metrics = {name: sums[rows] for name, sums in self.metrics.items()}
+        tensors = {name: part[rows] for name, part in parts.items() if isinstance(part, torch.Tensor)}
+        return Episodes(**tensors, metrics=metrics, curriculum=curriculum)
+
+    @property
+    def step_metrics(self) -> dict[str, torch.Tensor]:
+        """Each metric of the task, averaged over the steps of an episode."""
+        return {name: sums / self.lengths for name, sums in self.metrics.items()}
 
 
 @torch.no_grad()
@@ -58,12 +74,14 @@ def evaluate(
     episodes: int,
     *,
     seed: int | None = None,
+    curriculum: Curriculum | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Episodes:
     """Run a policy without noise for whole episodes from random initial states.
 
     Every world contributes the same number of episodes. Otherwise, worlds with short episodes would contribute more
-    episodes and bias the results.
+    episodes and bias the results. If the task has a curriculum in lasting memory, one episode does not change the level
+    of the next: all worlds play one episode, and then begin again as if they were further worlds.
 
     Args:
         env: The environment; its worlds are reset.
@@ -72,11 +90,13 @@ def evaluate(
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states. ``evaluate`` and ``lw.make`` draw different initial states from the same seed.
             Without a seed, the worlds continue their random streams.
+        curriculum: How far curricula have come, such as ``lw.load_curriculum(run)``. By default, lasting memory begins
+            anew if a seed is given, and shared memory is that of the environment.
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or the policy does not
-            fit the environment's observations and actions.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or the policy or the
+            curriculum does not fit the environment.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -91,32 +111,47 @@ def evaluate(
         )
     act, each = acting(policy), -(-episodes // env.nworld)
     check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
-    env.rand_reset(None if seed is None else evaluation_seed(seed))
-    metrics = list(env.episode_metrics.values())
-    results = torch.zeros(6 + len(metrics), each, env.nworld, device=env.obs.device)
-    count = torch.zeros(env.nworld, dtype=torch.long, device=env.obs.device)
-    total = torch.zeros(env.nworld, device=env.obs.device)
-    worlds = torch.arange(env.nworld, device=env.obs.device)
-    for t in range(each * env.horizon):
+    seed = None if seed is None else evaluation_seed(seed)
+    rounds = each if env.task.curriculum else 1
+    if curriculum is not None:
+        curriculum.check(env)
+    elif seed is None and rounds > 1:
+        curriculum = Curriculum.of(env)
+    results = torch.zeros(6 + len(env.metrics), each, env.nworld, device=env.obs.device)
+    starts = []
+    for number, part in enumerate(results.chunk(rounds, 1)):
+        start_episodes(env, seed, curriculum, first=number * env.nworld, total=each * env.nworld)
+        starts.append({name: env.lasting[name].cpu().clone() for name in env.task.curriculum})
+        for t in _play(env, act, part):
+            if progress is not None:
+                progress(number * env.horizon + t, each * env.horizon)
+    returns, lengths, rewards, evals, success, terminated, *sums = results.flatten(1).cpu()
+    named = dict(zip(env.episode_metrics, sums, strict=True))
+    lasting = {name: torch.cat([start[name] for start in starts]) for name in env.task.curriculum}
+    begun = Curriculum(shared={name: memory.cpu().clone() for name, memory in env.shared.items()}, lasting=lasting)
+    return Episodes(returns, lengths, rewards, evals, success, terminated, named, begun)
+
+
+def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.Tensor) -> Iterator[int]:
+    """Write the results of each world's first episodes into (numbers, episodes, nworld). Yield every 50 steps."""
+    each, worlds = results.shape[1], torch.arange(env.nworld, device=env.obs.device)
+    count, total = torch.zeros_like(worlds), torch.zeros_like(env.reward)
+    for t in range(1, each * env.horizon + 1):
         length = env.episode_step + 1.0
-        env.action.copy_(act(env.obs) if t else _first_actions(act, env))
+        env.action.copy_(_first_actions(act, env) if t == 1 else act(env.obs))
         env.step()
         total += env.reward
         ends = (env.success.float(), env.terminated.float())
-        now = torch.stack([total, length, env.reward, env.eval, *ends, *metrics])
+        now = torch.stack([total, length, env.reward, env.eval, *ends, *env.episode_metrics.values()])
         slot = count.clamp_max(each - 1)
-        wanted = env.done & (count < each)
-        results[:, slot, worlds] = torch.where(wanted, now, results[:, slot, worlds])
+        counts = env.done & (count < each)
+        results[:, slot, worlds] = torch.where(counts, now, results[:, slot, worlds])
         total.masked_fill_(env.done, 0.0)
-        count += wanted
-        if t % 50 == 49:
-            if progress is not None:
-                progress(t + 1, each * env.horizon)
+        count += counts
+        if t % 50 == 0:
+            yield t
             if bool((count >= each).all()):
-                break
-    returns, lengths, rewards, evals, success, terminated, *sums = results.flatten(1).cpu()
-    named = dict(zip(env.episode_metrics, sums, strict=True))
-    return Episodes(returns, lengths, rewards, evals, success, terminated, named)
+                return
 
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
@@ -142,7 +177,7 @@ def evaluation_worlds(env: Env, nworld: int, **changes: Any) -> Env:
 class MeanPolicyEvaluation:
     """Evaluates the policy without noise during training, in a separate, small environment on rank 0.
 
-    All evaluations start from the same initial states, so that they differ only in the policy.
+    All evaluations start from the same initial states, and at the curriculum that training has reached.
     """
 
     def __init__(self, env: Env, config: Any, team: Team) -> None:
@@ -158,7 +193,10 @@ class MeanPolicyEvaluation:
                 if self._few is None:
                     self._few = evaluation_worlds(self.env, self.episodes)
                 self._few.follow(self.env)
-                episodes = evaluate(self._few, moved(policy, self._few), self.episodes, seed=_MEAN_SEED)
+                episodes = evaluate(
+                    self._few, moved(policy, self._few), self.episodes, seed=_MEAN_SEED,
+                    curriculum=Curriculum.of(self.env),
+                )  # fmt: skip
                 parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
                 means.copy_(torch.stack([part.mean() for part in parts]))
             self.team.copy_leader([means])

@@ -43,7 +43,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
         policy: A module with the method ``act`` and the attribute ``nobs``.
         path: Path of the file; an existing file is replaced.
         env: An environment of the policy's task. With an environment, an ONNX file also contains the
-            ``deployment_metadata``.
+            ``deployment_metadata``. Its memory tells how far the training's curricula had come.
 
     Returns:
         The file's path.
@@ -98,6 +98,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
     """
     task, model = env.task, env.task.model
+    memory = {name: values.numpy(force=True) for name, values in {**env.shared, **env.lasting}.items()}
     parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
     normalizer: Any = getattr(policy, "normalizer", None)
     if isinstance(normalizer, Normalizer):
@@ -110,7 +111,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         "observations": parts,
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
         "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
-        **task.task.deployment(model, SimpleNamespace(**task.params)),
+        **task.task.deployment(model, SimpleNamespace(**task.params), memory),
     }
 
 

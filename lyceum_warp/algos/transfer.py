@@ -12,6 +12,7 @@ import warp as wp
 from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_worlds
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy
+from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Env
 from lyceum_warp.options import PhysicsOptions
@@ -98,6 +99,8 @@ class Transfer:
     """Number of pairs of episodes."""
     seed: int
     """Seed of the initial states."""
+    memory: str
+    """The curriculum at which all episodes began, as in "level 4.2 (0 to 9)"; empty if the task has none."""
     comparisons: tuple[Comparison, ...]
     """One comparison for each engine and each set of physics options."""
 
@@ -108,7 +111,7 @@ class Transfer:
         for comparison in self.comparisons:
             shown = ", ".join(difference.text for difference in comparison.differences)
             found.append(f"{comparison.second} against {comparison.first}: {comparison.verdict} ({shown})")
-        return "; ".join(found)
+        return "; ".join(found) + (f"; begun at {self.memory}" if self.memory else "")
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to values that JSON supports."""
@@ -127,6 +130,7 @@ def transfer(
     episodes: int = 64,
     *,
     seed: int = 0,
+    curriculum: Curriculum | None = None,
     margin: float = 0.05,
     device: str | None = None,
     warp: bool = True,
@@ -146,6 +150,7 @@ def transfer(
         policy: A function that maps observations to actions without noise, or a module whose method ``act`` does this.
         episodes: Number of pairs of episodes.
         seed: Seed of the initial states.
+        curriculum: How far curricula have come, such as ``lw.load_curriculum(run)``; by default as far as in ``env``.
         margin: Largest difference at which two means count as equal. For returns and lengths, the margin is a fraction
             of the mean absolute return or mean length in the first simulation. For terminations, it is an absolute
             difference of fractions.
@@ -161,6 +166,7 @@ def transfer(
     """
     check_kind("env of transfer", env, Env, "as lw.make(...) makes it")
     episodes, margin = whole_number("episodes", episodes, low=2), finite_number("margin", margin, low=0.0)
+    curriculum = curriculum or Curriculum.of(env)
     named, own = task_physics(env)
     if not physics:
         named = {name: named[name] for name in dict.fromkeys((EXACT, own))}
@@ -175,8 +181,9 @@ def transfer(
         worlds = evaluation_worlds(env, episodes, **changes)
         own_policy = moved(policy, worlds) if isinstance(policy, torch.nn.Module) else policy
         shown = functools.partial(_show, progress, number, len(plays))
-        result = evaluate(worlds, own_policy, episodes, seed=seed, progress=shown)
+        result = evaluate(worlds, own_policy, episodes, seed=seed, curriculum=curriculum, progress=shown)
         played[name] = result, sum(worlds.fault_counts.values())
+        memory = result.curriculum.text
     exact = f"{EXACT} physics"
     pairs = [(exact, name) for name in plays if name not in (exact, warp_name)]
     found = [_compared(*pair, played[pair[0]], played[pair[1]], margin) for pair in pairs]
@@ -184,7 +191,7 @@ def transfer(
         found.insert(0, _compared("C engine", warp_name, played[f"{own} physics"], played[warp_name], margin))
     if not env.task.ends_by("terminated"):
         found = [dataclasses.replace(one, differences=one.differences[:2]) for one in found]
-    return Transfer(task=env.task.name, episodes=episodes, seed=seed, comparisons=tuple(found))
+    return Transfer(task=env.task.name, episodes=episodes, seed=seed, memory=memory, comparisons=tuple(found))
 
 
 def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, step: int, steps: int) -> None:
@@ -201,6 +208,16 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
     given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
     own = next((name for name, options in named.items() if options == given), "own")
     return named | {own: given}, own
+
+
+def simulation(env: Env) -> str:
+    """Name an environment's engine and physics, such as "C engine, exact physics"."""
+    engine = (
+        "C engine" if env.engine.name == "mujoco" else f"{env.engine.name.capitalize()} engine on {env.device.alias}"
+    )
+    named, physics = task_physics(env)
+    options = ", ".join(f"{name} {value}" for name, value in named[physics].given().items())
+    return f"{engine}, {physics} physics{f' ({options})' if options else ''}"
 
 
 def _compared(

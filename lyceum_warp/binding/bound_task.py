@@ -234,9 +234,13 @@ class BoundTask:
             for overload in overloads(function):  # a term must not write a field
                 check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
         memory = self.source.memory
+        fields = {name: written_fields(function) for name, function in written.items()}
+        trained = frozenset[str]().union(*(names for name, names in fields.items() if name != "startup"))
+        self.curriculum = tuple(name for name in memory if memory[name].kind == "lasting_memory" and name in trained)
+        """Names of the lasting memory that functions other than ``startup`` write."""
         return {
-            name: frozenset(memory[field].kind if field in memory else field for field in written_fields(function))
-            for name, function in written.items()
+            name: frozenset(memory[field].kind if field in memory else field for field in names)
+            for name, names in fields.items()
         }
 
     def _memory_layouts(self) -> dict[str, parts.Layout]:

@@ -9,20 +9,22 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.algos.policy_check import check_sizes
-from lyceum_warp.algos.transfer import Transfer, transfer
+from lyceum_warp.algos.transfer import Transfer, simulation, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
-from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameter, parameters
 from lyceum_warp.cli.display import console, fitting_table, note, say, tried
 from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.controllers.trajectory import source
-from lyceum_warp.engines.placement import options_for_few_worlds
+from lyceum_warp.curriculum import Curriculum
+from lyceum_warp.engines.placement import options_for_few_worlds, options_on_cores
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
+from lyceum_warp.runs.choice import AUTO, EPISODES, choose_policy
 from lyceum_warp.runs.configuration import Configuration
-from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.folder import Run, load, load_curriculum
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.runs.task_copy import note_changes, run_env
 from lyceum_warp.support.interrupts import Interrupted
@@ -48,15 +50,17 @@ class Eval:
     """
 
     USUAL = (
-        "pretrained", "which", "episodes", "seed", "nworld", "video", "camera", "transfer", "episodes_to", "device",
+        "pretrained", "which", "episodes", "seed", "nworld", "memory", "video", "transfer", "episodes_to",
+        "device",
     )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
     """The run's folder; with --pretrained, the name of a task."""
     pretrained: bool = False
     """Whether to evaluate the package's pretrained policy of a task."""
-    which: str = "last"
-    """The policy to evaluate: last, best, or the number of a saved iteration."""
+    which: str = AUTO
+    """The policy to evaluate: auto (the better of the last and the best policy in new episodes), last, best, or the
+    number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
     """The name or file of a task to use instead of the run's task. Physics and parameters then come from this task. Its
     observations and actions must have the same sizes.
@@ -68,6 +72,12 @@ class Eval:
     """Seed of the initial states. Training draws different initial states, even with the same seed."""
     nworld: int = 32
     """Maximum number of worlds."""
+    memory: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE[,VALUE...]")] = ()
+    """A curriculum's memory at the start of the episodes, such as level=0,5,9. With several values, the command plays
+    --episodes for each. By default, curricula stand where they stood when the policy was saved.
+    """
+    fresh_memory: bool = False
+    """Whether curricula begin anew, as in a new run."""
     video: bool = False
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
     camera: CameraWords = ()
@@ -97,46 +107,121 @@ class Eval:
             Run.check_free(self.episodes_to)
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
-        path = run.policy_file(self.which)
         words, params = given(self.env) | given(self.physics), parameters(self.param, self)
         env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
             env = evaluation_worlds(env, nworld)
-        policy = load(run, which=self.which, device=env.obs.device)
-        check_sizes(policy, env, f"the policy in {path}")
+        which = better_policy(run, self.which, task=self.task, trust=self.trust)
+        policy = load(run, which=which, device=env.obs.device)
+        check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+        curricula, origin_of_memory = self._curricula(run, which, env)
+        if len(curricula) > 1 and (self.transfer or self.episodes_to):
+            raise ValueError("--transfer and --episodes-to play at one level: give --memory one value")
         try:
             with LongWork("evaluating the policy", "steps", console) as work:
-                episodes = evaluate(env, policy, self.episodes, seed=self.seed, progress=work).first(self.episodes)
+                played = [
+                    evaluate(
+                        env, policy, self.episodes, seed=self.seed, curriculum=curriculum, progress=work
+                    ).first(self.episodes)
+                    for curriculum in curricula
+                ]  # fmt: skip
         except Interrupted as signalled:
             name = signal.Signals(signalled.number).name
             note(f"interrupted by {name} before the episodes were complete: there are no statistics")
             raise
-        found = {
-            "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
-            "length": episodes.lengths, **episodes.metrics,
-        }  # fmt: skip
-        columns, deviation = {"": list(found)}, functools.partial(torch.std, correction=0)
-        for heading, number in (("mean", torch.mean), ("std", deviation), ("min", torch.min), ("max", torch.max)):
-            columns[heading] = [f"{number(values).item():.6g}" for values in found.values()]
-        which = "the mean policy" if self.which == "last" else f"the mean policy {self.which!r}"
         where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
-        say(f"{env.task.name}: {self.episodes} episodes of {which} {where}")
-        console.print(fitting_table(console, columns, omit=("std",)))
-        if env.task.functions["success"] is not None:
-            console.print(f"success: {episodes.success.mean().item():.0%}")
+        policy_text = "the mean policy" if which == "last" else f"the mean policy {which!r}"
+        say(f"{env.task.name}: {self.episodes} episodes of {policy_text} {where}, on the {simulation(env)}")
+        if len(played) > 1:
+            _print_levels(played)
+        else:
+            if text := played[0].curriculum.text:
+                say(f"memory at the start ({origin_of_memory}): {text}")
+            _print_statistics(env, played[0])
         if self.transfer:
             with LongWork("judging the policy's transfer", "steps", console) as work:
                 verdict = transfer(
-                    env, policy, max(2, self.episodes), seed=self.seed, device=self.env.device, progress=work
-                )
+                    env, policy, max(2, self.episodes), seed=self.seed, curriculum=curricula[0],
+                    device=self.env.device, progress=work,
+                )  # fmt: skip
             _print_transfer(verdict)
         if self.episodes_to is not None:
-            say(f"episodes: {_save_episodes(env, policy, self, run, origin)}")
+            say(f"episodes: {_save_episodes(env, policy, self, run, which, curricula[0], origin)}")
         if self.video:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
-            say(f"video: {tried(policy_video, env, policy, path, evaluation_seed(self.seed), camera=camera)}")
+            video = tried(
+                policy_video, env, policy, path, evaluation_seed(self.seed), curriculum=curricula[0], camera=camera
+            )
+            say(f"video: {video}")
+
+    def _curricula(self, run: Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
+        """Return the curricula at which to play, one for each value of --memory, and where they come from."""
+        if self.memory and self.fresh_memory:
+            raise ValueError("--memory sets the memory that --fresh-memory leaves at its start: omit one of them")
+        if self.memory:
+            curricula = [Curriculum()]
+            for name, value in map(parameter, self.memory):
+                values = torch.tensor(value, dtype=torch.float32).reshape(-1)
+                if name in env.shared:
+                    curricula = [dataclasses.replace(one, shared={**one.shared, name: values}) for one in curricula]
+                    continue
+                size = env.lasting[name].shape[1] if name in env.lasting else 1
+                rows = values.reshape(-1, size) if len(values) % size == 0 else values[None]
+                curricula = [
+                    dataclasses.replace(one, lasting={**one.lasting, name: row[None]})
+                    for one in curricula
+                    for row in rows
+                ]
+            return curricula, "as given"
+        saved = None if self.fresh_memory or self.task else load_curriculum(run, which=which)
+        if saved is None:
+            return [Curriculum(shared={name: memory * 0.0 for name, memory in env.shared.items()})], "new"
+        return [saved], "the run's"
+
+
+def better_policy(run: Run, which: str, *, task: str | None = None, trust: bool = False) -> str:
+    """Return "last" or "best" for ``AUTO``, and print the choice; return any other ``which`` as it is."""
+    if which != AUTO:
+        return which
+
+    def worlds() -> Env:
+        env = run_worlds(run, options_on_cores(), {}, nworld=EPISODES, task=task, trust=trust)
+        return env if env.horizon else evaluation_worlds(env, EPISODES)
+
+    if not run.best.is_file():
+        return "last"
+    with LongWork("comparing the last and the best policy", "steps", console) as work:
+        choice = choose_policy(run, worlds, progress=work)
+    say(choice.text)
+    return choice.which
+
+
+def _print_levels(played: list[Episodes]) -> None:
+    columns: dict[str, list[str]] = {"memory at the start": [episodes.curriculum.text for episodes in played]}
+    for heading, name in (("return", "returns"), ("length", "lengths"), ("evaluation", "evals"), ("success", "success"),
+                          ("terminated", "terminated")):  # fmt: skip
+        columns[heading] = [f"{getattr(episodes, name).mean().item():.4g}" for episodes in played]
+    columns["std of return"] = [f"{episodes.returns.std(correction=0).item():.3g}" for episodes in played]
+    console.print(fitting_table(console, columns))
+
+
+def _print_statistics(env: Env, episodes: Episodes) -> None:
+    # terms, ends and what measure writes add up over an episode; other metrics, such as a level, do not
+    quantities = env.task.task.metrics if env.task.functions["measure"] is None else ()
+    means = {f"{name}, a step": episodes.step_metrics[name] for name in quantities}
+    sums = {name: values for name, values in episodes.metrics.items() if name not in quantities}
+    numbers = {
+        "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
+        "length": episodes.lengths, **sums, **means,
+    }  # fmt: skip
+    columns, deviation = {"": list(numbers)}, functools.partial(torch.std, correction=0)
+    for heading, statistic in (("mean", torch.mean), ("std", deviation), ("min", torch.min), ("max", torch.max)):
+        columns[heading] = [f"{statistic(values).item():.6g}" for values in numbers.values()]
+    console.print(fitting_table(console, columns, omit=("std",)))
+    if env.task.functions["success"] is not None:
+        console.print(f"success: {episodes.success.mean().item():.0%}")
 
 
 def _print_transfer(verdict: Transfer) -> None:
@@ -182,14 +267,16 @@ def run_worlds(
     return env
 
 
-def _save_episodes(env: Env, policy: Policy, options: Eval, run: Run, source: dict[str, Any]) -> str:
+def _save_episodes(
+    env: Env, policy: Policy, options: Eval, run: Run, which: str, curriculum: Curriculum, source: dict[str, Any]
+) -> str:
     """Run the same episodes again, write one file per episode, and return a glob pattern of the files."""
     assert options.episodes_to is not None
-    whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": options.which}
+    whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
     with LongWork("running the episodes that are saved", "steps", console) as work:
         episodes = policy_episodes(
             env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
-            controller=whose, progress=work,
+            curriculum=curriculum, controller=whose, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):
             path = options.episodes_to / f"episode-{number:03d}.npz"

@@ -9,10 +9,12 @@ import tyro
 from lyceum_warp.algos.policy_export import check_export, export_policy
 from lyceum_warp.cli.arguments import Trust
 from lyceum_warp.cli.display import note, say
-from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.cli.evaluate import better_policy, run_worlds
+from lyceum_warp.curriculum import start_episodes
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Env
-from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.choice import AUTO
+from lyceum_warp.runs.folder import Run, load, load_curriculum
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,22 +33,26 @@ class Export:
     """The run's folder."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file to write, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
-    which: str = "last"
-    """The policy to export: last, best, or the number of a saved iteration."""
+    which: str = AUTO
+    """The policy to export: auto (the better of the last and the best policy in new episodes), last, best, or the
+    number of a saved iteration."""
     trust: Trust = False
 
     def run(self) -> None:
         path = self.to or self.folder / "policy.onnx"
         check_export(path)
         run = Run.open(self.folder)
-        policy = load(run, which=self.which)
-        export_policy(policy, path, env=self._env(run) if path.suffix == ".onnx" else None)
+        which = better_policy(run, self.which, trust=self.trust)
+        policy = load(run, which=which)
+        export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
         say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
 
-    def _env(self, run: Run) -> Env | None:
+    def _env(self, run: Run, which: str) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""
         try:
-            return run_worlds(run, options_on_cores(), {}, nworld=1, task=None, trust=self.trust)
+            env = run_worlds(run, options_on_cores(), {}, nworld=1, task=None, trust=self.trust)
+            start_episodes(env, None, load_curriculum(run, which=which))
+            return env
         except (ValueError, FileNotFoundError, ImportError) as error:
             note(f"the file has no metadata on the robot: {error}")
             return None

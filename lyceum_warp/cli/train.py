@@ -11,9 +11,8 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.evaluation import evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.evaluation import evaluation_seed, evaluation_worlds
 from lyceum_warp.algos.learner import Learner
-from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.squashed_policy import SquashedPolicy
 from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
@@ -29,8 +28,9 @@ from lyceum_warp.cli.arguments import (
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import read_checkpoint
+from lyceum_warp.runs.choice import EPISODES, choose_policy
 from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.folder import Run, load
 from lyceum_warp.runs.task_copy import note_changes
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
@@ -39,8 +39,6 @@ from lyceum_warp.training import train
 from lyceum_warp.viz.cameras import parsed_camera
 from lyceum_warp.viz.learning_curve import learning_curve
 from lyceum_warp.viz.policy_videos import policy_video
-
-_FINAL_EPISODES = 32
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
 """Settings that --resume may change, with their default values."""
@@ -316,18 +314,17 @@ class Train:
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: Run, learner: Learner) -> int:
-        env, policy, seed = learner.env, learner.policy, learner.env.options.seed + 1
+        env = learner.env
         console.print(curve_table(run.rows(), console))
-        few = evaluation_worlds(env, _FINAL_EPISODES)
         with LongWork("evaluating the mean policy", "steps", console) as work:
-            returns = evaluate(few, moved(policy, few), _FINAL_EPISODES, seed=seed, progress=work).returns
-        final = returns.mean().item()
-        say(f"mean policy, {len(returns)} new episodes: return {final:.1f} ± {returns.std(correction=0):.1f} "
-            f"({returns.min():.1f} to {returns.max():.1f})")  # fmt: skip
+            choice = choose_policy(run, lambda: evaluation_worlds(env, EPISODES), progress=work)
+        score = choice.score
+        say(f"mean policy, {EPISODES} new episodes: return {score.mean:.1f} ± {score.std:.1f} "
+            f"({score.low:.1f} to {score.high:.1f})")  # fmt: skip
+        if len(choice.scores) > 1:
+            say(choice.text)
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
-        if (best := run.best_score()) is not None:
-            every = "" if learner.best_by == "return_mean" else " (of the evaluated ones)"
-            say(f"best policy: return {best[1]:.1f} in iteration {best[0]}{every}")
+        if run.best.is_file():
             paths["best"] = str(run.best)
         if run.transfer.is_file():
             say(f"transfer: {json.loads(run.transfer.read_text())['line']}")
@@ -335,10 +332,12 @@ class Train:
             paths["curve"] = tried(learning_curve, run)
         if self.video:
             camera, path = parsed_camera(self.camera), run.folder / "video.mp4"
-            paths["video"] = tried(policy_video, env, policy, path, evaluation_seed(seed), camera=camera)
+            policy, seed = load(run, which=choice.which), evaluation_seed(env.options.seed + 1)
+            paths["video"] = tried(policy_video, env, policy, path, seed, camera=camera)
         for name, place in paths.items():
             say(f"{name + ':':<12}{place}")
-        if self.require_return is not None and not final > self.require_return:
-            note(f"the mean policy's return is {final:.1f}; --require-return demands more than {self.require_return:g}")
+        if self.require_return is not None and not score.mean > self.require_return:
+            demand = f"--require-return demands more than {self.require_return:g}"
+            note(f"the {choice.which} policy returns {score.mean:.1f}; {demand}")
             return 1
         return 0

@@ -12,12 +12,14 @@ from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.algos.policy_check import check_sizes
 from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import note
-from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
+from lyceum_warp.curriculum import start_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.folder import Run, load
+from lyceum_warp.runs.choice import AUTO
+from lyceum_warp.runs.folder import Run, load, load_curriculum
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower
@@ -67,8 +69,9 @@ class View:
     """Control the displayed world with a planner: MPPI, or the planner that --update selects."""
     follow: bool = False
     """Show the newest policy of a run while it trains."""
-    which: str = "last"
-    """The policy of a run to show: last, best, or the number of a saved iteration."""
+    which: str = AUTO
+    """The policy of a run to show: auto (the better of the last and the best policy in new episodes), last, best, or
+    the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
     """The task's name or file, if the task of the run or of the episodes cannot be found."""
     nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -116,12 +119,14 @@ class View:
         controllers: dict[str, Any] = {}
         watchers: list[Watcher] = []
         if kind == "run":
-            if self.follow and self.which != "last":
+            if self.follow and self.which not in (AUTO, "last"):
                 raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
             run, nworld = Run.open(self.what[0]), self.nworld or _RUN_WORLDS
             env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
-            policy = load(run, which=self.which, device=env.obs.device)
-            check_sizes(policy, env, f"the policy in {run.policy_file(self.which)}")
+            which = "last" if self.follow else better_policy(run, self.which, task=self.task, trust=self.trust)
+            policy = load(run, which=which, device=env.obs.device)
+            check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+            start_episodes(env, self.seed, None if self.task else load_curriculum(run, which=which))
             controllers["policy"] = policy
             if self.follow:
                 watchers.append(Follower(run, policy))
@@ -133,7 +138,7 @@ class View:
             config = self.planner.on_top_of(task_config(env.task.task))
             words |= {} if env.options.model is None else {"model": env.options.model}
             controllers["mppi"] = MPPI(env.task.task, config, seed=self.seed, params=env.given_params, **words)
-        view(env, controllers, seed=self.seed, watchers=watchers, **shown)
+        view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **shown)
         return 0
 
 

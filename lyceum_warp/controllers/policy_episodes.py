@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
+from lyceum_warp.curriculum import Curriculum, start_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import whole_number
 
@@ -18,12 +19,14 @@ def policy_episodes(
     episodes: int,
     *,
     seed: int | None = None,
+    curriculum: Curriculum | None = None,
     controller: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
-    The episodes equal those of ``lw.evaluate`` with the same seed and number of worlds. One call of the policy acts in
+    The episodes equal those of ``lw.evaluate`` with the same curriculum, number of worlds and seed (which it derives by
+    ``evaluation_seed``). One call of the policy acts in
     all worlds, so the times in a trajectory are those of the whole batch.
 
     Yields:
@@ -38,7 +41,10 @@ def policy_episodes(
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)
     for number in range(rounds):
-        env.rand_reset(seed if number == 0 else None)
+        if number == 0 or env.task.curriculum:
+            start_episodes(env, seed, curriculum, first=number * env.nworld, total=rounds * env.nworld)
+        else:
+            env.rand_reset()
         states, obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
         actions: list[torch.Tensor] = []
         outcomes: list[torch.Tensor] = []

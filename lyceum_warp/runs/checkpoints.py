@@ -12,6 +12,7 @@ from torch import nn
 
 from lyceum_warp.algos.policy import GaussianPolicy
 from lyceum_warp.algos.value import ValueFunction
+from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.validate import first_sentence
 
@@ -24,9 +25,13 @@ _CLASSES: dict[str, type[nn.Module]] = {"policy": GaussianPolicy, "value": Value
 """The default class of each network. A file stores the name of any other class."""
 
 
-def policy_content(iteration: int, policy: nn.Module, value: nn.Module | None = None) -> dict[str, Any]:
+def policy_content(
+    iteration: int, policy: nn.Module, value: nn.Module | None = None, curriculum: Curriculum | None = None
+) -> dict[str, Any]:
     """Make the content of a policy's file, with copies of the networks on the CPU."""
     content: dict[str, Any] = {"lyceum_warp": FORMAT, "iteration": iteration}
+    if curriculum is not None and (memory := {name: dict(rows) for name, rows in vars(curriculum).items() if rows}):
+        content["curriculum"] = memory
     for name, module in (("policy", policy), ("value", value)):
         if module is not None:
             kind = type(module)

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
 from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
@@ -65,6 +66,8 @@ class Run:
     """Path of the folder ``replay``: the replay buffer of the checkpoint, if the algorithm has one."""
     transfer: Path
     """Path of ``transfer.json``, the verdict of ``lw.transfer`` on the last policy."""
+    evaluation: Path
+    """Path of ``evaluation.json``, the returns of the last and the best policy in new episodes."""
     task_folder: Path
     """Path of the folder ``task``: copies of the task's file, modules and model, unless they are in the package."""
     check: Callable[[], None]
@@ -73,6 +76,7 @@ class Run:
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         self.folder, self.config = folder, config
         self.metrics, self.transfer = folder / "metrics.csv", folder / "transfer.json"
+        self.evaluation = folder / "evaluation.json"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
         self.replay, self.task_folder = folder / "replay", folder / _TASK
@@ -372,6 +376,26 @@ def load_value(run: str | Path | Run, *, which: str | int = "last", device: str 
     """
     content, path = _content(run, which, device)
     return network_of(content, path, "value").to(device).eval().requires_grad_(False)
+
+
+def load_curriculum(run: str | Path | Run, *, which: str | int = "last") -> Curriculum | None:
+    """Load how far a run's curricula had come when a policy was saved, for ``lw.evaluate`` and ``lw.transfer``.
+
+    The result is None if the task has no such memory, or if an earlier release saved the policy.
+
+    Args:
+        run: A run's folder, or a policy file in this folder.
+        which: See ``load``.
+
+    Raises:
+        FileNotFoundError: The run or the file does not exist.
+        ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release.
+    """
+    content, path = _content(run, which, "cpu")
+    try:
+        return Curriculum(**content["curriculum"]) if "curriculum" in content else None
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"the curriculum in {path} is damaged: {error}") from error
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[dict[str, Any], Path]:

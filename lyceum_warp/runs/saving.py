@@ -2,8 +2,10 @@
 
 import math
 import time
+from typing import Any
 
 from lyceum_warp.algos.learner import Iteration, Learner
+from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.runs.checkpoints import policy_content, write_content
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.replay_files import clean_replay, write_replay
@@ -38,7 +40,7 @@ class Saver:
         self.saved = saved
         best = None if run is None else run.best_score()
         self._best = -math.inf if best is None else best[1]
-        self._before = policy_content(learner.iteration, learner.policy, learner.value)
+        self._before = self._content()
         self._seconds, self._when = 0.0, time.perf_counter()
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
@@ -60,7 +62,7 @@ class Saver:
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
-            self._before = policy_content(learner.iteration, learner.policy, learner.value)
+            self._before = self._content()
         if better and score is not None:
             self._best = score
             content = before if sampled else self._before
@@ -70,6 +72,10 @@ class Saver:
             path.parent.mkdir(exist_ok=True)
             write_content(path, self._before)
         return score
+
+    def _content(self) -> dict[str, Any]:
+        learner = self.learner
+        return policy_content(learner.iteration, learner.policy, learner.value, Curriculum.of(learner.env))
 
     def due(self) -> bool:
         """Check whether it is time to save."""
@@ -88,7 +94,7 @@ class Saver:
         with learner.team.together():
             if run is not None:
                 run.check()
-                run.save(policy_content(learner.iteration, learner.policy, learner.value), state)
+                run.save(self._content(), state)
                 if replay is not None:
                     clean_replay(run.replay, replay)
         self._stored = 0 if replay is None else replay.stored

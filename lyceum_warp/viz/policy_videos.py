@@ -14,6 +14,7 @@ from lyceum_warp.algos.learner import Iteration, Learner
 from lyceum_warp.algos.networks import moved
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.controllers.policy_episodes import policy_episodes
+from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
@@ -26,10 +27,14 @@ NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 
 
 def policy_video(
-    env: Env, policy: Policy, path: Path, seed: int, *, camera: CameraChoice = None,
-    progress: NamedProgress | None = None,
+    env: Env, policy: Policy, path: Path, seed: int, *, curriculum: Curriculum | None = None,
+    camera: CameraChoice = None, progress: NamedProgress | None = None,
 ) -> Path:  # fmt: skip
-    """Run an episode of a policy in a new world, write a video of it, and return the video's path."""
+    """Run an episode of a policy in a new world, write a video of it, and return the video's path.
+
+    By default, the episode begins at the curriculum that ``env`` has reached.
+    """
+    curriculum = curriculum or Curriculum.of(env)
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
     with contextlib.ExitStack() as shown:
@@ -37,7 +42,9 @@ def policy_video(
             running: Progress = shown.enter_context(LongWork("running an episode for the video", "steps"))
         else:
             running = functools.partial(progress, "running an episode", "steps")
-        (episode,) = policy_episodes(one, acting(policy), 1, seed=seed, progress=running)
+        (episode,) = policy_episodes(
+            one, acting(policy), 1, seed=seed, curriculum=curriculum, progress=running
+        )  # fmt: skip
     drawing = None if progress is None else functools.partial(progress, "drawing the video", "frames")
     return write_video(one, episode.states, path, camera=camera, progress=drawing)
 

@@ -33,7 +33,7 @@ def test_experiment_gate_evaluates_each_policy_only_once(
 def test_velocity_error_of_a_standing_robot_equals_its_command(run: Path) -> None:
     env = gate.worlds(run, 2, gate.Options(), **gate.calm(gate.worlds(run, 1, gate.Options())))
     stand = SimpleNamespace(act=lambda obs: torch.zeros(2, 12))
-    played = gate.play(env, stand, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], 50, gate.home(env))
+    played = gate.play(env, stand, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], 50, gate.home(env, lw.Curriculum()))
     torch.testing.assert_close(played.velocity_error[30:].mean(0), torch.tensor([1.0, 0.0]), atol=0.05, rtol=0.0)
     torch.testing.assert_close(played.yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.05, rtol=0.0)
     assert not played.fell.any()

@@ -73,6 +73,7 @@ KINDS = {
     "metrics.csv": Kind("run/metrics.csv", mutations.mutated_csv, ("open", "resume")),
     "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
     "best.pt": Kind("run/best.pt", _checkpoint, ("load best", "resume", "from best")),
+    "evaluation.json": Kind("run/evaluation.json", mutations.mutated_json, ("eval",)),
     "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone", "load alone")),
     "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
     "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),

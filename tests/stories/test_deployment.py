@@ -79,6 +79,7 @@ def test_control_loop_in_the_documentation_reproduces_steps_of_the_environment(
 
 def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
     env = lw.make("go1_velocity")
+    env.lasting["env_steps"].fill_(130e3)  # the second of three stages of the commands
     policy, model = walking_policy(env), copy.copy(env.model)
     robot = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), model)
     data, meta = mujoco.MjData(model), robot.meta
@@ -99,7 +100,7 @@ def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[s
     torch.testing.assert_close(normalized.clamp(-10.0, 10.0), policy.normalizer(obs))
     assert meta["stiffness"][:3] == pytest.approx([15.895, 15.895, 35.764], abs=1e-3)
     assert meta["damping"][:3] == pytest.approx([1.0119, 1.0119, 2.2768], abs=1e-4)
-    assert meta["commands"]["forward_velocity"] == [-2.0, 3.0] and meta["force_limit"][2] == pytest.approx(35.55)
+    assert meta["commands"]["forward_velocity"] == [-1.5, 2.0] and meta["force_limit"][2] == pytest.approx(35.55)
 
 
 def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
