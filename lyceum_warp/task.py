@@ -434,10 +434,12 @@ class Task:
       until the next write or reset.
     - ``initialize``, ``randomize`` and ``event``: qpos, qvel, act, ctrl, eq_active, the inputs, memory, lasting memory
       and model fields. Every reset first restores the nominal values of model fields, so random changes do not
-      accumulate. ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
-      ``sensordata``), because these are computed afterwards.
+      accumulate.
     - ``startup``: model fields and lasting memory. Resets do not change them.
     - ``substep`` and ``advance``: both kinds of memory. ``advance`` writes the memory of ``s1``.
+
+    ``startup``, ``initialize`` and ``randomize`` must not read derived fields (``xpos``, ``site_xpos``,
+    ``sensordata``), because these are computed afterwards.
 
     A reset calls ``reject`` before the substeps of ``settle``. During these substeps, ``substep`` is not called.
 

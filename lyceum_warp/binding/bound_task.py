@@ -13,11 +13,12 @@ import warp as wp
 
 from lyceum_warp.binding import models, parts
 from lyceum_warp.binding.codegen import kernels_of
+from lyceum_warp.binding.divisions import check_divisions
 from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.sources import is_struct, overloads
-from lyceum_warp.binding.writes import Rights, check_writes, written_fields
+from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
 from lyceum_warp.fields import DATA_FIELDS, INITIAL, INPUTS, Field, describe, is_data_field, vec10
 from lyceum_warp.model_fields import VARYING_FIELDS, describe_model_field, is_model_field
 from lyceum_warp.options import ModelSource, PhysicsOptions
@@ -33,6 +34,9 @@ _SPELLED = {
 
 _MOST_SUCCESS_STEPS = 2**24
 """The steps are counted in a float32, which is exact up to 2**24."""
+
+_BEFORE_FORWARD = {"startup", "initialize", "randomize"}
+"""Functions that run before the engine computes the fields of the initial state."""
 
 _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
@@ -202,7 +206,7 @@ class BoundTask:
         self.obs_layouts = obs_layouts(self.source, self.params)
         self.observers = self.source.group_functions(self.obs_layouts)
         observers = {observer_name(group): function for group, function in self.observers.items()}
-        check_writes(self.name, observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
+        self._check_functions(observers, dict.fromkeys(observers, self._rights(FUNCTIONS["observe"])))
         self.shared = self._shared_layouts()
         structs = obs_slices(self.source, self.params) | self.shared
         self.kernels = kernels_of(self.source, self.observers, self.memory, structs)
@@ -229,10 +233,13 @@ class BoundTask:
     def _checked_writes(self) -> dict[str, frozenset[str]]:
         written = {name: function for name, function in self.functions.items() if function is not None}
         rights: dict[str, Rights] = {name: self._rights(function) for name, function in FUNCTIONS.items()}
-        check_writes(self.name, written, rights)
+        self._check_functions(written, rights)
+        for name in _BEFORE_FORWARD & written.keys():
+            check_reads(self.name, name, written[name])
         for name, function in self.source.terms.functions.items():
             for overload in overloads(function):  # a term must not write a field
-                check_writes(self.name, {name: overload}, rights | {name: dict.fromkeys(overload.input_types, ())})
+                own = {name: dict.fromkeys(overload.input_types, ())}
+                self._check_functions({name: overload}, rights | own)
         memory = self.source.memory
         fields = {name: written_fields(function) for name, function in written.items()}
         trained = frozenset[str]().union(*(names for name, names in fields.items() if name != "startup"))
@@ -242,6 +249,11 @@ class BoundTask:
             name: frozenset(memory[field].kind if field in memory else field for field in names)
             for name, names in fields.items()
         }
+
+    def _check_functions(self, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
+        check_writes(self.name, functions, rights)
+        for name, function in functions.items():
+            check_divisions(self.name, name, function)
 
     def _memory_layouts(self) -> dict[str, parts.Layout]:
         return {name: parts.layout(self.source.world, name, self.params, "World") for name in MEMORIES}

@@ -12,7 +12,7 @@ import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.registry import kernel_name
-from lyceum_warp.binding.sources import FunctionSource, is_struct
+from lyceum_warp.binding.sources import is_struct, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, variant_of
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
@@ -249,5 +249,5 @@ def _origin(struct: Any) -> str:
 
 
 def _return_values(function: wp.Function) -> list[ast.expr]:
-    nodes = ast.walk(FunctionSource(function).tree)
+    nodes = ast.walk(source_of(function).tree)
     return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]

@@ -2,6 +2,7 @@
 
 import ast
 import builtins
+import functools
 import linecache
 import re
 import types
@@ -81,6 +82,10 @@ class FunctionSource:
         """Evaluate a condition that is a ``wp.static(...)``. Return None for any other condition."""
         found = self.value(node) if self.is_static(node) else None
         return None if found is None else bool(found)
+
+
+source_of = functools.cache(FunctionSource)
+"""Parse a function's source only once. The syntax tree is shared, so it must not be changed."""
 
 
 def has_source(function: wp.Function) -> bool:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, is_struct, overloads, run_source
+from lyceum_warp.binding.sources import is_struct, overloads, run_source, source_of
 from lyceum_warp.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
@@ -205,7 +205,7 @@ class Terms:
             return f"{place} takes {name}, but the end of an episode depends only on the state: it may take s and p"
         if name in _OWN:
             return f"{place} takes {name}, which is a name of the generated text: rename it"
-        known = [*given, *self._params.vars, *self._world.vars, *FunctionSource(function).scope]
+        known = [*given, *self._params.vars, *self._world.vars, *source_of(function).scope]
         close = [other for other in difflib.get_close_matches(name, known, 1) if other != name]
         hint = f": did you mean {close[0]}?" if close else ""
         return f"{place} takes {name}, which is not a function of the task, a parameter or a field of World{hint}"
@@ -218,7 +218,7 @@ class Terms:
 
     def place(self, function: wp.Function) -> str:
         """Name a function, the task, and the function's line, for messages."""
-        source = FunctionSource(function)
+        source = source_of(function)
         return f"{source.name} of the task {self._name!r} ({source.place(source.tree)})"
 
 

@@ -1,4 +1,4 @@
-"""Find all places where a Warp function, or a function that it calls, writes into its arguments.
+"""Find all places where a Warp function, or a function that it calls, reads or writes its arguments.
 
 The analysis follows a row into its elements and their components, into calls, local variables and local structs. Any
 other use of a row counts as a write, for example returning it or passing it to a native function.
@@ -12,7 +12,8 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.sources import FunctionSource, has_source, is_row, is_struct, name_of, overloads
+from lyceum_warp.binding.sources import has_source, is_row, is_struct, name_of, overloads, source_of
+from lyceum_warp.fields import DERIVED_FIELDS
 
 _READERS = {"len", "lower_bound", "sample_cdf", "print", "printf"}
 
@@ -38,22 +39,43 @@ class Write:
     """An expression that may write the row, such as a call of a native function. None if the write is certain."""
 
 
+@dataclasses.dataclass
+class Trace:
+    """What a function and its callees do."""
+
+    arguments: list[str]
+    """The names of the function's arguments."""
+    writes: dict[Write, None] = dataclasses.field(default_factory=dict)
+    """The writes into the arguments, in source order."""
+    reads: dict[str, str] = dataclasses.field(default_factory=dict)
+    """The struct fields whose elements are read, each with the function and the line that read it first."""
+    calls: dict[Any, None] = dataclasses.field(default_factory=dict)
+    """The analysed calls, each as a function and its ``places``."""
+
+    @property
+    def functions(self) -> list[wp.Function]:
+        """The function and its callees with Python source."""
+        return list(dict.fromkeys(function for function, *_ in self.calls))
+
+
 @functools.cache
-def find_writes(function: wp.Function) -> tuple[Write, ...]:
-    """Find all writes into the arguments of a function, in source order. Writes by its callees are included."""
+def trace(function: wp.Function) -> Trace:
+    """Analyse a function and its callees."""
     kinds = enumerate(map(_kind, function.input_types.values()))
     places = tuple(None if kind is None else _Place(i, None, kind) for i, kind in kinds)
-    arguments, writes = list(function.input_types), dict[Write, None]()
+    found = Trace(list(function.input_types))
     if has_source(function):
-        _Reader(function, places, arguments, writes, set())
-        return tuple(writes)
-    name = name_of(function)
-    return tuple(Write(i, None, argument, name, name, use=name) for i, argument in enumerate(arguments) if places[i])
+        _read_function(function, places, found)
+    else:
+        name = name_of(function)
+        unknown = (Write(i, None, argument, name, name, use=name) for i, argument in enumerate(found.arguments))
+        found.writes = {write: None for write in unknown if places[write.position]}
+    return found
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
     """Return the names of the struct fields that a function writes, or may write."""
-    return frozenset(write.field for write in find_writes(function) if write.field is not None)
+    return frozenset(write.field for write in trace(function).writes if write.field is not None)
 
 
 Rights = Mapping[str, Collection[str] | None]
@@ -64,7 +86,7 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
     """Raise a ValueError if a function of a task writes a field or a row that it must not write."""
     for name, function in functions.items():
         allowed = list(rights[name].values())
-        for write in find_writes(function):
+        for write in trace(function).writes:
             fields = allowed[write.position]
             if (fields is None or write.field in fields) and not write.replaced:
                 continue
@@ -77,6 +99,16 @@ def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mappin
                 )
             advice = _advice(write, name, rights)
             raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {advice}")
+
+
+def check_reads(task: str, name: str, function: wp.Function) -> None:
+    """Raise a ValueError if a function that changes the initial state reads a field that MuJoCo computes from it."""
+    for field, place in trace(function).reads.items():
+        if field in DERIVED_FIELDS or field == "sensordata":
+            raise ValueError(
+                f"{name} of the task {task!r} reads {field} in {place}, but MuJoCo computes {field} after {name}, so "
+                "the values are those of an earlier state: compute them from qpos and qvel"
+            )
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
@@ -128,25 +160,18 @@ def _kind(written: Any) -> Any:
     return written if is_struct(written) else (written.ndim, written.dtype) if is_row(written) else None
 
 
+def _read_function(function: wp.Function, places: tuple[_Place | None, ...], found: Trace) -> None:
+    """Analyse a function for the values that its caller passes. A value that cannot be written is None."""
+    if (key := (function, *places)) not in found.calls:
+        found.calls[key] = None
+        _Reader(function, places, found)
+
+
 class _Reader:
-    """Reads the source of one function and of its callees.
+    """Reads the source of one function and of its callees, and adds to a trace."""
 
-    Args:
-        places: The values that the caller passes, one for each argument. A value that cannot be written is None.
-        arguments: Names of the arguments of the analysed function.
-        seen: The calls that were already analysed, each as a function and its ``places``.
-    """
-
-    def __init__(
-        self,
-        function: wp.Function,
-        places: tuple[_Place | None, ...],
-        arguments: list[str],
-        writes: dict[Write, None],
-        seen: set[Any],
-    ) -> None:
-        self.arguments, self.writes, self.seen = arguments, writes, seen
-        self.source = FunctionSource(function)
+    def __init__(self, function: wp.Function, places: tuple[_Place | None, ...], found: Trace) -> None:
+        self.trace, self.source = found, source_of(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
         # read everything twice: in a loop, a local struct may be used before the line that puts a row into it
@@ -157,9 +182,9 @@ class _Reader:
     def _note(self, place: _Place, node: ast.AST, *, replaced: bool = False, follows: bool = True) -> None:
         """Record a write. ``follows=False`` marks a use of the row that cannot be analysed, and may be a write."""
         use = None if follows else ast.unparse(node).splitlines()[0]
-        target = ".".join(filter(None, (self.arguments[place.position], place.field)))
+        target = ".".join(filter(None, (self.trace.arguments[place.position], place.field)))
         where = self.source.place(node)
-        self.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
+        self.trace.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
     def _read(self, node: ast.AST) -> _Place | None:
         """Record the writes of a syntax node. If the node is an expression, return its ``_Place``."""
@@ -175,6 +200,8 @@ class _Reader:
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
+            if owner and owner.field and isinstance(node.ctx, ast.Load):
+                self.trace.reads.setdefault(owner.field, f"{self.source.name} ({self.source.place(node)})")
             return owner and owner.element(node.slice)
         if isinstance(node, ast.Call):
             self._call(node)
@@ -249,6 +276,4 @@ class _Reader:
                 given.append(place)
             else:
                 return  # another overload
-        if (key := (callee, *given)) not in self.seen:
-            self.seen.add(key)
-            _Reader(callee, tuple(given), self.arguments, self.writes, self.seen)
+        _read_function(callee, tuple(given), self.trace)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from lyceum_warp import Row
-from lyceum_warp.binding.writes import check_writes, find_writes, written_fields
+from lyceum_warp.binding.writes import check_writes, trace, written_fields
 
 
 @wp.struct
@@ -104,7 +104,7 @@ def writes_forms(s: Forms, p: Params):
 
 def test_all_kinds_of_writes_are_found() -> None:
     assert written_fields(writes_forms) == {*Forms.vars} - {"not_at_all"}
-    assert {write.use for write in find_writes(writes_forms)} == {None}
+    assert {write.use for write in trace(writes_forms).writes} == {None}
 
 
 @wp.struct
@@ -175,7 +175,7 @@ def uses_rows(s: Uses, p: Params):
 
 
 def test_untraceable_use_of_an_array_is_reported_as_a_write() -> None:
-    assert {write.field for write in find_writes(uses_rows) if write.use is not None} == {*Uses.vars}
+    assert {write.field for write in trace(uses_rows).writes if write.use is not None} == {*Uses.vars}
 
 
 @wp.func
@@ -198,7 +198,7 @@ def reads_only(s: World, p: Params, obs: Row[float]):
 
 
 def test_changing_a_copy_of_an_argument_is_not_a_write() -> None:
-    assert {write.target for write in find_writes(reads_only)} == {"obs"}
+    assert {write.target for write in trace(reads_only).writes} == {"obs"}
 
 
 def made_with(row_name: str, helper: Any) -> Any:
