@@ -114,7 +114,6 @@ class Soak({parent}):
 
     @staticmethod
     def edit_model(spec):
-        {parent}.edit_model(spec)
         spec.nuserdata = 1
 """
 

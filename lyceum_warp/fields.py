@@ -199,6 +199,11 @@ def describe(
         hint = did_you_mean(name, DATA_FIELDS, f"the fields are {', '.join(sorted(DATA_FIELDS))}")
         raise ValueError(f"there is no field {name!r}: {hint}")
     if cleared:
+        if name == "sensordata" and not snapshot:
+            raise ValueError(
+                "the task reads forces or accelerations from 'sensordata', because it lists it in cleared, but the "
+                "model has no sensor of them: add the sensors in edit_model"
+            )
         if not snapshot or refresh > Stage.NONE:
             raise ValueError(
                 f"the field {name!r} cannot be cleared, because it belongs to the current state: remove it from cleared"

@@ -530,7 +530,8 @@ class Task:
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Change the model's spec in place, before MuJoCo compiles it.
 
-        The spec describes the task's model, or the model passed to ``make``.
+        The spec describes the task's model, or the model passed to ``make``. The ``edit_model`` of each parent class
+        runs first, so it must not be called.
         """
 
     @staticmethod

@@ -42,7 +42,7 @@ _PARTS = 'the parts of its observation, as obs = {"position": 5}'
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """Load a task's model, or the given model, as an MjSpec, and apply the task's ``edit_model``."""
+    """Load a task's model, or the given model, as an MjSpec, and apply ``edit_model`` of the task and its parents."""
     return _edited(task, _read_spec(task, model))
 
 
@@ -56,19 +56,26 @@ def _read_spec(task: type[Task], model: ModelSource | None) -> mujoco.MjSpec:
 
 
 def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
-    copy = spec.copy()
-    try:
-        changed: Any = task.edit_model(copy)
-    except Exception as error:
-        raise ValueError(
-            f"edit_model of the task {task_name(task)!r} fails on the model {spec.modelname!r}: "
-            f"{type(error).__name__}: {error}"
-        ) from error
-    if changed is not None:
-        raise ValueError(
-            f"edit_model of the task {task_name(task)!r} returns {type(changed).__name__}: it must change the spec in "
-            "place and return None"
-        )
+    copy, name = spec.copy(), task_name(task)
+    edits = [vars(owner)["edit_model"] for owner in reversed(task.__mro__) if "edit_model" in vars(owner)]
+    for edit in (edit.__get__(None, task) for edit in edits):
+        if "edit_model" in getattr(getattr(edit, "__code__", None), "co_names", ()):
+            raise ValueError(
+                f"edit_model of the task {name!r} calls edit_model of another class, which would then run twice: "
+                "remove the call, because the edits of all parents run first"
+            )
+        try:
+            changed: Any = edit(copy)
+        except Exception as error:
+            raise ValueError(
+                f"edit_model of the task {name!r} fails on the model {spec.modelname!r}: {type(error).__name__}: "
+                f"{error}"
+            ) from error
+        if changed is not None:
+            raise ValueError(
+                f"edit_model of the task {name!r} returns {type(changed).__name__}: it must change the spec in place "
+                "and return None"
+            )
     return copy
 
 

@@ -14,7 +14,7 @@ from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import is_struct, source_of
 from lyceum_warp.binding.task_terms import Terms
-from lyceum_warp.binding.variants import Variant, variant_of
+from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
 from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
 
 
@@ -73,10 +73,11 @@ class TaskSource:
         Functions of the module are left out if another function calls them.
         """
         module = vars(sys.modules[owner.__module__])
-        functions = {name: self._seen(value) for name, value in module.items() if isinstance(value, wp.Function)}
+        written = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
+        functions = {name: self._seen(value) for name, value in written.items()}
         tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
         used = {id(self._seen(value)) for task in tasks for value in vars(task).values()}
-        called = {name for f in functions.values() if f.func is not None for name in f.func.__code__.co_names}
+        called = {name for f in written.values() if f.func is not None for name in f.func.__code__.co_names}
         forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
         own = [name for name, value in vars(owner).items() if isinstance(value, wp.Function | staticmethod)]
         unused = [
@@ -107,12 +108,23 @@ class TaskSource:
         return not hasattr(self.task, "obs")
 
     def _struct(self, name: str) -> Any:
-        struct = self._written(name)
+        struct = self._declared(name, self.task)
         if isinstance(struct, type):
             raise ValueError(f"{name} of the task {self.name!r} must be a Warp struct: decorate it with @wp.struct")
         if not hasattr(struct, "vars"):
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
+
+    def _declared(self, name: str, owner: type[Task]) -> Any:
+        """Return the struct that a class declares, merged with those of the parents if it extends one of them."""
+        scopes = (vars(owner), owner.scope, vars(sys.modules[owner.__module__]))
+        own = next((scope[name] for scope in scopes if name in scope), None)
+        parents = [self._declared(name, base) for base in owner.__bases__ if base in self._owners]
+        structs = list(filter(is_struct, parents))
+        if own is None:
+            return merged(structs) if structs else None
+        extends = is_struct(own) and any(issubclass(own.cls, struct.cls) for struct in structs)
+        return merged([own, *structs]) if extends else own
 
     def _with_functions(self, own: Any) -> Any:
         """Return the parameter struct that functions take.
@@ -181,7 +193,7 @@ class TaskSource:
             raise ValueError(
                 f"{name} of the task {self.name!r} returns a tuple, but must return a single {wanted.result.__name__}"
             )
-        self._check_structs(name, structs)
+        check_structs(self.name, function, {self.world: self.world.cls, self.params: self.defaults})
         kinds = tuple(map(self._kind, types))
         if kinds not in (wanted.kinds, wanted.all_kinds) or (returned is not None and returned is not wanted.result):
             more = f", with or without a last argument {wanted.optional}" if wanted.optional else ""
@@ -189,17 +201,6 @@ class TaskSource:
                 more = f"{more}; to write the struct {structs[2].key}, remove obs from the class"
             raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}{more}")
         return function
-
-    def _check_structs(self, name: str, structs: list[Any]) -> None:
-        """Refuse a function that takes the World or Params of another file."""
-        for kind in structs:
-            for own_name, own in (("World", self.world), ("Params", self.params)):
-                if kind is not own and kind.key.rpartition(".")[2] == own_name:
-                    raise ValueError(
-                        f"{name} of the task {self.name!r} takes {own_name} from {_origin(kind)}, but the task uses "
-                        f"{own_name} from {_origin(own)}: import World and Params from the same file, derive the "
-                        f"task's struct from the other (class {own_name}(module.{own_name})), or rewrite {name}"
-                    )
 
     def _kind(self, argument: Any) -> str:
         """Return an argument's type as ``FUNCTIONS`` writes it, such as "World" or "Row[float]"."""
@@ -241,11 +242,6 @@ def _may_list(task: type[Task], group: str) -> bool:
     """Whether the ``obs`` of a task may have the given group."""
     obs = getattr(task, "obs", None)
     return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
-
-
-def _origin(struct: Any) -> str:
-    module = struct.cls.__module__
-    return str(getattr(sys.modules.get(module), "__file__", None) or module)
 
 
 def _return_values(function: wp.Function) -> list[ast.expr]:

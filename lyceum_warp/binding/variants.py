@@ -2,18 +2,22 @@
 
 Warp compiles a function for the structs in its annotations. If a task extends its parent's World, the parent's
 functions are therefore copied, and the copies take the task's World. If the task replaces one of the parent's
-functions, the copies call the replacement.
+functions, the copies call the replacement. If a task has several parents, their structs are merged, and their functions
+call each other as methods do with ``super()``.
 """
 
+import functools
+import itertools
 import sys
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from lyceum_warp.binding.sources import has_source, is_struct, name_of, overloads
-from lyceum_warp.task import Task
+from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task
 
 
 class Variant:
@@ -95,27 +99,14 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     defaults, ``params`` is the struct of the base task. Otherwise, the two are identical.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
-    values = [list(_values(module, owners)) for module in modules]
-    structs = {own: params} if own is not params else {}
-    for i, parents in enumerate(values):
-        for parent in filter(is_struct, parents):
-            if parent in (world, params, own):
-                continue
-            new = [world, params, *(v for own in values[:i] for v in own if is_struct(v) and v.key == parent.key)]
-            if extended := [struct for struct in new if struct is not parent and issubclass(struct.cls, parent.cls)]:
-                structs[parent] = extended[0]
-    replaced = {
+    values = [value for module in modules for value in _values(module, owners)]
+    structs = _new_structs(filter(is_struct, values), {own: params, world: world, params: params})
+    replaced = _next_functions(owners) | {
         value.replaces: value
-        for own in reversed(values)
-        for value in own
+        for value in reversed(values)
         if isinstance(value, wp.Function) and hasattr(value, "replaces")
     }
-    named = {*structs, *structs.values(), world, params}
-    for module in modules:  # the list grows during the loop
-        for value in _values(module, owners):
-            home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
-            if isinstance(home, types.ModuleType) and home not in modules and _names(home, named):
-                modules.append(home)
+    modules = _with_helpers(modules, owners, {*structs, *structs.values(), world, params})
     found = dict.fromkeys(v for module in modules for v in _values(module, owners) if isinstance(v, wp.Function))
     functions = [f for f in found if has_source(f) and sys.modules.get(_home(f)) in modules]
     taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
@@ -127,8 +118,77 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     if key not in _made:
         made = _made[key] = Variant(modules, functions, structs, replaced)
         for before, after in replaced.items():
+            check_structs(task, made.seen(after, _home(after)), {world: world.cls, params: own.cls})
             _check_replacement(task, made, before, after)
     return _made[key]
+
+
+def merged(structs: Iterable[Any]) -> Any:
+    """Return the struct that extends all others. If none does, make one."""
+    known = dict.fromkeys(structs)
+    last = [s for s in known if not any(s is not other and issubclass(other.cls, s.cls) for other in known)]
+    return last[0] if len(last) == 1 else _merge(*last)
+
+
+@functools.cache
+def _merge(*structs: Any) -> Any:
+    names = {"__module__": structs[0].cls.__module__}
+    return wp.struct(types.new_class(structs[0].cls.__name__, structs, exec_body=lambda body: body.update(names)))
+
+
+def _new_structs(family: Iterable[Any], known: Mapping[Any, Any]) -> dict[Any, Any]:
+    """Map each struct of a family to the struct that the task's functions take.
+
+    ``known`` maps the task's World and Params. A struct that one of these extends maps to this one. Any other struct,
+    such as an observation's, maps to the struct of the same name that extends it.
+    """
+    structs, family = dict(known), list(family)
+    for parent in family:
+        if parent not in structs:
+            others = [s for s in known.values() if issubclass(s.cls, parent.cls)]
+            named = [s for s in family if s.key == parent.key and issubclass(s.cls, parent.cls)]
+            structs |= {parent: others[0]} if others else dict.fromkeys(named, merged(named))
+    return {struct: new for struct, new in structs.items() if struct is not new}
+
+
+def _next_functions(owners: Sequence[type[Task]]) -> dict[wp.Function, wp.Function]:
+    """Find the calls of a common parent's function that must go to another parent's, as with Python's ``super()``.
+
+    If two parents of a task extend ``advance`` of a common parent, the first one's call of the common ``advance`` goes
+    to the second one's. The result then maps the common function to the second one's.
+    """
+    scopes = {owner: {**vars(sys.modules[owner.__module__]), **owner.scope, **vars(owner)} for owner in owners}
+    names = dict.fromkeys(name for scope in scopes.values() for name in scope)
+    replaced: dict[wp.Function, wp.Function] = {}
+    for name in (name for name in names if name in FUNCTIONS or name.startswith(GROUP_PREFIX)):
+        functions: dict[wp.Function, type[Task]] = {}
+        for owner, scope in scopes.items():
+            value = scope.get(name)
+            value = value.__func__ if isinstance(value, staticmethod) else value
+            if isinstance(value, wp.Function) and _home(value) == owner.__module__:
+                functions[value] = owner  # the last owner, because the classes of a module share its functions
+        if len(functions) < 3:
+            continue
+        first, *others = functions
+        common = next((f for f in others if issubclass(functions[first], functions[f])), None)
+        if common is not None:
+            beside = [f for f, owner in functions.items()
+                      if not issubclass(functions[first], owner) and issubclass(owner, functions[common])]  # fmt: skip
+            replaced |= itertools.pairwise([common, *reversed(beside)])
+    return replaced
+
+
+def _with_helpers(
+    modules: Sequence[types.ModuleType], owners: Sequence[type[Task]], structs: set[Any]
+) -> list[types.ModuleType]:
+    """Add the modules from which the family imports functions that take one of the given structs."""
+    found = list(modules)
+    for module in found:  # the list grows during the loop
+        for value in _values(module, owners):
+            home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
+            if isinstance(home, types.ModuleType) and home not in found and _names(home, structs):
+                found.append(home)
+    return found
 
 
 def _home(function: wp.Function) -> str:
@@ -154,6 +214,27 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
         and any(is_struct(kind) and kind in structs for f in overloads(value) for kind in f.input_types.values())
         for value in vars(module).values()
     )  # fmt: skip
+
+
+def check_structs(task: str, function: wp.Function, declared: Mapping[Any, type]) -> None:
+    """Raise a ValueError if a function takes another World or Params than its task uses.
+
+    ``declared`` maps the World and the Params that the task's functions take to the classes that the task declares.
+    """
+    for kind in filter(is_struct, function.input_types.values()):
+        for name, cls in zip(("World", "Params"), declared.values(), strict=True):
+            if kind not in declared and kind.key.rpartition(".")[2] == name:
+                bases = [base for base in cls.__bases__ if base is not object and not issubclass(kind.cls, base)]
+                named = ", ".join(f"{Path(_file(base)).stem}.{base.__name__}" for base in (*bases, kind.cls))
+                raise ValueError(
+                    f"{name_of(function)} of the task {task!r} takes {name} from {_file(kind.cls)}, but the task uses "
+                    f"{name} from {_file(cls)}: import World and Params from the same file, write the task's struct as "
+                    f"class {name}({named}), or rewrite {name_of(function)}"
+                )
+
+
+def _file(cls: type) -> str:
+    return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)
 
 
 def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:

@@ -39,6 +39,12 @@ def test_invalid_task_attribute_raises_an_error(line: str, message: str, tmp_pat
         bound(tiny_task.write(tmp_path, f"{tiny_task.TINY}    {line}\n"))
 
 
+def test_cleared_forces_of_a_model_without_force_sensors_raise_an_error_about_the_sensors(tmp_path: Path) -> None:
+    source = tiny_task.changed((QPOS, f"{QPOS}\n    sensordata: Row[float]"))
+    with pytest.raises(ValueError, match=r"model has no sensor of them: add the sensors in edit_model$"):
+        bound(tiny_task.write(tmp_path, f"{source}    cleared = ('sensordata',)\n"))
+
+
 REWARD = "def reward(s0: World, action: Row[float], s1: World, p: Params)"
 QPOS, OBS = "    qpos: Row[float]", "obs[0] = s.qpos[0]"
 

@@ -117,6 +117,96 @@ def test_variant_in_another_folder_finds_the_model_file_of_its_parent(
     assert lw.make(file).model.nq == 7
 
 
+BASE = tiny_task.changed(
+    ("    qpos: Row[float]", "    qpos: Row[float]\n    count: Row[float] = lw.memory()"),
+    ("@wp.func", """@wp.struct
+class Seen:
+    x: Row[float] = lw.part()
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    s1.count[0] = s0.count[0] + 1.0
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Seen):
+    obs.x[0] = 1.0
+
+@wp.func"""),
+    ("obs: Row[float]", "obs: Seen"), ("obs[0] = ", "obs.x[0] = "), ('    obs = {"x": 1}', """
+    @staticmethod
+    def edit_model(spec):
+        spec.option.timestep *= 0.5"""),
+)  # fmt: skip
+
+SIDE = """
+import warp as wp
+import lyceum_warp as lw
+from lyceum_warp import Row
+import merged_base as base
+
+@wp.struct
+class World(base.World):
+    side: Row[float] = lw.memory()
+
+@wp.struct
+class Params(base.Params):
+    side_gain: float = 2.0
+
+@wp.struct
+class Seen(base.Seen):
+    side: Row[float] = lw.part()
+
+@wp.func
+def observe(s: World, p: Params, obs: Seen):
+    base.observe(s, p, obs)
+    obs.side[0] = p.side_gain * s.side[0]
+
+@wp.func
+def observe_critic(s: World, p: Params, obs: Seen):
+    base.observe_critic(s, p, obs)
+    obs.side[0] = 0.5
+
+@wp.func
+def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    base.advance(s0, action, s1, p, rng)
+    s1.side[0] = 10.0 * s1.count[0]
+
+class Side(base.Tiny):
+    @staticmethod
+    def edit_model(spec):
+        assert spec.option.timestep < 0.002
+        spec.option.timestep *= 0.5
+"""
+
+MERGED = """
+import warp as wp
+import lyceum_warp as lw
+import merged_left, merged_right
+
+@wp.struct
+class World(merged_left.World):
+    own: wp.array[float] = lw.memory()
+
+class Merged(merged_left.Side, merged_right.Side):
+    pass
+"""
+
+
+def test_parents_with_own_structs_and_functions_are_merged(tmp_path: Path) -> None:
+    tiny_task.write(tmp_path, BASE, "merged_base.py")
+    for name in ("left", "right"):
+        tiny_task.write(tmp_path, SIDE.replace("side", name), f"merged_{name}.py")
+    env = lw.make(tiny_task.write(tmp_path, MERGED, "merged.py"), right_gain=3.0)
+    assert list(env.obs_space.parts) == ["x", "right", "left"]
+    for _ in range(2):
+        env.step(torch.zeros(1, 3))
+    memory = {name: env.state_space.split(env.get_state())[name].item() for name in ("count", "left", "right", "own")}
+    assert memory == {"count": 2.0, "left": 20.0, "right": 20.0, "own": 0.0}
+    assert env.obs[0, 1:].tolist() == [60.0, 40.0]
+    assert env.obs_groups["critic"].tolist() == [[1.0, 0.5, 0.5]]
+    assert env.model.opt.timestep == 0.002 / 8
+
+
 MISTAKES = {
     "other arguments": (
         [("def tripled(x: float, s: World)", "def tripled(x: float)"), ("parent.scaled(x, s) + s.qvel[0]", "x")],
@@ -126,7 +216,7 @@ MISTAKES = {
         [("class World(parent.World):\n    qvel", "class World:\n    qpos: wp.array[float]\n    qvel"),
          ("\ntripled.replaces = parent.scaled\n", "")],
         r"takes World from .*parent\.py, but the task uses World from .*child\.py: .*"
-        r"derive the task's struct from the other \(class World\(module\.World\)\)",
+        r"class World\(variant_parent\.World\)",
     ),
 }  # fmt: skip
 

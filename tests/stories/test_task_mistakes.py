@@ -80,7 +80,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a function of another file": (
         [(OWN_WORLD, "from other_rewards import World, reward\n")],
         r"reward of the task 'tiny' takes Params from .*other_rewards\.py, but the task uses Params from .*tiny\.py"
-        r": import World and Params from the same file, derive the task's struct from the other \(class Params\(",
+        r": import World and Params from the same file, write the task's struct as class Params\(other_rewards\.",
     ),
     "a function of another file with its own structs": (
         [("class Tiny", "from other_rewards import reward\n\nclass Tiny")],

@@ -76,7 +76,6 @@ class G1Stand(balancing.Balance):
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         """Make the upper body rigid in the pose of the keyframe knees_bent, and set the legs' gains."""
-        balancing.Balance.edit_model(spec)
         walkers.prepare_walker(spec, ("left_foot", "right_foot"), timestep=0.005, iterations=(10, 10))
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()

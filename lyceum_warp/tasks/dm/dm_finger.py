@@ -121,13 +121,13 @@ def randomize_turn(s: TurnWorld, p: TurnParams, rng: Row[wp.uint32]):
 
 
 @lw.register
-class FingerTurnEasy(FingerSpin):
+class FingerTurnEasy(lw.Task):
     """A finger with two joints turns a body until the body's tip is in a large target."""
 
+    model, frame_skip = suite.model("finger"), 2
     World, Params = TurnWorld, TurnParams
     observe, reward, randomize = observe_turn, reward_turn, randomize_turn
     obs = FingerSpin.obs | {"target_position": 2, "dist_to_target": 1}
-    planning = lw.Planning()
     target_radius = 0.07  # m
 
     @classmethod

@@ -98,9 +98,10 @@ def randomize_swim(s: SwimWorld, p: SwimParams, rng: Row[wp.uint32]):
 
 
 @lw.register
-class FishSwim(FishUpright):
+class FishSwim(lw.Task):
     """A fish swims to a target."""
 
+    model, frame_skip = suite.model("fish"), 10
     World, Params = SwimWorld, SwimParams
     observe, reward, randomize = observe_swim, reward_swim, randomize_swim
     obs = {"joint_angles": 7, "upright": 1, "target": 3, "velocity": 13}

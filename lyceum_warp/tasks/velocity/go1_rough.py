@@ -1,15 +1,9 @@
 """Go1RoughVelocity: a Unitree Go1 walks at a commanded velocity on rough ground, and scans it."""
 
 import mujoco
-import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.velocity import go1, rough
-
-
-@wp.struct
-class Params(rough.Params, go1.Params):
-    pass
 
 
 @lw.register
