@@ -3,7 +3,6 @@
 tests/test_docs.py checks that every public name and every task appears exactly once.
 """
 
-import ast
 import dataclasses
 import importlib
 import inspect
@@ -21,7 +20,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.spaces import action_space
-from lyceum_warp.support.docstrings import attribute_docs
+from lyceum_warp.support.docstrings import attribute_docs, field_docs
 from lyceum_warp.task import Element, FromModel
 
 DOCS = Path(__file__).parent
@@ -237,13 +236,14 @@ def metrics(task: BoundTask) -> list[str]:
 
 def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
     """Return the parameters, their defaults, and their comments in the task's files."""
-    meanings = comments(task.task)
+    meanings = field_docs(task.source.defaults)
     rows = []
     for name in task.source.params.vars:
         if name in ("dt", "substep_dt"):
             continue
         default = getattr(task.source.defaults, name)
-        rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meanings.get(name, "")))
+        meaning = meanings[name].replace("|", "\\|").replace("*", "\\*")
+        rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meaning))
     return rows
 
 
@@ -261,21 +261,6 @@ def spelled(default: Any, value: Any) -> str:
     if numbers.ndim == 0:
         return str(value) if numbers.dtype.kind == "b" else f"{value:.6g}"
     return ", ".join(f"{number:.6g}" for number in numbers.ravel().tolist())
-
-
-def comments(task: type) -> dict[str, str]:
-    """Return the comments of the fields of ``Params``, including fields of base classes."""
-    found: dict[str, str] = {}
-    for cls in reversed(task.__mro__[:-1]):
-        lines = inspect.getsource(sys.modules[cls.__module__]).splitlines()
-        for node in ast.parse("\n".join(lines)).body:
-            if isinstance(node, ast.ClassDef) and node.name.endswith("Params"):
-                for field in node.body:
-                    if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-                        _, mark, text = lines[(field.end_lineno or 0) - 1].partition("  # ")
-                        if mark and not text.startswith(("fmt:", "noqa", "type:")):
-                            found[field.target.id] = text.replace("|", "\\|").replace("*", "\\*")
-    return found
 
 
 # Markdown

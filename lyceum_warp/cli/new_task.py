@@ -15,9 +15,9 @@ from lyceum_warp.binding.models import compile_model
 from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import say
 from lyceum_warp.cli.task_text import literal, task_text
-from lyceum_warp.cli.velocity_text import TRAINING, Walker, velocity_text
+from lyceum_warp.cli.velocity_text import TRAINING, Walker, substeps, velocity_text
 from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
-from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.options import CONES, PhysicsOptions
 from lyceum_warp.support.files import replaced
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {
@@ -103,6 +103,10 @@ class New:
         training = "" if walker is None else f" {TRAINING}"
         say(f"{path}: {sizes}; check and train it with")
         say(f"  lyceum-warp check {path}\n  lyceum-warp train {path}{training}")
+        if walker is not None:
+            cone = next(name for name, kind in CONES.items() if kind == model.opt.cone)
+            physics = f"{substeps(model)} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
+            say(f"a step has {physics}; lyceum-warp tune {path} finds faster physics")
 
 
 def _class_name(path: Path) -> str:

@@ -155,6 +155,11 @@ class Walker:
         return np.any(moment, axis=0)[m.jnt_dofadr]
 
 
+def substeps(model: mujoco.MjModel) -> int:
+    """Return the number of substeps in a step of the task."""
+    return max(1, round(_STEP / model.opt.timestep))
+
+
 def velocity_text(file: str, class_name: str, source: str, walker: Walker) -> str:
     """Generate the text of a robot's task file, as ``task_text`` does."""
     biped = len(walker.feet) == 2
@@ -174,8 +179,10 @@ def velocity_text(file: str, class_name: str, source: str, walker: Walker) -> st
     if not walker.has_home:
         params.append(f"start_height: float = {walker.height:.3f}")
         params += _wrapped("default_pose: wp.array[float] = [", [f"{q:.4g}" for q in walker.pose], "]")
-    skip = max(1, round(_STEP / model.opt.timestep))
-    settings = [f"model = {source}", f"frame_skip = {skip}  # substeps of {1000 * model.opt.timestep:g} ms in a step"]
+    settings = [
+        f"model = {source}",
+        f"frame_skip = {substeps(model)}  # substeps of {1000 * model.opt.timestep:g} ms in a step",
+    ]
     if walker.has_home != biped:
         settings.append(f"keyframe = {literal('home') if walker.has_home else None}")
     edits = ["walkers.add_feet(spec, NEW_SITES)"] if new else []
@@ -208,7 +215,7 @@ _TEXT = '''"""{class_name}: a robot walks at a commanded velocity.
 
     lyceum-warp train {file} {training}
 
-Every other number is a parameter of the family: see lyceum_warp/tasks/velocity/walking.py.
+Every other number is a parameter of the family: see help(walking.Params).
 """
 
 import mujoco

@@ -18,8 +18,11 @@ Class = TypeVar("Class", bound=type)
 _parse = functools.lru_cache(maxsize=1)(ast.parse)
 
 
-def attribute_docs(cls: type) -> dict[str, str]:
-    """Return the docstrings of a class's attributes by name, or nothing if there is no source."""
+def attribute_docs(cls: type, *, comments: bool = False) -> dict[str, str]:
+    """Return the docstrings of a class's attributes by name, or nothing if there is no source.
+
+    With ``comments``, an attribute without a docstring has the comment on its last line.
+    """
     try:
         lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
         body: list[ast.stmt] = _parse("".join(lines)).body
@@ -28,14 +31,24 @@ def attribute_docs(cls: type) -> dict[str, str]:
     except (OSError, TypeError, SyntaxError, StopIteration):
         return {}
     docs: dict[str, str] = {}
-    for statement, following in itertools.pairwise(body):
-        text = following.value if isinstance(following, ast.Expr) else None
-        if not (isinstance(text, ast.Constant) and isinstance(text.value, str)):
+    for statement, following in itertools.pairwise([*body, ast.Pass()]):
+        targets = [statement.target] if isinstance(statement, ast.AnnAssign) else getattr(statement, "targets", [None])
+        if not isinstance(target := targets[0], ast.Name):
             continue
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            docs[statement.target.id] = inspect.cleandoc(text.value)
-        elif isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name):
-            docs[statement.targets[0].id] = inspect.cleandoc(text.value)
+        text = following.value if isinstance(following, ast.Expr) else None
+        comment = lines[(statement.end_lineno or 0) - 1].partition("  # ")[2].strip()
+        if isinstance(text, ast.Constant) and isinstance(text.value, str):
+            docs[target.id] = inspect.cleandoc(text.value)
+        elif comments and comment and not comment.startswith(("fmt:", "noqa", "type:")):
+            docs[target.id] = comment
+    return docs
+
+
+def field_docs(cls: type) -> dict[str, str]:
+    """Return the docstring or the comment of each field of a struct, or "". ``cls`` is the struct's Python class."""
+    docs = dict.fromkeys(inspect.get_annotations(cls), "")
+    for base in reversed(cls.__mro__[:-1]):
+        docs |= attribute_docs(base, comments=True)
     return docs
 
 

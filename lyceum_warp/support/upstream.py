@@ -6,12 +6,15 @@ No other module uses such internals.
 import contextlib
 import functools
 import importlib
+import inspect
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import warp as wp
+
+from lyceum_warp.support.docstrings import field_docs, listed
 
 
 def builtin_functions() -> Mapping[str, Any]:
@@ -23,11 +26,23 @@ def builtin_functions() -> Mapping[str, Any]:
     return functions
 
 
+class _StructDoc:
+    """The docstring of a struct, which lists its fields. It is read from the source when ``help()`` asks for it."""
+
+    def __get__(self, struct: Any, owner: type) -> str | None:
+        if struct is None:
+            return None
+        return f"{inspect.cleandoc(struct.cls.__doc__ or struct.key)}\n\nFields:\n{listed(field_docs(struct.cls))}\n"
+
+    def __set__(self, struct: Any, doc: str | None) -> None:
+        """Ignore the docstring that ``wp.struct`` copies from the class."""
+
+
 def extend_structs() -> None:
     """Let a class extend a ``wp.struct`` and inherit its fields, as in ``class World(go1.World)``.
 
     In Warp, a struct is not a type, so a class cannot extend it. A class that extends the struct's Python class would
-    lose its fields, because Warp reads no inherited annotations.
+    lose its fields, because Warp reads no inherited annotations. Structs also get docstrings for ``help()``.
     """
     codegen: Any = wp._src.codegen
 
@@ -43,6 +58,7 @@ def extend_structs() -> None:
         return (struct.cls,)
 
     codegen.Struct.__mro_entries__ = bases
+    codegen.Struct.__doc__ = _StructDoc()
 
 
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:

@@ -1,11 +1,14 @@
 import pydoc
 import re
+from typing import Any
 
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.support.docstrings import attribute_docs
+from lyceum_warp.support.docstrings import attribute_docs, field_docs
 from lyceum_warp.task import FUNCTIONS, Task
+from lyceum_warp.tasks.balance import balancing
+from lyceum_warp.tasks.velocity import gait, rough, walking
 
 
 def page(thing: object) -> str:
@@ -28,6 +31,15 @@ def test_help_shows_every_attribute_docstring(kind: type) -> None:
     assert docs
     for name, doc in docs.items():
         assert f"{name}: {' '.join(doc.split())}" in text
+
+
+@pytest.mark.parametrize("struct", [walking.Params, walking.BipedParams, gait.Params, rough.Params, balancing.Params])
+def test_help_of_a_family_shows_the_meaning_of_every_parameter(struct: Any) -> None:
+    text = " ".join(page(struct).split())
+    docs = field_docs(struct.cls)
+    assert {*struct.vars} <= {*docs} and all(docs.values())
+    for name, doc in docs.items():
+        assert f"{name}: {doc}" in text
 
 
 def test_help_of_class_done_explains_every_bit() -> None:

@@ -26,24 +26,24 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
-    joint_qpos: wp.array[int] = lw.qposes()
-    joint_dof: wp.array[int] = lw.dofs()
-    motors: wp.array[int] = lw.actuators()
-    right_foot: int = lw.site("right_foot")
-    left_foot: int = lw.site("left_foot")
+    dt: float  # seconds in a step
+    joint_qpos: wp.array[int] = lw.qposes()  # of the actuated joints
+    joint_dof: wp.array[int] = lw.dofs()  # of the actuated joints
+    motors: wp.array[int] = lw.actuators()  # of these joints
+    right_foot: int = lw.site("right_foot")  # the site
+    left_foot: int = lw.site("left_foot")  # the site
     default_pose: wp.array[float] = [0.0]  # rad
     action_scale: wp.array[float] = [1.0]  # rad
     # reward terms
     forward_speed: float = 0.0  # m/s
     target_height: float = 1.0  # of the base, m
-    least_height: float = 0.5
+    least_height: float = 0.5  # of the base; an episode ends below it, m
     # starts and pushes
-    start_height: float = 1.0
+    start_height: float = 1.0  # of the base, m
     start_noise: float = 0.02  # rad, and rad/s
     push_times: wp.array[float] = [5.0, 10.0, 15.0]  # s
     push_impulse: wp.vec2 = wp.vec2(10.0, 20.0)  # N s
-    mass: float = lw.from_model(lambda model, p: float(model.body_subtreemass[0]))
+    mass: float = lw.from_model(lambda model, p: float(model.body_subtreemass[0]))  # of the robot, kg
 
 
 @wp.func

@@ -31,7 +31,7 @@ class Params(balancing.Params):
     start_height: float = 0.755
     # gait
     gait_frequency: float = 1.25  # Hz
-    stance_share: float = 0.6
+    stance_share: float = 0.6  # fraction of a cycle for which a foot is on the ground
     swing: wp.array[float] = 2 * [-0.3, 0.0, 0.0, 0.6, -0.3, 0.0]  # largest change of the targets in a swing, rad
 
 

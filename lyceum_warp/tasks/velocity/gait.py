@@ -24,8 +24,8 @@ class World(walking.World):
 
 @wp.struct
 class Params(walking.BipedParams):
-    gait_frequency: float = 1.25  # Hz
-    stance_share: float = 0.55
+    gait_frequency: float = 1.25  # cycles of the clock per second, Hz
+    stance_share: float = 0.55  # fraction of a cycle in which a foot should be on the ground
     foot_lift: float = 0.07  # greatest height of a swing, m
     standing_height: float = 0.04  # height of the feet's sites above the soles, m
     growth_steps: float = 4000.0  # steps of each world until the costs reach their full weight

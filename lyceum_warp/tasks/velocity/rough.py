@@ -25,11 +25,11 @@ class World(walking.World):
 
 @wp.struct
 class Params(walking.Params):
-    terrain: wp.array2d[float] = lw.height_field("terrain")
-    origins: wp.array2d[wp.vec3] = TERRAIN.origins
-    patch: float = TERRAIN.patch
-    episode_seconds: float = 20.0
-    scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)
+    terrain: wp.array2d[float] = lw.height_field("terrain")  # heights of the ground, m
+    origins: wp.array2d[wp.vec3] = TERRAIN.origins  # middle of each patch, by level and column, m
+    patch: float = TERRAIN.patch  # side of a patch, m
+    episode_seconds: float = 20.0  # duration of a whole episode, for the commanded distance, s
+    scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)  # points of the height scan around the robot, m
     scan_noise: float = 0.1  # largest, m
 
 

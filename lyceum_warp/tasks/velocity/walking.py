@@ -67,69 +67,72 @@ class World:
 
 @wp.struct
 class Params:
-    dt: float
-    substep_dt: float
+    dt: float  # seconds in a step
+    substep_dt: float  # seconds in a substep
     # the robot
-    joints: wp.array[int] = lw.joints()
-    feet: wp.array[int] = lw.sites()
-    trunk: int = lw.from_model(walkers.base)
+    joints: wp.array[int] = lw.joints()  # the actuated joints, in the order of actions and observations
+    feet: wp.array[int] = lw.sites()  # a site at each foot
+    trunk: int = lw.from_model(walkers.base)  # the body of the free joint
     imu: wp.vec3 = wp.vec3(0.0)  # the velocimeter's position on the base, m
-    joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)
-    joint_dof: wp.array[int] = lw.from_model(walkers.joint_dof)
-    controls: wp.array[int] = lw.from_model(walkers.controls)
-    leg_qpos: wp.array2d[int] = lw.from_model(walkers.leg_qpos)
-    leg_dof: wp.array2d[int] = lw.from_model(walkers.leg_dof)
-    leg_axes: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_axes)
-    leg_offsets: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_offsets)
-    foot_offsets: wp.array[wp.vec3] = lw.from_model(walkers.foot_offsets)
-    foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)
-    foot_forces: wp.array[int] = lw.from_model(walkers.foot_forces)
-    soles: wp.array2d[wp.vec4] = lw.from_model(walkers.soles)
+    joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)  # indices of the joints in qpos
+    joint_dof: wp.array[int] = lw.from_model(walkers.joint_dof)  # indices of the joints in qvel
+    controls: wp.array[int] = lw.from_model(walkers.controls)  # indices of the joints' servos in ctrl
+    leg_qpos: wp.array2d[int] = lw.from_model(walkers.leg_qpos)  # indices of each leg's joints in qpos; -1 for none
+    leg_dof: wp.array2d[int] = lw.from_model(walkers.leg_dof)  # indices of each leg's joints in qvel; -1 for none
+    leg_axes: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_axes)  # axes of each leg's joints
+    leg_offsets: wp.array2d[wp.vec3] = lw.from_model(walkers.leg_offsets)  # from each leg's joint to the next, m
+    foot_offsets: wp.array[wp.vec3] = lw.from_model(walkers.foot_offsets)  # from the last joint to the foot, m
+    foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)  # geoms of the feet that can touch the ground
+    foot_forces: wp.array[int] = lw.from_model(walkers.foot_forces)  # indices of the forces in sensordata
+    soles: wp.array2d[wp.vec4] = lw.from_model(walkers.soles)  # spheres of each foot: centre and radius, m
     # reward terms
-    linear_velocity_variance: float = 0.25  # (m/s)^2
-    angular_velocity_variance: float = 0.5  # (rad/s)^2
-    tilt_variance: float = 0.2
-    standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # rad
-    walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])
-    soft_limit: float = 0.9  # fraction of a joint's range
-    # desired foot height in a swing (m), longest rewarded single stance (s)
-    swing_target: float = 0.1
-    longest_step: float = 0.4
+    linear_velocity_variance: float = 0.25  # squared error at which the term is 1/e, (m/s)^2
+    angular_velocity_variance: float = 0.5  # squared error at which the term is 1/e, (rad/s)^2
+    tilt_variance: float = 0.2  # squared sine of the tilt at which the term upright is 1/e
+    standing_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.05])  # for pose, rad
+    walking_pose_std: wp.array[float] = lw.from_model(lambda model, p: len(p.joints) * [0.3])  # for pose, rad
+    soft_limit: float = 0.9  # fraction of a joint's range that has no cost
+    swing_target: float = 0.1  # desired height of a foot in its swing, m
+    longest_step: float = 0.4  # longest rewarded single stance, s
     least_command: float = 0.05  # if the size of a command is below this number, the robot should stand
-    fall_angle: float = math.radians(70.0)
-    least_height: float = 0.0  # of the base, m
+    fall_angle: float = math.radians(70.0)  # tilt that ends an episode, rad
+    least_height: float = 0.0  # of the base; an episode ends below it, m
     # actions
-    default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # rad
-    action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad
-    # stages of the commands: first step, minimum and maximum forward velocity (m/s), maximum yaw rate (rad/s)
-    stages: wp.array2d[float] = [[0.0, -1.0, 1.0, 0.5], [120e3, -1.5, 2.0, 0.7], [240e3, -2.0, 3.0, 0.7]]
-    lateral_velocity: float = 1.0
-    command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)
+    default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # the servos' targets under the action 0, rad
+    action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad for an action of 1
+    # commands
+    stages: wp.array2d[float] = [
+        [0.0, -1.0, 1.0, 0.5],
+        [120e3, -1.5, 2.0, 0.7],
+        [240e3, -2.0, 3.0, 0.7],
+    ]  # first step, least and greatest forward velocity (m/s) and greatest yaw rate (rad/s) of each stage
+    lateral_velocity: float = 1.0  # greatest, m/s
+    command_seconds: wp.vec2 = wp.vec2(3.0, 8.0)  # range of a command's duration, s
     heading_share: float = 0.3  # fraction of commands that give a heading
-    heading_gain: float = 0.5  # 1/s
-    standing_share: float = 0.1
+    heading_gain: float = 0.5  # yaw rate per error of the heading, 1/s
+    standing_share: float = 0.1  # fraction of commands to stand
     forward_share: float = 0.2  # fraction of commands to walk straight ahead
-    least_forward_velocity: float = 0.3
-    # bounds of the uniform noise on the policy's observations
-    linear_velocity_noise: float = 0.5
-    angular_velocity_noise: float = 0.2
-    gravity_noise: float = 0.05
-    joint_position_noise: float = 0.01
-    joint_velocity_noise: float = 1.5
+    least_forward_velocity: float = 0.3  # of commands to walk straight ahead, m/s
+    # noise on the policy's observations
+    linear_velocity_noise: float = 0.5  # bound of the uniform noise, m/s
+    angular_velocity_noise: float = 0.2  # bound of the uniform noise, rad/s
+    gravity_noise: float = 0.05  # bound of the uniform noise on the direction of gravity
+    joint_position_noise: float = 0.01  # bound of the uniform noise, rad
+    joint_velocity_noise: float = 1.5  # bound of the uniform noise, rad/s
     # pushes
-    push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)
+    push_seconds: wp.vec2 = wp.vec2(1.0, 3.0)  # range of the time between two pushes, s
     push_velocity: wp.vec3 = wp.vec3(0.5, 0.5, 0.4)  # largest change of velocity, in the world's axes, m/s
     push_spin: wp.vec3 = wp.vec3(0.52, 0.52, 0.78)  # largest change of angular velocity, in the world's axes, rad/s
     # differences between robots
     encoder_bias: float = 0.015  # largest, rad
     trunk_offset: wp.vec3 = wp.vec3(0.025, 0.025, 0.03)  # largest shift of the centre of mass, m
-    sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)
-    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # log-uniform
-    rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)  # log-uniform
+    sliding_friction: wp.vec2 = wp.vec2(0.3, 1.5)  # range of the feet's friction, uniform
+    spinning_friction: wp.vec2 = wp.vec2(1e-4, 2e-2)  # range of the feet's friction, log-uniform
+    rolling_friction: wp.vec2 = wp.vec2(1e-5, 5e-3)  # range of the feet's friction, log-uniform
     # resets
-    start_height: float = lw.from_model(walkers.home_height)
-    start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # offset of the base, m
-    start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)
+    start_height: float = lw.from_model(walkers.home_height)  # of the base, m
+    start_low: wp.vec3 = wp.vec3(-0.5, -0.5, 0.01)  # least offset of the base, m
+    start_high: wp.vec3 = wp.vec3(0.5, 0.5, 0.05)  # greatest offset of the base, m
     start_yaw: float = 3.14  # largest, rad
 
 
