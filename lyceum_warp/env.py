@@ -3,7 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable, Collection, Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -18,7 +18,7 @@ from lyceum_warp.binding.write_probe import Probe
 from lyceum_warp.done import FAULTS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
-from lyceum_warp.fields import describe, elements, has_several_rows
+from lyceum_warp.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.graphs.compile_ahead import compile_ahead
 from lyceum_warp.kernels import step_types, steps
 from lyceum_warp.model_fields import describe_model_field, is_model_field, put_rows
@@ -27,6 +27,7 @@ from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
+from lyceum_warp.support.suggestions import Named, did_you_mean
 from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
 from lyceum_warp.task import Task
 from lyceum_warp.world_arrays import own_bytes_per_world
@@ -176,7 +177,7 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                dict(zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
+                Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.episode_metric_sums = torch_view(worlds.episode_metrics)
@@ -203,7 +204,7 @@ class Env:
             if not _replica:
                 self.engine.check_room()
         except Exception as error:
-            if (clear := explained(error, self.task.name)) is error:
+            if (clear := explained(error, self.task)) is error:
                 raise
             raise clear from None
         leave_in_parent(self, "worlds", "engine")
@@ -214,6 +215,14 @@ class Env:
                 f"env.{name} is a buffer at a fixed address: write into the buffer, as env.{name}.copy_(...)"
             )
         super().__setattr__(name, value)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            hint = did_you_mean(name, [*Env.__annotations__, *vars(Env)], "help(lw.Env) lists the attributes")
+            if is_data_field(name) or is_model_field(name):
+                hint = f"use env.field({name!r})"
+            raise AttributeError(f"an environment has no {name!r}: {hint}")
 
     def __reduce__(self) -> Any:
         raise TypeError(

@@ -95,6 +95,9 @@ def _package_place(file: str, package: str, within: str, install: str, before_py
     raise FileNotFoundError(f"{what} is not installed: pip install '{install}'")
 
 
+_CLONE = "git clone https://github.com/google-deepmind/mujoco_menagerie, and set MENAGERIE_ROOT to the clone"
+
+
 def _menagerie_place(file: str) -> tuple[Path, str]:
     if root := os.environ.get("MENAGERIE_ROOT"):
         return _checkout(root), file
@@ -108,8 +111,8 @@ def _menagerie_place(file: str) -> tuple[Path, str]:
     raise FileNotFoundError(
         f"the model {file} comes from MuJoCo Menagerie, and no installed package has {robot!r}. Use one "
         "of three sources. For any robot: pip install mujoco-menagerie (it downloads robots on demand). For "
-        "some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'. For a local copy: git "
-        "clone https://github.com/google-deepmind/mujoco_menagerie, and set MENAGERIE_ROOT to the clone"
+        "some robots, such as G1, H1, T1, Go1 and Spot: pip install 'lyceum-warp[menagerie]'. For a local copy: "
+        f"{_CLONE}"
     )
 
 
@@ -130,7 +133,9 @@ def _downloaded(robot: str) -> Path:
     try:
         folder: Path = menagerie.get(robot).path()
     except menagerie.MenagerieError as error:
-        raise FileNotFoundError(f"the package mujoco-menagerie can't provide {robot!r}: {error}") from error
+        raise FileNotFoundError(
+            f"the package mujoco-menagerie can't provide {robot!r}: {error}; for use without a network: {_CLONE}"
+        ) from error
     return folder
 
 

@@ -14,7 +14,7 @@ import mujoco
 
 from lyceum_warp.model_files import ModelFile
 from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
-from lyceum_warp.support.suggestions import did_you_mean
+from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
 from lyceum_warp.support.validate import (
     check_flag,
     check_kind,
@@ -66,6 +66,7 @@ def _checked_limits(solver: Any) -> dict[str, int]:
     return {name: whole_number(f"solver's {name}", value, low=SOLVER_LIMITS[name]) for name, value in solver.items()}
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
@@ -142,6 +143,7 @@ class PhysicsOptions:
         return dataclasses.replace(known[self.base], **(self.given() | {"base": None}))
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
@@ -241,18 +243,11 @@ _DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
 
 OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
 
-_OTHER_WORDS = {
-    "num_envs": "nworld", "n_envs": "nworld", "xml_file": "model", "max_episode_steps": "horizon", "record": "graphs",
-    "iterations": "solver={'iterations': ...}", "ls_iterations": "solver={'ls_iterations': ...}",
-    "noslip_iterations": "solver={'noslip_iterations': ...}",
-}  # fmt: skip
-"""Names of options in other packages and earlier releases, with the names in this release."""
-
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
     """Return "did you mean ...?" for an unknown name, or "" if no name is similar."""
-    if word in _OTHER_WORDS:
-        return f"did you mean {_OTHER_WORDS[word]}?"
+    if word in SOLVER_LIMITS:
+        return f"did you mean solver={{{word!r}: ...}}?"
     return did_you_mean(word, [*others, *OPTIONS])
 
 

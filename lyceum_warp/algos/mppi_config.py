@@ -12,6 +12,7 @@ from lyceum_warp.algos.hyperparameters import check_fields
 from lyceum_warp.algos.plan_update import PlanUpdate
 from lyceum_warp.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_word
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
@@ -24,6 +25,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:

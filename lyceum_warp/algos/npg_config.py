@@ -6,6 +6,7 @@ from typing import Literal
 from lyceum_warp.algos.hyperparameters import LEAST, check_fields
 from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import suggest_arguments
 
 _BOUNDS: dict[str, float | tuple[float, float]] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
@@ -20,6 +21,7 @@ episode of hopper took 31 or 63 iterations, the return of some seeds stayed low 
 when an episode took 16 iterations (bench/README.md, "NPG's learning curves")."""
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:

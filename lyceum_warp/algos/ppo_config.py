@@ -6,6 +6,7 @@ from typing import Any, Literal
 from lyceum_warp.algos.hyperparameters import check_fields
 from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import whole_number
 
 _BOUNDS: dict[str, float | tuple[float, float]] = {
@@ -15,6 +16,7 @@ _BOUNDS: dict[str, float | tuple[float, float]] = {
 }  # fmt: skip
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOConfig:

@@ -6,6 +6,7 @@ from typing import Any, Literal
 from lyceum_warp.algos.hyperparameters import LEAST, check_fields
 from lyceum_warp.algos.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import suggest_arguments
 
 _BOUNDS: dict[str, float | tuple[float, float]] = {
     "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "quantiles": 1,
@@ -28,6 +29,7 @@ _MANY: dict[str, Any] = {
 """Defaults for 256 worlds or more, close to the settings of Seo et al., 2025, for humanoids."""
 
 
+@suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACConfig:

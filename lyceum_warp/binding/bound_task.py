@@ -327,8 +327,8 @@ class BoundTask:
                     f"the memory World.{name} of the task {self.name!r} has the name of an existing field or part of "
                     "the state: rename it"
                 )
-        whole_number(f"draws of the task {self.name!r}", task.draws, low=1)
-        whole_number(f"settle of the task {self.name!r}", task.settle, low=0)
+        for name in ("draws", "settle", "horizon"):
+            self._check_int(name, low=1 if name == "draws" else 0)
         if not isinstance(task.keyframe, str | None):
             raise ValueError(
                 f"keyframe of the task {self.name!r} must be the name of a keyframe of the model, such as 'home', not "
@@ -339,7 +339,6 @@ class BoundTask:
             for name in getattr(task, kind):
                 if name not in self.source.world.vars:
                     raise ValueError(f"{kind} of the task {self.name!r} has {name!r}: make it a field of World, too")
-        whole_number(f"horizon of the task {self.name!r}", task.horizon, low=0)
         self._check_success_steps()
         if task.action_range is not None:
             try:
@@ -352,10 +351,16 @@ class BoundTask:
                     f"1.0), not {task.action_range!r}"
                 )
 
+    def _check_int(self, name: str, **bounds: int) -> int:
+        value, what = getattr(self.task, name), f"{name} of the task {self.name!r}"
+        number = whole_number(what, value, **bounds)
+        if isinstance(value, float):
+            raise ValueError(f"{what} must be an int: write {number}, not {value!r}")
+        return number
+
     def _check_success_steps(self) -> None:
-        task = self.task
-        name = f"success_steps of the task {self.name!r}"
-        steps = whole_number(name, task.success_steps, low=1, high=_MOST_SUCCESS_STEPS)
+        task, name = self.task, f"success_steps of the task {self.name!r}"
+        steps = self._check_int("success_steps", low=1, high=_MOST_SUCCESS_STEPS)
         if steps > 1 and self.functions["success"] is None:
             raise ValueError(
                 f"{name} is {steps}, but the task has no {FUNCTIONS['success'].signature}: add this function"
@@ -409,6 +414,19 @@ class BoundTask:
         kind = self.types[name]
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
         if not wp.types.types_equal(dtype, array.dtype) or ndim != array.ndim - 1:
-            element = "lw.vec10" if array.dtype is vec10 else wp.types.type_repr(array.dtype)
-            wanted = _SPELLED.get(element, element) if array.ndim == 1 else f"Row[{_SPELLED.get(element, element)}]"
+            wanted = _spelled(array.dtype, array.ndim - 1)
             raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
+
+    def declaration(self, name: str) -> str:
+        """Return the line of World that declares a field of the model, such as "qvel: Row[float]"."""
+        if is_data_field(name):
+            field = describe(self.model, name)
+            return f"{name}: {_spelled(field.dtype, len(field.shape))}"
+        constant = describe_model_field(self.model, name, varies=False)
+        return f"{name}: {_spelled(constant.dtype, len(constant.shape))}"
+
+
+def _spelled(dtype: Any, ndim: int) -> str:
+    element = "lw.vec10" if dtype is vec10 else wp.types.type_repr(dtype)
+    element = _SPELLED.get(element, element)
+    return f"Row[{element}]" if ndim else element

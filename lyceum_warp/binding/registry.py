@@ -162,7 +162,7 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     if task not in _tasks and (module := _package_modules().get(task)) is not None:
         importlib.import_module(module)
     if task not in _tasks:
-        hint = did_you_mean(task, task_names(), f"there are {', '.join(task_names())}")
+        hint = did_you_mean(task, task_names(), "lyceum-warp tasks lists them")
         raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
     source_files(_tasks[task])
     return _tasks[task]

@@ -1,7 +1,10 @@
 """Parse a command's options, print its help, and suggest options for misspelt ones."""
 
+import contextlib
 import dataclasses
-import difflib
+import io
+import itertools
+import re
 import shutil
 import textwrap
 import typing
@@ -9,6 +12,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import tyro
+
+from lyceum_warp.support.suggestions import closest
+
+_ERRORS = (
+    (r"Error parsing (\S+): no type matching INT .* from \[(.*?)\]", "{0} takes a whole number, not {1}"),
+    (r"Error parsing (\S+): no type matching FLOAT .* from \[(.*?)\]", "{0} takes a number, not {1}"),
+    (
+        r"Error parsing (\S+): no type matching \S*\[\w+ .* from \[(.*?)\]",
+        "{0} takes numbers separated by spaces, not {1}",
+    ),
+    (r"Missing value for argument '(\S+)'", "{0} needs a value"),
+    (r"Missing from .*?: (\S+)", "{0} is missing"),
+    (r"invalid choice '(\S*)' for argument '(\S+)'. Expected one of \((.*)\)", "{1} takes {2}, not '{0}'"),
+)
+"""Patterns of tyro's errors, each with a message in one line."""
 
 _CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
 
@@ -23,11 +41,27 @@ def parse(command: type, prog: str, words: Sequence[str]) -> Any:
     if "--help-all" in words:
         words = ["--help"]
     options: Any = dict(prog=prog, config=_CONFIG, return_unknown_args=True)
-    found, unknown = tyro.cli(command, args=words, **options)
+    with contextlib.redirect_stderr(io.StringIO()) as printed:
+        try:
+            found, unknown = tyro.cli(command, args=words, **options)
+        except SystemExit as error:
+            if error.code:
+                raise ValueError(f"{_in_one_line(printed.getvalue())} ({prog} --help)") from None
+            raise
     if unknown:
         flags = [flag for group in _options(command).values() for flag in group]
         raise ValueError(_unknown(unknown[0], flags, prog))
     return found
+
+
+def _in_one_line(box: str) -> str:
+    """Shorten tyro's error message, a box of several lines."""
+    lines = [line.strip("│╭╮╰╯ ") for line in box.splitlines()[1:]]
+    text = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
+    for pattern, short in _ERRORS:
+        if match := re.search(pattern, text):
+            return short.format(*match.groups())
+    return text
 
 
 def _print_help(command: type, prog: str) -> None:
@@ -50,8 +84,9 @@ def _unknown(word: str, options: Sequence[str], prog: str) -> str:
     flag = word.partition("=")[0].replace("_", "-")
     if not flag.startswith("-"):
         return f"{prog} does not take the argument {word!r}: see {prog} --help"
-    close = difflib.get_close_matches(flag.strip("-"), [option[2:] for option in options], 1)
-    hint = f"did you mean --{close[0]}?" if close else f"{prog} --help-all lists the options"
+    names = {option.strip("-").replace("-", "_"): option for option in options}
+    close = closest(flag.strip("-").replace("-", "_"), names, 1)
+    hint = f"did you mean {names[close[0]]}?" if close else f"{prog} --help-all lists the options"
     return f"{prog} has no option {flag}: {hint}"
 
 

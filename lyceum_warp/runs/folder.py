@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from lyceum_warp.binding.registry import file_name
 from lyceum_warp.curriculum import Curriculum
 from lyceum_warp.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
 from lyceum_warp.runs.trust import remember
@@ -20,6 +21,10 @@ from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.support.versions import versions
 
 _CONFIG, _TASK = "config.json", "task"
+
+PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
+"""The folder of the package's pretrained runs."""
+
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
 """Temporary files that remain if a process is killed while it creates a run."""
 
@@ -155,7 +160,9 @@ class Run:
         """
         path = Path(folder) / _CONFIG
         if not path.is_file():
-            raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}")
+            known = (PRETRAINED / file_name(str(folder)) / _CONFIG).is_file()
+            hint = f"; for the package's policy, add --pretrained, or open lw.pretrained_run({str(folder)!r})"
+            raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}{hint if known else ''}")
         try:
             config = json.loads(path.read_text())
             number = config["format"]

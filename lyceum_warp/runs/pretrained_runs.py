@@ -3,15 +3,13 @@
 from pathlib import Path
 
 from lyceum_warp.binding.registry import file_name
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.folder import PRETRAINED, Run
 from lyceum_warp.support.suggestions import did_you_mean
-
-_FOLDER = Path(__file__).resolve().parents[1] / "pretrained"
 
 
 def pretrained_tasks() -> list[str]:
     """List the tasks that have a pretrained policy."""
-    return sorted(path.parent.name.replace("-", "/") for path in _FOLDER.glob("*/config.json"))
+    return sorted(path.parent.name.replace("-", "/") for path in PRETRAINED.glob("*/config.json"))
 
 
 def pretrained_run(task: str) -> Path:
@@ -33,7 +31,7 @@ def pretrained_run(task: str) -> Path:
     if task not in tasks:
         hint = did_you_mean(task, tasks, f"the tasks with a policy are {', '.join(tasks)}")
         raise ValueError(f"there is no pretrained policy of {task!r}: {hint}")
-    return _FOLDER / file_name(task)
+    return PRETRAINED / file_name(task)
 
 
 def pretrained_text(run: Run) -> str:

@@ -29,6 +29,8 @@ def bound(file: Path, **options: Any) -> BoundTask:
             "success_steps = 2",
             r"^success_steps of the task 'tiny' is 2, but the task has no success\(s: World, p: Params\)",
         ),
+        ("horizon = 100.0", r"horizon of the task 'tiny' must be an int: write 100, not 100\.0"),
+        ("settle = 2.0", "settle of the task 'tiny' must be an int: write 2"),
         ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
         ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
         ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
@@ -61,7 +63,8 @@ MISTAKES = {
         "observe of the task 'tiny' writes not-a-number into x of obs",
     ),
     "unknown field": (
-        function(f"{REWARD} -> float:\n    return s1.qvel[0]"), "can't compile the functions of the task .*qvel"
+        function(f"{REWARD} -> float:\n    return s1.qvel[0]"),
+        r"reward of the task 'tiny' \(tiny\.py, line 20\).*: add qvel: Row\[float\] to World",
     ),
     "quaternion": (
         function(f"{REWARD} -> float:\n    return wp.quat_rotate(lw.quat(1.0, 0.0, 0.0, 0.0), wp.vec3())[0]"),
@@ -84,9 +87,42 @@ MISTAKES = {
             "def height(s: World):\n    h = s.qpos[0]\n    for i in range(2):\n        h = 1\n    return h\n\n"
             f"@wp.func\n{REWARD} -> float:\n    return height(s1)"
         ),
-        "can't compile the functions of the task 'tiny': .*\"height\"",
+        r"can't compile height of the task 'tiny' \(tiny\.py, line 22\): 'h = 1'",
     ),
 }  # fmt: skip
+
+
+FIXES = {
+    "wp.max(action[0], action[1], action[2])": r"as in wp\.max\(a, wp\.max\(b, c\)\)",
+    "action[0] ** 2": r"as in x \*\* 2\.0",
+    "2 * action[0]": "numbers as floats",
+    "wp.length(2 * wp.vec3(action[0]))": "numbers as floats",
+    "wp.clamp(action[0], -1, 1)": "numbers as floats",
+    "wp.where(action[0] > 0.0, 1, 0)": "numbers as floats",
+    "lw.tolerance(action[0], 0, 1)": "numbers as floats",
+    "lw.tolerance(action[0], wp.vec3(0.0), 1.0)": r"help\(lw\.tolerance\) lists",
+    "action[action[0]]": r"row\[int\(x\)\]",
+    "TABLE[0]": r"into Params, as in table: wp\.array\[float\]",
+    "np.clip(action[0], 0.0, 1.0)": r"use Warp's functions, such as .* wp\.clamp",
+    "wp.lenght(wp.vec3(1.0))": "did you mean length",
+    "p.weight": "add weight: float = 1.0 to Params",
+    "s1.xpos[1][2]": r"add xpos: Row\[wp\.vec3\] to World",
+    "s1.body_mass[1]": r"add body_mass: Row\[float\] to World",
+    "s1.qpoz[1]": "did you mean qpos",
+    "float(again(3))": "a function cannot call itself: use a loop",
+}
+
+
+@pytest.mark.parametrize(("expression", "fix"), FIXES.items(), ids=FIXES)
+def test_function_that_warp_cannot_compile_raises_an_error_with_the_fix(
+    expression: str, fix: str, tmp_path: Path
+) -> None:
+    helper = "import numpy as np\nTABLE = np.ones(3)\n\n@wp.func\ndef again(n: int) -> int:\n    return again(n - 1)\n"
+    reward = f"@wp.func\n{REWARD} -> float:\n    return {expression}\n"
+    source = tiny_task.changed(("class Tiny", f"{helper}\n{reward}\nclass Tiny"))
+    with pytest.raises(ValueError, match=fix) as caught:
+        lw.make(tiny_task.write(tmp_path, source))
+    assert "\n" not in str(caught.value) and "reward of the task 'tiny'" in str(caught.value).replace("again", "reward")
 
 
 @pytest.mark.parametrize(("change", "message"), MISTAKES.values(), ids=MISTAKES)

@@ -22,6 +22,8 @@ def test_task_name_with_a_namespace_finds_its_task_and_gives_a_valid_file_name()
     assert file_name("dm/humanoid_walk") == "dm-humanoid_walk" and file_name("hopper") == "hopper"
     with pytest.raises(ValueError, match="no task 'dm/walker_wlk': did you mean dm/walker_walk"):
         find_task("dm/walker_wlk")
+    with pytest.raises(ValueError, match="no task 'runs/lost': lyceum-warp tasks lists them"):
+        find_task("runs/lost")
 
 
 @pytest.mark.parametrize("name", ["hopper.xml", "foo.bar", "./t", ""])

@@ -51,6 +51,14 @@ def test_pretrained_policies_are_small_and_contain_no_code() -> None:
     assert size < 5e6
 
 
+def test_task_name_in_place_of_a_run_names_the_pretrained_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no run in hopper: .* add --pretrained, .*pretrained_run\('hopper'\)"):
+        Run.open("hopper")
+    with pytest.raises(FileNotFoundError, match=r"config\.json$"):
+        Run.open("runs/hopper")
+
+
 def test_description_of_a_pretrained_policy_names_the_training_settings(tmp_path: Path) -> None:
     evaluated = {"return": 123.45, "std": 6.78, "episodes": 32, "lyceum_warp": "0.2.0"}
     config = {"algorithm": "ppo", "task": "hopper", "params": {"ctrl_cost_weight": 0.5}, "physics": {}, "options": {}}
