@@ -64,6 +64,8 @@ class Display(training.Display):
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
         with self.progress:
             yield
+        if kinds := ", ".join(f"{number:,d} {kind}" for kind, number in env.fault_counts.items() if number):
+            say(f"faults by their kind (lw.Done): {kinds}; lyceum-warp check names the function of a bad reward")
 
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""

@@ -1,5 +1,6 @@
-"""Check that no function of a task uses an index out of range."""
+"""Check that no function of a task uses an index out of range, and that results are finite."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.done import FAULTS
+from lyceum_warp.done import FAULTS, Done
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.task import FUNCTIONS, MEMORIES, observer_name
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
@@ -21,14 +22,15 @@ _FEW = 20
 
 
 def check_bounds(ctx: Context) -> None:
-    """No function of the task reads or writes out of range in a row, a vector or a matrix.
+    """No function of the task reads or writes out of range in a row, a vector or a matrix, and all results are finite.
 
-    Warp counts negative indices from the end, but only constants such as ``-1`` are allowed.
+    Warp counts negative indices from the end, but only constants such as ``-1`` are allowed. A result may be infinite
+    or NaN in a state with a fault.
     """
     run = _Run(ctx)
     with ctx.changed(ctx.a, autoreset=False):
         run.steps()
-    if problems := run.checked.problems(run.report):
+    if problems := [*run.checked.problems(run.report), *run.not_finite]:
         ctx.fail("; ".join(problems))
 
 
@@ -61,6 +63,8 @@ class _Run:
         self.rows["shared"] = self._array((n, self.worlds.shared.shape[1]), wp.float32)
         self.rows["ended"] = wp.full(1, True, dtype=bool, device=self.env.device)
         self.rows["terminated"] = wp.array([True, False], dtype=bool, device=self.env.device)
+        self.not_finite: dict[str, None] = {}
+        """Problems: the functions whose results are NaN or infinite in valid states."""
 
     def steps(self) -> None:
         env = self.env
@@ -83,7 +87,10 @@ class _Run:
             self._run_step(self.worlds)
 
     def _run_before_restart(self, state: torch.Tensor, action: torch.Tensor) -> None:
-        """Repeat a step that ended with a fault, because a read out of range may have caused the fault."""
+        """Repeat a step that ended with a fault, because a read out of range may have caused the fault.
+
+        If the fault is a reward or an observation, find the functions whose results are not finite.
+        """
         env = self.ctx.b
         env.set_state(state)
         env.action.copy_(action)
@@ -91,6 +98,18 @@ class _Run:
         for phase in env.worlds.physics_phases():
             phase.run()
         self._run_step(env.worlds)
+        found: list[tuple[Done, Sequence[str], wp.array | None]] = [(Done.REWARD, ["reward"], None)]
+        if "score" in self.functions:
+            found = [(Done.REWARD, self.env.task.metrics, self.rows["metrics"])]
+        for group, space in self.worlds.obs_spaces.items():
+            name = observer_name(group)
+            found.append((Done.OBSERVATION, [f"{column} of {name}" for column in space.columns], self.obs[name]))
+        for fault, names, rows in found:
+            worlds = (self.env.done_reason & int(fault)) != 0
+            if worlds.any():
+                bad = [True] if rows is None else (~torch.isfinite(torch_view(rows)[worlds])).any(0).tolist()
+                wrong = (name for name, is_bad in zip(names, bad, strict=True) if is_bad)
+                self.not_finite |= dict.fromkeys(f"{name} is NaN or infinite" for name in wrong)
 
     def _run_step(self, worlds: Worlds) -> None:
         dirty = True

@@ -226,3 +226,33 @@ def test_function_that_cannot_be_checked_is_reported_by_name(function: Any, mess
     task = type("Unchecked", (Right,), {"advance": function})
     with pytest.raises(AssertionError, match=f"the functions could not be checked: {message}"):
         check_task(task, engine="mujoco", steps=2, checks=[check_bounds])
+
+
+@wp.func
+def height(s: World) -> float:
+    return s.qpos[1]
+
+
+@wp.func
+def root(s: World) -> float:
+    return wp.sqrt(s.qpos[0])  # the robot also moves backwards
+
+
+@wp.struct
+class Timed(Params):
+    dt: float
+
+
+@wp.func
+def place(s: World, p: Timed, obs: Row[float]):
+    obs[0] = s.qpos[0]
+
+
+class Rooted(lw.Task):
+    Params, observe = Timed, place
+    model, obs, rewards = "hopper.xml", {"x": 1}, {"height": 1.0, "root": 1.0}
+
+
+def test_term_that_is_not_a_number_is_named() -> None:
+    with pytest.raises(AssertionError, match="breaks the rule 'bounds': root is NaN or infinite"):
+        check_task(Rooted, engine="mujoco", nworld=2, steps=20, checks=[check_bounds])
