@@ -69,9 +69,9 @@ def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any
 class Env:
     """One task in many worlds. Every array is allocated once and shared with torch.
 
-    Write ``action``, call ``step``, and read the other buffers. When an episode ends, the world starts a new random
-    episode in the same step. ``obs`` is then the new episode's first observation, and ``final_obs`` is the old
-    episode's last observation.
+    Write ``action``, call ``step``, and read the other buffers: unlike in Gymnasium, ``step`` and the resets return
+    nothing. When an episode ends, the world starts a new random episode in the same step. ``obs`` is then the new
+    episode's first observation, and ``final_obs`` is the old episode's last observation.
 
     A world with a fault (see ``Done``) restarts and leaves all other worlds unchanged. ``fault_counts`` counts the
     faults. After a fault, the reward is 0, and ``final_obs`` is the last valid observation. On the Warp engine, all

@@ -62,13 +62,13 @@ def _compiled(source: FunctionSource) -> Iterator[ast.AST]:
 
 
 def _is_integer(kind: Any) -> bool:
-    return getattr(kind, "_wp_scalar_type_", kind) in _INTEGERS
+    return _scalar(kind) in _INTEGERS
 
 
 class _Types:
     """Infers the types of a function's expressions from annotations, literals, conversions and assignments.
 
-    None stands for a type that is unknown.
+    An array's type is a tuple of its number of axes and its element type. None stands for a type that is unknown.
     """
 
     def __init__(self, function: wp.Function) -> None:
@@ -77,80 +77,67 @@ class _Types:
         self._assigned: dict[str, list[tuple[ast.expr, int | None]]] = {}
         """The expressions that are assigned to each local variable, each with an index if a tuple is unpacked."""
         for node in _compiled(self.source):
-            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
-                for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-                    parts = target.elts if isinstance(target, ast.Tuple) else []
-                    for name, index in ((target, None), *((part, i) for i, part in enumerate(parts))):
-                        if isinstance(name, ast.Name):
-                            self._assigned.setdefault(name.id, []).append((node.value, index))
-            elif isinstance(node, ast.For) and isinstance(node.target, ast.Name):
-                self._known[node.target.id] = int  # Warp loops over ranges only
+            for target in getattr(node, "targets", [getattr(node, "target", None)]):
+                if isinstance(node, ast.For) and isinstance(target, ast.Name):
+                    self._known[target.id] = int  # Warp loops over ranges only
+                elif (value := getattr(node, "value", None)) is not None:
+                    parts = enumerate(target.elts) if isinstance(target, ast.Tuple) else [(None, target)]
+                    for index, part in parts:
+                        if isinstance(part, ast.Name):
+                            self._assigned.setdefault(part.id, []).append((value, index))
 
     def of(self, node: ast.expr) -> Any:
-        """Return the type of an expression. An array is a tuple of its number of axes and its element type."""
+        """Return the type of an expression."""
         match node:
             case ast.Name(id=name) if name in self.source.locals:
                 return self._local(name)
             case ast.Constant(value=value):
                 return type(value)
-            case ast.Attribute(value=owner, attr=name) if self.source.value(node) is None:
-                kind = self.of(owner)
-                if is_struct(kind):
-                    return _annotated(kind.vars[name].type) if name in kind.vars else None
-                if isinstance(kind, tuple):
-                    return {"shape": (1, int), "size": int, "ndim": int}.get(name)
-                return getattr(kind, "_wp_scalar_type_", None)
-            case ast.Subscript(value=owner, slice=index):
-                return self._element(self.of(owner), index)
-            case ast.UnaryOp(op=ast.USub() | ast.UAdd() | ast.Invert(), operand=operand):
-                return self.of(operand)
+            case ast.UnaryOp(operand=inner) | ast.IfExp(body=inner):
+                return self.of(inner)
             case ast.BinOp(left=left, right=right):
                 kinds = [self.of(left), self.of(right)]
                 return next((kind for kind in kinds if not _is_integer(kind)), kinds[0])
-            case ast.IfExp(body=body):
-                return self.of(body)
-            case ast.Call():
+            case ast.Subscript(value=owner, slice=index):
+                axes, element = kind if isinstance(kind := self.of(owner), tuple) else (0, _scalar(kind))
+                indices = index.elts if isinstance(index, ast.Tuple) else [index]
+                axes -= sum(not isinstance(i, ast.Slice) for i in indices)
+                return (axes, element) if axes > 0 else element
+            case ast.Call() if not self.source.is_static(node):
                 return self._result(node)
-            case ast.Name() | ast.Attribute():
-                value = self.source.value(node)
-                return None if value is None else type(value)
+        if (value := self.source.value(node)) is not None:
+            return type(value)
+        if isinstance(node, ast.Attribute):
+            kind = self.of(node.value)
+            if is_struct(kind):
+                return _annotated(kind.vars[node.attr].type) if node.attr in kind.vars else None
+            return {"shape": (1, int), "size": int}.get(node.attr) if isinstance(kind, tuple) else _scalar(kind)
         return None
 
     def _local(self, name: str) -> Any:
         if name not in self._known:
             self._known[name] = None  # ends the recursion for x = x + 1
-            kinds = (self._part(value, index) for value, index in self._assigned.get(name, ()))
-            self._known[name] = next((kind for kind in kinds if kind is not None), None)
+            for value, index in self._assigned.get(name, ()):
+                kind = self.of(value.elts[index] if isinstance(value, ast.Tuple) and index is not None else value)
+                if index is not None and not isinstance(value, ast.Tuple):  # a function returns a tuple
+                    kind = dict(enumerate(typing.get_args(kind))).get(index)
+                self._known[name] = self._known[name] or _annotated(kind)
         return self._known[name]
-
-    def _part(self, value: ast.expr, index: int | None) -> Any:
-        if index is None:
-            return self.of(value)
-        if isinstance(value, ast.Tuple):
-            return self.of(value.elts[index])
-        kinds = typing.get_args(self.of(value))
-        return _annotated(kinds[index]) if index < len(kinds) else None
-
-    def _element(self, kind: Any, index: ast.expr) -> Any:
-        if not isinstance(kind, tuple):
-            return getattr(kind, "_wp_scalar_type_", None)
-        axes, element = kind
-        axes -= sum(not isinstance(i, ast.Slice) for i in (index.elts if isinstance(index, ast.Tuple) else [index]))
-        return (axes, element) if axes > 0 else element
 
     def _result(self, node: ast.Call) -> Any:
         kind, callee = self.source.call(node)
-        if kind == "static":
-            value = self.source.value(node)
-            return None if value is None else type(value)
         if kind == "helper":
             results = [each.adj.arg_types.get("return") for each in overloads(callee)]
             return _annotated(results[0]) if all(result == results[0] for result in results) else None
         if kind == "builtin" and node.args:
-            if callee.key in ("len", "int"):
+            if callee.key in ("int", "len", "randi"):
                 return int
             return self.of(node.args[-1]) if callee.key in _LIKE_LAST else getattr(wp, callee.key, None)
         return callee if kind == "other" else None
+
+
+def _scalar(kind: Any) -> Any:
+    return getattr(kind, "_wp_scalar_type_", None if isinstance(kind, tuple) else kind)
 
 
 def _annotated(kind: Any) -> Any:

@@ -57,6 +57,7 @@ def integers(p: Params, row: Row[float], x: float, n: int):
         count += 1
     row[0] = float(count / n)
     row[0] = float((1 if x > 0.0 else 2) / 2)
+    row[0] = float(wp.randi(wp.rand_init(n), 0, 9) / 2)
     count /= 2
 
 
@@ -78,5 +79,5 @@ def others(p: Params, row: Row[float], x: float, n: int):
 def test_all_divisions_of_integers_are_found_and_no_others() -> None:
     lines = [line.strip() for line in ast.unparse(source_of(integers).tree).splitlines() if "/" in line]
     found = [ast.unparse(division) for division in integer_divisions(integers)]
-    assert len(found) == len(lines) == 18 and all(map(str.__contains__, lines[:-1], found))
+    assert len(found) == len(lines) == 19 and all(map(str.__contains__, lines[:-1], found))
     assert found[-1] == "count / 2" and integer_divisions(others) == []
