@@ -25,7 +25,8 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
     Example:
         >>> runner = OnPolicyRunner(RslRlVecEnv(env), runner_config(env))
 
-    rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger`` and ``tf32``, and it does not evaluate the mean policy.
+    rsl_rl's PPO ignores ``final_entropy_coef``, ``stagger``, ``tf32`` and ``symmetry``, and it does not evaluate the
+    mean policy.
 
     Args:
         env: The environment whose observations are the networks' inputs.

@@ -260,6 +260,7 @@ class PPO(OnPolicyLearner):
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
         """Make one step of Adam on a mini-batch."""
         config, clip = self.config, self.config.clip
+        old_mean, own_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
         mean, log_std = self.policy(samples["obs"]), self._log_std()
@@ -282,7 +283,8 @@ class PPO(OnPolicyLearner):
         gradients = torch.autograd.grad(loss, self._parameters)
 
         with torch.no_grad():
-            kl = (weight * divergence(samples["mean"], self._old_log_std, mean, log_std)).sum()
+            # an image's old mean is not the policy's: KL divergences of images would measure the policy's asymmetry
+            kl = (own_weight * divergence(old_mean, self._old_log_std, mean[: len(old_mean)], log_std)).sum()
             torch.cat([*(part.flatten() for part in gradients), kl[None], losses], out=self._sums)
             self.team.sum(self._sums)
             if config.schedule == "adaptive":
@@ -297,7 +299,7 @@ class PPO(OnPolicyLearner):
         assert self._mirror is not None and self._mirror_value is not None
         images = dict(samples)
         for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
-                            ("action", self._mirror.action), ("mean", self._mirror.action)):  # fmt: skip
+                            ("action", self._mirror.action)):  # fmt: skip
             images[name] = image(samples[name])
         return {name: torch.cat([part, images[name]]) for name, part in samples.items()}
 

@@ -90,6 +90,23 @@ def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
     torch.testing.assert_close(weight, weight * rows[:, None] * columns, rtol=0.0, atol=1e-6)
 
 
+def test_the_learning_rate_ignores_the_asymmetry_of_the_policy(env: lw.Env) -> None:
+    """Its KL divergence is the one of metrics.csv, between the old and the new policy on the samples."""
+    ppo = learner(env, "augment", desired_kl=1e-9, normalize=False)
+    torch.nn.init.xavier_uniform_(ppo.policy.network[-1].weight)
+    assert asymmetry(ppo.policy, env) > 0.1
+    ppo.sample()
+    samples = {name: part.flatten(0, 1) for name, part in ppo.evaluated_samples().items()}
+    weight, before = torch.full((len(samples["obs"]),), 1.0 / len(samples["obs"])), ppo.rate.item()
+    ppo.learn(samples, weight)
+    assert ppo.rate >= before  # the policy has not changed
+    ppo._apply_std()
+    kl = ppo.divergence()
+    ppo.learn(samples, weight)
+    assert ppo._sums[-4].item() == pytest.approx(kl.item(), rel=1e-4)
+    assert ppo.rate < before
+
+
 def test_task_without_a_mirror_function_raises_an_error(shared_env: SharedEnv) -> None:
     with pytest.raises(ValueError, match="the task 'hopper' declares no mirror image: set mirror = lw.Mirror"):
         lw.PPO(shared_env("hopper"), config=dataclasses.replace(CONFIG, symmetry="exact"))

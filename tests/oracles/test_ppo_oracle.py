@@ -15,6 +15,10 @@ from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
 STEPS, N = 12, 8
 
 
+class Mirrored(Metered):
+    mirror = lw.Mirror({"x": [-1.0], "v": [-1.0], "action": [-1.0]})
+
+
 @pytest.fixture(autouse=True)
 def double() -> Iterator[None]:
     """Use float64, because Adam would turn float32 rounding errors of tiny gradients into full steps."""
@@ -40,9 +44,18 @@ def samples(ppo: lw.PPO) -> dict[str, torch.Tensor]:
             "log_prob": log_prob, "value": value, "target": value + advantage, "advantage": advantage}  # fmt: skip
 
 
+def augmented(env: Any, obs: Any, actions: Any) -> tuple[Any, Any]:
+    """Append mirror images, as ``Mirrored.mirror`` defines them."""
+    images = None if obs is None else torch.cat([obs, obs.apply(torch.neg)])
+    return images, torch.cat([actions, -actions])
+
+
 def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
     env = ppo.env
-    other = OnPolicyRunner(RslRlVecEnv(env), runner_config(env, ppo.config), None, "cpu").alg
+    config = runner_config(env, ppo.config)
+    if ppo.config.symmetry == "augment":
+        config["algorithm"]["symmetry_cfg"] = {"use_data_augmentation": True, "data_augmentation_func": augmented}
+    other = OnPolicyRunner(RslRlVecEnv(env), config, None, "cpu").alg
     for network in (other.actor, other.critic):
         network.double()
     other.actor.mlp.load_state_dict(ppo.policy.network.state_dict())
@@ -60,13 +73,13 @@ def theirs(ppo: lw.PPO, given: dict[str, torch.Tensor]) -> Any:
 @pytest.mark.parametrize("changes", [
     {}, {"desired_kl": 1e-4}, {"desired_kl": 1e3, "max_grad_norm": 0.01}, {"clip": 0.01, "entropy_coef": 0.3},
     {"whiten_minibatches": True, "clip_value_loss": False, "std_type": "log"},
-    {"schedule": "fixed", "minibatches": 5, "epochs": 3, "value_coef": 0.5},
+    {"schedule": "fixed", "minibatches": 5, "epochs": 3, "value_coef": 0.5}, {"symmetry": "augment"},
 ])  # fmt: skip
 def test_an_update_gives_the_same_parameters_as_rsl_rl(
     changes: dict[str, Any], shared_env: SharedEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = lw.PPOConfig(**{"hidden": (16, 8), "value_hidden": (8,), "num_steps": STEPS, "normalize": False} | changes)
-    ppo = lw.PPO(shared_env(Metered, nworld=N, horizon=10), config=config)
+    ppo = lw.PPO(shared_env(Mirrored, nworld=N, horizon=10), config=config)
     for module in (ppo.policy, ppo.value):  # layers near zero would have small gradients
         torch.nn.init.xavier_uniform_(module.network[-1].weight, generator=torch.Generator().manual_seed(0))
     given = samples(ppo)
