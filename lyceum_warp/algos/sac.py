@@ -358,6 +358,7 @@ class SAC(Learner):
             "temperature": self.log_temperature.detach(),
             "returns": self.team.gather(self.rollout.running_return),
             "optimizers": [step.optimizer.state_dict() for step in self._steps],
+            "warms_up": self._warms_up,
         }
         return super().state_dict() | copy.deepcopy(own)
 
@@ -370,6 +371,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
+        self._warms_up = state.get("warms_up", self._warms_up)  # missing in old checkpoints
         self._learn.forget()  # the graph contains the addresses of Adam's old moments
 
     @property

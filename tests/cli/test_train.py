@@ -7,6 +7,7 @@ from typing import Any
 import mujoco
 import pytest
 import tiny_task
+import torch
 from conftest import TaskFile
 from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 
@@ -342,6 +343,28 @@ def test_interrupted_run_ends_after_the_iteration_and_can_be_resumed(
     assert metrics(out) == metrics(trained)
     assert cli.main(["train", "--resume", str(out), "--iterations", "5", *QUIET]) == 0
     assert len(metrics(out)) == 5
+
+
+@pytest.mark.parametrize("flags", [
+    ["npg", "--samples", "32"], ["ppo", "--num-steps", "8", "--minibatches", "2"],
+    ["sac", "--num-steps", "8", "--warmup", "72", "--batch", "16", "--replay", "100"],
+], ids=lambda flags: flags[0])  # fmt: skip
+def test_run_resumed_after_every_iteration_equals_an_uninterrupted_run(flags: list[str], tmp_path: Path) -> None:
+    """SAC's warm-up ends within the third of five iterations. The first stop is before the first iteration."""
+    options = ["--algorithm", *flags, "--nworld", "4", "--horizon", "10", "--hidden", "8", "--value-hidden", "8",
+               "--mean-every", "2", "--mean-episodes", "2", *QUIET]  # fmt: skip
+    assert cli.main(["train", "point_mass", "--out", str(tmp_path / "whole"), "--iterations", "5", *options]) == 0
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(ALGORITHMS[flags[0]][0], "__next__", lambda learner: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            cli.main(["train", "point_mass", "--out", str(tmp_path / "parts"), "--iterations", "5", *options])
+    for iteration in range(1, 6):
+        resume = ["train", "--resume", str(tmp_path / "parts"), "--iterations", str(iteration), *QUIET]
+        assert cli.main(resume) == 0
+    assert metrics(tmp_path / "parts") == metrics(tmp_path / "whole")
+    one, other = (torch.load(tmp_path / name / "checkpoint.pt")["state"] for name in ("parts", "whole"))
+    for part in ("env", "policy", "value", "generator"):
+        torch.testing.assert_close(one[part], other[part], rtol=0.0, atol=0.0)
 
 
 def test_second_interrupt_ends_a_run_immediately(
