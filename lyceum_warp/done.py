@@ -19,7 +19,7 @@ class Done(enum.IntFlag):
     TRUNCATED = 2
     """The time limit was reached, or the task's ``truncated`` returned True. ``env.truncated`` also includes faults."""
     NAN = 4
-    """A state or a control is NaN or larger than 1e10, or task memory is not finite."""
+    """A state or a control is NaN or at least 1e10 in magnitude, or task memory is not finite."""
     CONTACT_OVERFLOW = 8
     """There were more contacts than the engine has room for."""
     CONSTRAINT_OVERFLOW = 16
@@ -29,9 +29,9 @@ class Done(enum.IntFlag):
     ACTION = 64
     """The action was not finite and was replaced by zero."""
     REWARD = 128
-    """The reward was not finite."""
+    """The reward was NaN or at least 1e10 in magnitude."""
     OBSERVATION = 256
-    """The observation was not finite."""
+    """An observation was NaN or at least 1e10 in magnitude."""
     MODEL = 512
     """A randomized model field has a value that MuJoCo cannot simulate, such as a negative mass."""
 

@@ -33,9 +33,6 @@ log = logging.getLogger(__name__)
 _SHORTER = 4
 """Maximum number of times that NPG shortens a step."""
 
-_LARGEST = 1e30
-"""Rewards are clipped to this limit, so that their sum over an episode fits into float32."""
-
 _PATIENCE = 10
 """Learning ends after this number of consecutive iterations with a non-finite update."""
 
@@ -232,8 +229,8 @@ class NPG(OnPolicyLearner):
             last, self._skipping = self.iteration + 1, 0
             raise FloatingPointError(
                 f"{' and '.join(skipped)} in iteration {last} {'are' if len(skipped) > 1 else 'is'} not finite, as "
-                f"in the {_PATIENCE - 1} iterations before; all these updates were skipped. "
-                f"{self.rollout.explain_not_finite()}"
+                f"in the {_PATIENCE - 1} iterations before; all these updates were skipped: make delta, value_rate, or "
+                f"the rewards and observations smaller ({self.rollout.extremes()})"
             )
         return len(skipped)
 
@@ -260,8 +257,7 @@ class NPG(OnPolicyLearner):
         rollout, config, team = self.rollout, self.config, self.team
         value = self.predict(rollout.obs_groups[self.value.group], rollout.step)
         next_value = self.predict(rollout.final_obs_groups[self.value.group], rollout.step + 1.0)
-        reward = rollout.reward.clamp(-_LARGEST, _LARGEST)
-        advantage, target = self._estimate(reward, value, next_value)
+        advantage, target = self._estimate(rollout.reward, value, next_value)
         prediction = prediction_sums(target, value)
         self.value.rescale(target, first=self._value_is_new and self.iteration == 0, team=team)
         # a factor on the advantages does not change the step, and division by a power of two causes no rounding

@@ -172,8 +172,8 @@ class PPO(OnPolicyLearner):
         timer.mark()
         if not update.pop("finite"):
             raise FloatingPointError(
-                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards, "
-                "smaller"
+                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards and "
+                f"observations, smaller ({rollout.extremes()})"
             )
 
         # 4. Evaluate the mean policy.

@@ -1,9 +1,9 @@
 """Store the samples of a fixed number of steps in a preallocated buffer."""
 
-import math
 from collections.abc import Collection, Mapping
 from typing import Any, TypeAlias
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -20,9 +20,6 @@ from lyceum_warp.support.validate import check_flag, check_group, check_kind, wh
 
 _Pair: TypeAlias = tuple[Any, wp.array]
 """An array of an environment, and the buffer that stores it for each step."""
-
-_LARGE = 1e18
-"""Largest absolute observation; its square still fits into float32."""
 
 
 @document_attributes
@@ -204,36 +201,19 @@ class Rollout:
         env.rand_reset(mask=mask)
         self.running_return.masked_fill_(mask, 0.0)
 
-    def explain_not_finite(self) -> str:
-        """Find the first number that is infinite, NaN or too large for float32, and describe it and a remedy.
-
-        The environment treats infinite or NaN rewards and observations as faults. Rewards and observations can
-        therefore be too large, but not infinite or NaN.
-        """
-        kinds: list[tuple[str, torch.Tensor, float, Mapping[str, slice]]] = [("reward", self.reward, torch.inf, {})]
-        for groups in (self.obs_groups, self.final_obs_groups):
-            parts = {group: self.env.obs_spaces[group].parts for group in groups}
-            kinds += [("observation", obs, _LARGE, parts[group]) for group, obs in groups.items()]
-        for name, values, limit, spans in kinds:
-            if not (bad := ~(values.abs() < limit)).any():
-                continue
-            t, world, *place = bad.nonzero()[0].tolist()
-            number = values[t, world, *place].item()
-            part = [f" in {part!r}" for part, span in spans.items() for i in place if span.start <= i < span.stop]
-            samples = bad.view(*bad.shape[:2], -1).any(-1)
-            found, fix = "not finite", ""
-            if math.isfinite(number):
-                found, fix = f"beyond {limit:g}", ": scale it in observe, or normalise observations (normalize)"
-            return (
-                f"The {name} of the task {self.env.task.name!r} is {number:g}{''.join(part)} in step {t + 1} of world "
-                f"{self.env.first_world + world}, and {found} in {int(samples.sum())} of {samples.numel()} samples{fix}"
-            )
-        if not self.action.isfinite().all():
-            return "Rewards and observations are finite, actions are not: make the step (delta) smaller"
-        return (
-            "Rewards and observations are finite: make the step (delta) or the rate of the value function's fit "
-            "(value_rate) smaller"
-        )
+    def extremes(self) -> str:
+        """Describe the reward and the observation of each group that have the largest magnitude, for error messages."""
+        rows: dict[str, tuple[torch.Tensor, Mapping[str, slice]]] = {"reward": (self.reward.unsqueeze(-1), {})}
+        for group, obs in self.obs_groups.items():
+            name = "observation" if group == "policy" else f"observation of the group {group!r}"
+            rows[name] = obs, self.env.obs_spaces[group].parts
+        texts = []
+        for name, (values, parts) in rows.items():
+            t, world, column = (int(i) for i in np.unravel_index(int(values.abs().argmax()), values.shape))
+            part = "".join(f" in {part!r}" for part, columns in parts.items() if columns.start <= column < columns.stop)
+            where = f"in step {t + 1} of world {self.env.first_world + world}"
+            texts.append(f"the largest {name} is {values[t, world, column]:g}{part} {where}")
+        return "; ".join(texts)
 
     def _launch_inputs(self) -> None:
         dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))

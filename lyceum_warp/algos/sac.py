@@ -215,8 +215,8 @@ class SAC(Learner):
         times = timer.seconds()
         if not update.pop("finite"):
             raise FloatingPointError(
-                f"the updates of iteration {self.iteration + 1} are not finite: make learning_rate, or the rewards, "
-                "smaller"
+                f"the updates of iteration {self.iteration + 1} are not finite: make learning_rate, or the rewards and "
+                f"observations, smaller ({rollout.extremes()})"
             )
         update |= {name: update[name] / updates if updates else math.nan for name in sums}
 

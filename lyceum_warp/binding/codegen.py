@@ -52,10 +52,10 @@ def observe_group(group: int, s: World, p: Params, out: Observations, w: int, ba
 
 
 @wp.func
-def finite_group(group: int, out: Observations, w: int) -> bool:
-    finite = bool(True)
-{finite}
-    return finite
+def valid_group(group: int, out: Observations, w: int) -> bool:
+    valid = bool(True)
+{valid}
+    return valid
 
 
 @wp.func
@@ -163,7 +163,7 @@ def _generated(
         if name in memory or is_data_field(name):  # model fields are not copied, because a step does not change them
             state += _copy(name, ndim)
     scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
-    scope["restored_row"] = kernel_rows.restored_row
+    scope |= {"restored_row": kernel_rows.restored_row, "row_in_range": kernel_rows.row_in_range}
     observe = []
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
@@ -182,8 +182,8 @@ def _generated(
         "state": state or ["    pass"],
         "groups": [f"    {group}: type_group" for group in groups],
         "observe": [f"    {line}" for line in observe],
-        "finite": [
-            f"    if group == {number}:\n        finite = finite_row(out.{group}[w], 0, 1)"
+        "valid": [
+            f"    if group == {number}:\n        valid = row_in_range(out.{group}[w], 0, 1)"
             for number, group in enumerate(groups)
         ],
         "copy": [f"    copy_row(source.{group}[w], target.{group}[w], lane, lanes)" for group in groups],

@@ -7,6 +7,7 @@ samples of a plant in consecutive rows. With spline knots, the first axis has on
 import warp as wp
 
 from lyceum_warp.done import Done
+from lyceum_warp.kernels.faults import is_out_of_range
 from lyceum_warp.kernels.random import stream, world_key
 
 ACTION = wp.constant(int(Done.ACTION))
@@ -220,21 +221,23 @@ def add_up(
     """Add up the worlds' discounted rewards and terminal values; launched over (nworld,).
 
     If ``stop`` is set, a sample gets no reward and no terminal value after its episode has terminated. The return is
-    minus infinity if the sample has a fault, or if the sum is not finite.
+    minus infinity if the sample has a fault, if a reward is a fault, or if the sum is not finite.
     """
     k = wp.tid()
     total = float(0.0)
     weight = float(1.0)
     going = bool(True)
+    failed = bool(fault_in[k] != 0)
     for t in range(reward_in.shape[0]):
         if going:
+            failed = failed or is_out_of_range(reward_in[t, k])
             total += weight * reward_in[t, k]
             weight *= discount
             if stop and terminated_in[t, k]:
                 going = False
     if going:
         total += weight * terminal_in[k]
-    if fault_in[k] != 0 or not wp.isfinite(total):
+    if failed or not wp.isfinite(total):
         total = -wp.inf
     return_out[k] = total
 

@@ -2,6 +2,17 @@
 
 import warp as wp
 
+from lyceum_warp.kernels import faults
+
+
+@wp.func
+def row_in_range(row: wp.array[float], lane: int, lanes: int) -> bool:
+    """Return whether every element that this thread reads is smaller than 1e10 in magnitude."""
+    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
+        if faults.is_out_of_range(row[i]):
+            return False
+    return True
+
 
 @wp.func
 def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:

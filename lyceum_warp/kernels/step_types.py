@@ -74,7 +74,7 @@ class TaskCode:
     views: Mapping[Any, wp.Function]  # ``Kernels.views``
     copy_state: wp.Function  # copies the fields that change in a step
     observe_group: wp.Function
-    finite_group: wp.Function
+    valid_group: wp.Function
     copy_observations: wp.Function
     finite_memory: wp.Function
     valid_model: wp.Function  # whether the model fields that the task writes are valid

@@ -28,7 +28,7 @@ def judge_kernels(task: TaskCode) -> None:
     """Make the kernels that compute rewards, ends of episodes, metrics and observations."""
     Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
     view, finite_memory = task.view, task.finite_memory
-    finite_group, copy_observations = task.finite_group, task.copy_observations
+    valid_group, copy_observations = task.valid_group, task.copy_observations
     reward, measure, evaluate, terminated, truncated, success = (
         task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "truncated", "success")
     )
@@ -101,7 +101,7 @@ def judge_kernels(task: TaskCode) -> None:
                             found_out.reward[w] = score(view(before, w), action_in[w], s1, p, weights, metrics_out[w])
                         else:
                             found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
-                        if not wp.isfinite(found_out.reward[w]):
+                        if faults.is_out_of_range(found_out.reward[w]):
                             found = REWARD
                 elif part == METRICS:
                     if wp.static(has_measure and not has_score):
@@ -112,7 +112,7 @@ def judge_kernels(task: TaskCode) -> None:
                 else:
                     group = part - OBSERVE_FIRST
                     observe(group, s1, p, obs_out, w, counters)
-                    if not finite_group(group, obs_out, w):
+                    if not valid_group(group, obs_out, w):
                         found = OBSERVATION
             found_out.fault[part, w] = found
 
@@ -209,47 +209,47 @@ def judge_kernels(task: TaskCode) -> None:
         params: wp.array[Params],
         counters: Counters,
         good_in: Observations,
-        finite_out: wp.array2d[bool],
+        valid_out: wp.array2d[bool],
         obs_out: Observations,
         parts: int,
         first: int,
     ):
-        """Observe each world whose mask is set, and mark finite observation groups; launched over (parts, nworld).
+        """Observe each world whose mask is set, and mark valid observation groups; launched over (parts, nworld).
 
-        If ``parts`` is 1, this kernel also replaces observations that are not finite. Otherwise,
+        If ``parts`` is 1, this kernel also replaces observations that are not valid. Otherwise,
         ``replace_observations`` must be launched next.
         """
         start, k = wp.tid()
         w = first + k
         if mask_in[w]:
-            finite = bool(True)
-            for group in range(start, finite_out.shape[0], parts):
+            valid = bool(True)
+            for group in range(start, valid_out.shape[0], parts):
                 observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
-                finite_out[group, w] = finite_group(group, obs_out, w)
-                finite = finite and finite_out[group, w]
-            if parts == 1 and not finite:
+                valid_out[group, w] = valid_group(group, obs_out, w)
+                valid = valid and valid_out[group, w]
+            if parts == 1 and not valid:
                 copy_observations(good_in, obs_out, w, 0, 1)
 
     @task.kernel()
     def replace_observations(
         mask_in: wp.array[bool],
-        finite_in: wp.array2d[bool],
+        valid_in: wp.array2d[bool],
         good_in: Observations,
         obs_inout: Observations,
         lanes: int,
         first: int,
     ):
-        """Replace observations that are not finite by the last good ones; launched over (nworld, lanes).
+        """Replace observations that are not valid by the last good ones; launched over (nworld, lanes).
 
         The next step reports the fault.
         """
         k, lane = wp.tid()
         w = first + k
         if mask_in[w]:
-            finite = bool(True)
-            for group in range(finite_in.shape[0]):
-                finite = finite and finite_in[group, w]
-            if not finite:
+            valid = bool(True)
+            for group in range(valid_in.shape[0]):
+                valid = valid and valid_in[group, w]
+            if not valid:
                 copy_observations(good_in, obs_inout, w, lane, lanes)
 
     @task.kernel_for("measure")

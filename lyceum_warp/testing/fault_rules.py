@@ -90,28 +90,33 @@ def check_bad_warmstart(ctx: Context) -> None:
 
 
 def check_not_finite(ctx: Context) -> None:
-    """A reward or an observation that is not finite is a fault, and changes no other world."""
-    a, b, bad = ctx.a, ctx.b, ctx.a.nworld // 2
-    others, actions = ~ctx.mask(bad), ctx.actions(2)
+    """A reward or an observation that is not finite or too large is a fault, and changes no other world.
+
+    Each parameter becomes infinite in one world, and 1e30 in another.
+    """
+    a, b, extremes = ctx.a, ctx.b, {ctx.a.nworld // 2: np.inf, 0: 1e30}
+    others, actions = ~ctx.mask(*extremes), ctx.actions(2)
     params = {name: value for name, value in a.task.params.items() if name not in ("dt", "substep_dt")}
     names = [name for name, value in params.items() if isinstance(value, float) and np.isfinite(value)]
     with ctx.changed(a, b, graphs=False):  # graphs would be captured again for each of these parameters
         for name in names:
             kept = a.task.params[name]
             ctx.restart()
-            a.set_params(**{name: np.where(np.arange(a.nworld) == bad, np.inf, kept)})
+            a.set_params(**{name: np.array([extremes.get(world, kept) for world in range(a.nworld)])})
             try:
                 for i, action in enumerate(actions):
-                    good = a.obs[bad].clone()
+                    good = a.obs.clone()
                     a.step(action)
                     b.step(action)
-                    what = f"with {name}=inf in world {bad}, step {i}"
-                    if int(a.done_reason[bad]) & int(Done.REWARD | Done.OBSERVATION):
-                        ctx.that(a.truncated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad]} {what}")
-                        ctx.equal(a.final_obs[bad], good, f"final_obs against the last good observation {what}")
-                        ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
-                    for key in ("reward", "obs", "final_obs"):
-                        ctx.that(torch.isfinite(getattr(a, key)).all(), f"{key} is not finite {what}")
-                    ctx.same_worlds(others, f"other worlds {what}")
+                    for bad, value in extremes.items():
+                        what = f"with {name}={value:g} in world {bad}, step {i}"
+                        if int(a.done_reason[bad]) & int(Done.REWARD | Done.OBSERVATION):
+                            ctx.that(a.truncated[bad] and a.reward[bad] == 0, f"the reward is {a.reward[bad]} {what}")
+                            ctx.equal(a.final_obs[bad], good[bad], f"final_obs against the last good one {what}")
+                            ctx.that(a.time[bad] == 0, f"the world was not reset {what}")
+                        for key in ("reward", "obs", "final_obs"):
+                            extreme = getattr(a, key)[bad].abs().max()
+                            ctx.that(extreme < 1e10, f"{key} is {extreme} {what}")
+                    ctx.same_worlds(others, f"other worlds with extreme {name}, step {i}")
             finally:
                 a.set_params(**{name: kept})

@@ -1,5 +1,7 @@
 import copy
 import dataclasses
+import math
+import re
 from typing import Any
 
 import pytest
@@ -149,6 +151,21 @@ def test_invalid_ppo_arguments_raise_an_error(env: lw.Env) -> None:
         made(env, seed=-1)
 
 
-def test_non_finite_update_ends_learning(env: lw.Env) -> None:
-    with pytest.raises(FloatingPointError, match="the update of iteration 1 is not finite: make learning_rate, or the"):
-        next(made(env, learning_rate=1e30, schedule="fixed"))
+def test_non_finite_update_ends_learning_and_names_the_largest_samples(env: lw.Env) -> None:
+    ppo = made(env, learning_rate=1e30, schedule="fixed")
+    with pytest.raises(FloatingPointError) as raised:
+        next(ppo)
+    message, rollout = str(raised.value), ppo.rollout
+    for name, rows in (("reward", rollout.reward), ("observation", rollout.obs[..., 0])):
+        t, world = divmod(int(rows.abs().argmax()), 4)
+        found = re.search(rf"largest {name} is (\S+) .*?in step (\d+) of world (\d+)", message)
+        assert found is not None and float(found[1]) == pytest.approx(rows[t, world].item(), rel=1e-4)
+        assert (int(found[2]), int(found[3])) == (t + 1, world)
+
+
+def test_ppo_learns_from_the_largest_rewards_that_are_no_faults(env: lw.Env) -> None:
+    ppo = made(env)
+    estimate = ppo._estimate
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(ppo, "_estimate", lambda reward, *rest: estimate(reward.sign() * 9e9, *rest))
+        assert all(math.isfinite(next(ppo).value_loss) for _ in range(3))

@@ -32,13 +32,20 @@ class Params:
     remembered: float = 1.0
     lasting: float = 1.0
     damping: float = 1.0
+    reward: float = 1.0
+    seen: float = 1.0
     box: int = lw.body("box")
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
     obs[0] = s.qpos[0]
-    obs[1] = s.body_mass[p.box]
+    obs[1] = s.body_mass[p.box] * p.seen
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    return p.reward
 
 
 @wp.func
@@ -112,6 +119,20 @@ def test_non_finite_memory_causes_a_fault_in_its_world(name: str, engine: str) -
     columns = env.state_space.parts["steps"]
     assert env.get_state()[:, columns].flatten().tolist() == [2.0, 1.0 if name == "lasting" else 2.0, 2.0]
     env.set_state(env.get_state())
+
+
+@ENGINES
+@pytest.mark.parametrize("extreme", [2e10, -1e30, float("inf")])
+def test_rewards_and_observations_beyond_1e10_are_faults_of_their_world(extreme: float, engine: str) -> None:
+    env = lw.make(Faulty, nworld=4, engine=engine, reward=[1.0, extreme, 1.0, 9e9], seen=[1.0] * 4)
+    good = env.obs.clone()
+    env.set_params(seen=[1.0, 1.0, extreme, 1e9])
+    env.step()
+    assert [lw.Done(reason) for reason in env.done_reason.tolist()] == [0, lw.Done.REWARD, lw.Done.OBSERVATION, 0]
+    assert env.reward.tolist() == pytest.approx([1.0, 0.0, 0.0, 9e9])
+    assert torch.equal(env.final_obs[1:3], good[1:3]) and env.truncated.tolist() == [False, True, True, False]
+    assert env.fault_counts["reward"] == env.fault_counts["observation"] == 1
+    assert env.obs.abs().max() < 1e10  # even if the first observation of an episode is too large
 
 
 @ENGINES
