@@ -79,13 +79,25 @@ def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -
 
 LIMIT = 10.0
 
+_OUTLIER = 100.0
+"""Limit of observations in updates of a normaliser, in standard deviations from the mean of all earlier observations.
+Values rarer than 1 in 10,000 (the square) thus hardly change the standard deviation; more frequent values do."""
+
+_PRIOR = 1000
+"""The limit assumes that this many observations with a standard deviation of 1 preceded the first one. Episodes start
+with small velocities, for example, and the larger velocities of later steps are no outliers."""
+
+_TRIMMED = 0.01
+"""Fraction of the first batch, at each end of a part's values, that may be outliers."""
+
 _Applied: TypeAlias = tuple[torch.Tensor, torch.Tensor]
 
 
 class Normalizer(nn.Module):
     """Normalises observations by their running mean and variance, and clips them to [-limit, limit].
 
-    Before the first update, observations are not scaled.
+    Before the first update, observations are not scaled. Outliers, such as the absurd observation of a single world,
+    hardly change mean and variance (see ``_OUTLIER``).
     """
 
     count: torch.Tensor
@@ -102,6 +114,7 @@ class Normalizer(nn.Module):
         self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("shift", torch.zeros(size))
         self.register_buffer("scale", torch.ones(size))
+        self._seen: int | None = None  # ``count`` on the host, because reading a GPU's number waits for the device
 
     @torch.no_grad()
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
@@ -112,6 +125,10 @@ class Normalizer(nn.Module):
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
         n = obs.shape[0] * team.size
+        if self._seen is None:
+            self._seen = int(self.count)
+        obs = obs.clamp(*self._bounds(obs, team))
+        self._seen += n
         mean = team.sum(obs.sum(0)) / n
         square = team.sum((obs - mean).square().sum(0))
         total, delta = self.count + n, mean - self.mean
@@ -120,6 +137,21 @@ class Normalizer(nn.Module):
         self.count.copy_(total)
         self.shift.copy_(self.mean)
         self.scale.copy_(((self.square / total).sqrt() + eps).clamp_min(1e-4).reciprocal())
+
+    def _bounds(self, obs: torch.Tensor, team: Team) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the limits of observations in an update from earlier observations, or else from trimmed ranges."""
+        mean, square, count = self.mean, self.square, self._seen
+        if not count:
+            ordered, count = obs.sort(0).values, len(obs)
+            trimmed = min(max(1, int(_TRIMMED * count)), (count - 1) // 2)
+            low, high = (team.sum(ordered[i].clone()) / team.size for i in (trimmed, count - 1 - trimmed))
+            mean, square = (low + high) / 2.0, count * ((high - low) / 4.0).square()
+        reach = _OUTLIER * ((square + _PRIOR) * (1.0 / (count + _PRIOR))).sqrt()
+        return mean - reach, mean + reach
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        super()._load_from_state_dict(*args)
+        self._seen = None
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:

@@ -39,3 +39,58 @@ def test_normalizer_has_the_mean_and_variance_over_all_batches() -> None:
     normalized = normalizer(obs)
     torch.testing.assert_close(normalized.mean(0), torch.zeros(4), atol=1e-3, rtol=0)
     torch.testing.assert_close(normalized.std(0), torch.ones(4), atol=1e-2, rtol=0)
+
+
+def test_normalizer_clips_no_ordinary_observations() -> None:
+    """The columns have a large mean, a tiny scale, and values that are constant or small at first."""
+    generator = torch.Generator().manual_seed(0)
+    obs = torch.randn(300, 64, 4, generator=generator).double() * torch.tensor([1.0, 1e-6, 5.0, 20.0])
+    obs[..., 0] += 1e6
+    obs[:100, :, 2] = 0.0
+    obs[:5, :, 3] *= 1e-4
+    normalizer = Normalizer(4)
+    for batch in obs:
+        normalizer.update(batch)
+    torch.testing.assert_close(normalizer.mean, obs.mean((0, 1)), rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close((normalizer.square / normalizer.count).sqrt(), obs.std((0, 1), correction=0))
+
+
+@pytest.mark.parametrize("extreme", [1e6, -9e9])
+@pytest.mark.parametrize("batch", [8, 64, 20_000])
+def test_rare_extreme_observations_hardly_change_the_scale(batch: int, extreme: float) -> None:
+    """One of 20,000 observations is extreme, the second one and four more."""
+    obs = torch.randn(100_000, 1, generator=torch.Generator().manual_seed(0)).double()
+    plain, disturbed = Normalizer(1), Normalizer(1)
+    spoilt = obs.clone()
+    spoilt[1::20_000] = extreme
+    for part, other in zip(obs[:20_000].split(batch), spoilt[:20_000].split(batch), strict=True):
+        plain.update(part), disturbed.update(other)
+    for part, other in zip(obs[20_000:].split(20_000), spoilt[20_000:].split(20_000), strict=True):
+        plain.update(part), disturbed.update(other)
+    assert 0.5 < disturbed.scale / plain.scale < 1.0 and (disturbed.shift - plain.shift).abs() < 0.02
+
+
+def test_normalizer_follows_frequent_observations_of_any_scale() -> None:
+    """A column that was constant becomes large in one of 64 worlds."""
+    normalizer, obs = Normalizer(1), torch.zeros(64, 1)
+    for _ in range(100):
+        normalizer.update(obs)
+    obs[0] = 1e6
+    for _ in range(300):
+        normalizer.update(obs)
+    assert 1.0 / normalizer.scale.item() == pytest.approx(1e6 / 8.0, rel=0.2)
+
+
+def test_resumed_normalizer_equals_an_uninterrupted_one() -> None:
+    obs = torch.randn(4, 64, 2, generator=torch.Generator().manual_seed(0))
+    obs[:, 0] = 1e6
+    one, other = Normalizer(2), Normalizer(2)
+    one.update(obs[0])
+    other.update(100.0 * obs[1])
+    other.load_state_dict(one.state_dict())
+    for part in obs[2:]:
+        one.update(part), other.update(part)
+    assert torch.equal(one.scale, other.scale) and torch.equal(one.shift, other.shift)
+    other.load_state_dict(Normalizer(2).state_dict())
+    other.update(obs[0] + 1e9)  # the first batch of an empty normaliser
+    assert other.shift.min() > 9e8
