@@ -27,7 +27,9 @@ class PlanSamples:
     returns: torch.Tensor
     """The samples' returns, (plants, samples); minus infinity for failed samples."""
     weights: torch.Tensor
-    """The samples' weights, (plants, samples), written by ``weigh``. The weights for each plant sum to 1."""
+    """The samples' weights, (plants, samples), written by ``weigh``. They must not be negative, must be 0 for failed
+    samples, and must sum to 1 for each plant. If all samples of a plant failed, the planner ignores the weights, and
+    its plan and its noise do not change."""
     actions: torch.Tensor
     """The samples' actions, (rows, plants, samples, nact)."""
     nominal: torch.Tensor
@@ -41,7 +43,7 @@ class PlanSamples:
     """Standard deviations of the noise for the next planning iteration, written by ``fit``."""
     summary: torch.Tensor
     """Best return, mean return, effective sample size and number of failed samples, (plants, 4). If ``capturable`` is
-    set, ``weigh`` must write this tensor. If the best return is minus infinity, the plan does not change."""
+    set, ``weigh`` must write this tensor."""
 
 
 @document_attributes

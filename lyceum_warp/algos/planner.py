@@ -268,6 +268,7 @@ class Planner:
             self._terminal, self._world_return = (wp.zeros(nworld, dtype=float) for _ in range(2))
             self._weight: Any = wp.zeros(self._nsample, dtype=float)
             self._summary: Any = wp.zeros((plants, 4), dtype=float)
+            self._valid, self._problem = wp.zeros(plants, dtype=bool), wp.zeros(plants, dtype=int)
             self._seed, self._count, self._shift, self._phase = (wp.zeros(plants, dtype=int) for _ in range(4))
             shape = (self.horizon, plants, nact)
             self._actions, self._nominal_actions = (wp.zeros(shape, dtype=float) for _ in range(2))
@@ -311,6 +312,10 @@ class Planner:
         )
         self._action = self.actions[0]
         self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
+        self._problems = torch_view(self._problem)
+        if self._problems.is_cuda:
+            self._copied_problems = torch.zeros(plants, dtype=torch.int32, pin_memory=True)
+            self._copied = torch.cuda.Event()
 
     def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
         return rows.squeeze(axis) if self.plants == 1 else rows
@@ -329,7 +334,9 @@ class Planner:
             The action to apply now, on the state's device: (nu,), or (plants, nu) with several plants.
 
         Raises:
-            ValueError: The state has the wrong shape or type, or is not finite.
+            ValueError: The state has the wrong shape or type, or is not finite. Or a custom update wrote invalid
+                weights or numbers that are not finite; the plan does not change then. With states on a GPU, a later
+                call raises this error, because no call waits for the GPU.
         """
         self.env.check_process()
         self._loop.state.copy_(self._checked(state))
@@ -337,10 +344,7 @@ class Planner:
         for call in self._calls:
             call()
         action = self._action.to(state.device, copy=True)
-        # after a copy to the CPU, reading the summary does not wait for the device
-        if action.device.type == "cpu" and not self._warned and (self._summary.numpy()[:, 0] == -np.inf).any():
-            self._warned = True
-            self._warn_of_failed_samples()
+        self._report_problems(waited=action.device.type == "cpu")
         return action
 
     def _checked(self, state: torch.Tensor) -> torch.Tensor:
@@ -372,6 +376,42 @@ class Planner:
             raise ValueError(f"{which} has {values[where]} in its {part!r}: pass finite states to the planner")
         return state
 
+    def _report_problems(self, *, waited: bool) -> None:
+        """Report the problems of plans; without waiting for a GPU, those of earlier calls."""
+        problems = self._problems
+        if waited or not problems.is_cuda:
+            bits = problems.to("cpu", copy=True)
+        elif self._copied.query():
+            bits = self._copied_problems.clone()
+            self._copied_problems.copy_(problems, non_blocking=True)
+            self._copied.record(torch.cuda.current_stream(problems.device))
+        else:
+            return
+        if not bits.any():
+            return
+        problems.zero_()
+        if (bits & (planning.BAD_WEIGHTS | planning.BAD_FIT)).any():
+            self._refuse_update(bits)
+        if not self._warned:
+            self._warned = True
+            self._warn_of_failed_samples()
+
+    def _refuse_update(self, bits: torch.Tensor) -> None:
+        name, plant = type(self._update).__name__, int(bits.argmax())
+        of = "" if self.plants == 1 else f" of plant {plant}"
+        if not bits[plant] & planning.BAD_WEIGHTS:
+            raise ValueError(f"fit of {name} wrote a plan or a deviation{of} that is not finite")
+        weights, returns = self._arrays.weights[plant].cpu(), self._arrays.returns[plant].cpu()
+        wrong = torch.where(returns > -torch.inf, ~((weights >= 0.0) & (weights < torch.inf)), weights != 0.0)
+        reason = f"their sum{of} is {weights.sum():.6g}"
+        if wrong.any():
+            sample = int(wrong.nonzero()[0])
+            failed = "" if returns[sample] > -torch.inf else ", which failed,"
+            reason = f"the weight of sample {sample}{of}{failed} is {weights[sample]:.6g}"
+        raise ValueError(
+            f"weigh of {name} must write weights that are not negative, sum to 1 and are 0 for failed samples: {reason}"
+        )
+
     def _warn_of_failed_samples(self) -> None:
         faults = Done(int(np.bitwise_or.reduce(self._loop.fault.cpu().numpy())))
         substep, frame_skip = self.env.model.opt.timestep, self.env.task.frame_skip
@@ -397,7 +437,7 @@ class Planner:
         else:
             parts += [
                 Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples),
-                self._fit_in_torch,
+                self._fit,
             ]  # fmt: skip
         # combine phases into as few graphs as possible; functions that use torch run between the graphs
         calls: list[Any] = []
@@ -457,12 +497,21 @@ class Planner:
         self._update.weigh(self._arrays)
 
     def _average_samples(self) -> None:
-        plan = [self._weight, self._samples, self._nominal, self._summary, self._plan]
+        launch_blocks(planning.check_weights, self.plants, [self._return, self._weight, self._valid, self._problem])
+        plan = [self._weight, self._samples, self._nominal, self._valid, self._plan]
         launch_blocks(planning.average, self._plan.size, plan)
 
     def _average(self) -> None:
         self._average_samples()
+        self._fit()
+
+    def _fit(self) -> None:
         self._update.fit(self._arrays)
+        if isinstance(self.config.update, PlanUpdate):
+            for before, after in ((self._nominal, self._plan), (self._nominal_deviation, self._deviation)):
+                if after is not None:
+                    args = [self._valid, before, self._problem, after]
+                    wp.launch(planning.undo_bad_fit, after.shape, args, device=self.env.device)
         self._interpolate(self._plan, self._actions)
 
     def _weigh_in_torch(self) -> None:
@@ -477,10 +526,6 @@ class Planner:
         effective = 1 / arrays.weights.square().sum(1)
         columns = arrays.returns.amax(1), earned, effective, (~good).sum(1).float()
         torch.stack(columns, 1, out=arrays.summary)
-
-    def _fit_in_torch(self) -> None:
-        self._update.fit(self._arrays)
-        self._interpolate(self._plan, self._actions)
 
     def _evaluate(self) -> None:
         self._terminal_view.copy_(self._torch_values())

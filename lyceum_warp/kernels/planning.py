@@ -16,6 +16,9 @@ NOISE = wp.constant(-2)
 DRAWS = wp.constant(-3)
 """Replaces the episode number in the stream keys of the samples."""
 
+ALL_FAILED, BAD_WEIGHTS, BAD_FIT = 1, 2, 4
+"""Bits of a plan's problems: all samples failed; invalid weights; numbers of ``PlanUpdate.fit`` that are not finite."""
+
 _TILES = f"{__name__}.tiles"
 """The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,
 which holds the address of the tiles. Therefore ``graphs.capture`` serialises these kernels."""
@@ -347,6 +350,58 @@ def weigh_elites(
 
 
 @wp.kernel(enable_backward=False, module=_TILES)
+def check_weights(
+    return_in: wp.array[float],
+    weight_in: wp.array[float],
+    valid_out: wp.array[bool],
+    problem_inout: wp.array[int],
+):
+    """Check the weights of each plant's samples; launched with one block for each plant.
+
+    Weights are valid if they are finite, not negative, 0 for failed samples, and sum to 1.
+    """
+    p, lane = wp.tid()
+    n = return_in.shape[0] // valid_out.shape[0]
+    total, wrong, good = float(0.0), float(0.0), float(0.0)
+    for k in range(p * n + lane, (p + 1) * n, wp.block_dim()):
+        weight = weight_in[k]
+        total += weight
+        if return_in[k] > -wp.inf:
+            good += 1.0
+            if not (weight >= 0.0):
+                wrong += 1.0
+        elif weight != 0.0:
+            wrong += 1.0
+    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    wrong = wp.tile_extract(wp.tile_sum(wp.tile(wrong)), 0)
+    good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
+    if lane == 0:
+        valid = good > 0.0 and wrong == 0.0 and wp.abs(total - 1.0) < 1.0e-3
+        valid_out[p] = valid
+        if not valid:
+            problem_inout[p] = problem_inout[p] | wp.where(good > 0.0, BAD_WEIGHTS, ALL_FAILED)
+
+
+@wp.kernel(enable_backward=False)
+def undo_bad_fit(
+    valid_in: wp.array[bool],
+    before_in: wp.array3d[float],
+    problem_inout: wp.array[int],
+    after_inout: wp.array3d[float],
+):
+    """Undo changes that are not finite, and all changes for plants without valid weights.
+
+    Launched over (horizon or knots, nplant, nact).
+    """
+    t, p, i = wp.tid()
+    if not valid_in[p]:
+        after_inout[t, p, i] = before_in[t, p, i]
+    elif not wp.isfinite(after_inout[t, p, i]):
+        after_inout[t, p, i] = before_in[t, p, i]
+        problem_inout[p] = problem_inout[p] | BAD_FIT
+
+
+@wp.kernel(enable_backward=False, module=_TILES)
 def fit_deviation(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],
@@ -385,12 +440,12 @@ def average(
     weight_in: wp.array[float],
     action_in: wp.array3d[float],
     nominal_in: wp.array3d[float],
-    summary_in: wp.array2d[float],
+    valid_in: wp.array[bool],
     plan_out: wp.array3d[float],
 ):
     """Average the samples' actions by their weights; launched with one block for each element of the plans.
 
-    If all samples failed, the plan does not change.
+    Without valid weights, the plan does not change.
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
@@ -403,7 +458,7 @@ def average(
         total += weight_in[k] * action_in[t, k, i]
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:
-        plan_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, total, nominal_in[t, p, i])
+        plan_out[t, p, i] = wp.where(valid_in[p], total, nominal_in[t, p, i])
 
 
 def value_kernel(value: wp.Function) -> wp.Kernel:

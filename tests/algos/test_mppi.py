@@ -204,9 +204,9 @@ def test_sample_counts_as_failed_if_it_fails_in_one_model() -> None:
     assert torch.isfinite(plan.model_returns[:, 0]).all()
 
 
-@pytest.mark.quick("reward-mujoco", "physics-warp", "value-mujoco")
+@pytest.mark.quick("reward-mujoco", "large reward-mujoco", "physics-warp", "value-mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("how", ["reward", "physics", "value"])
+@pytest.mark.parametrize("how", ["reward", "large reward", "physics", "value"])
 def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     settings: dict[str, Any] = dict(horizon=4, samples=40, smoothing=(1, 0, 0), temperature=1.0, engine=engine)
     if how == "physics":
@@ -215,14 +215,14 @@ def test_failed_samples_have_no_weight(how: str, engine: str) -> None:
     elif how == "value":
         settings |= dict(noise=1.0, limit=1e9, value=lambda obs: torch.where(obs[:, 0] > 0, torch.nan, 1.0))
     else:
-        settings |= dict(noise=0.3)
+        settings |= dict(noise=0.3, wrong=2e10 if how == "large reward" else np.inf)
     plan = MPPI(Picky, **settings)
     for _ in range(4):
         state = plan.state_of()
         plan(state)
         bad = torch.isinf(plan.returns)
         assert 0 < bad.sum() < 40, "all or none failed: nothing was tested"
-        if how == "reward":
+        if "reward" in how:
             assert torch.equal(bad, (plan.sampled > 0.5).any(0).any(-1))
         good = plan.sampled[:, ~bad].double()
         weights = torch.softmax(plan.returns[~bad].double(), 0)

@@ -3,6 +3,7 @@ from typing import Any
 import pytest
 import torch
 import warp as wp
+from rail_task import Picky
 from test_gpu import CUDA, nothing_waits
 from varied_task import Varied
 
@@ -133,6 +134,32 @@ def test_plans_allocate_nothing_and_do_not_wait_for_the_device(planner: str) -> 
         for _ in range(50):
             plan(state)
     assert (torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(CUDA)) == memory
+
+
+class NegativeWeights(lw.PlanUpdate):
+    def weigh(self, samples: lw.PlanSamples) -> None:
+        samples.weights.fill_(-1.0)
+
+
+def test_problems_of_plans_are_reported_without_waiting_for_the_device(caplog: pytest.LogCaptureFixture) -> None:
+    words: dict[str, Any] = dict(device=CUDA, engine="warp", horizon=4, samples=16)
+    failing = lw.MPPI(Picky, limit=-10.0, **words)
+    wrong = lw.Planner(Picky, update=NegativeWeights(), **words)
+    state = failing.state_of()
+    for _ in range(3):
+        failing(state)
+    with nothing_waits():
+        failing(state)
+    torch.cuda.synchronize()
+    for _ in range(3):
+        failing(state)
+    (message,) = caplog.messages
+    assert message.startswith("all 16 samples of a plan of picky failed")
+    with pytest.raises(ValueError, match="^weigh of NegativeWeights must .*: the weight of sample 0 is -1$"):
+        for _ in range(3):
+            wrong(state)
+            torch.cuda.synchronize()
+    assert not wrong.actions.any()
 
 
 @pytest.mark.parametrize("risk", ["mean", "worst"])
