@@ -38,7 +38,10 @@ def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
 
 @wp.func
 def draw_delay(delay: Row[float], least: int, most: int, rng: Row[wp.uint32]):
-    """Draw the delay of ``delayed_action``: a whole number of steps from ``least`` to ``most``."""
+    """Draw the delay of ``delayed_action``: a whole number of steps from ``least`` to ``most``.
+
+    The history of actions must hold at least ``most`` values.
+    """
     delay[0] = float(uniform_int(rng, least, most))
 
 

@@ -1,6 +1,6 @@
 """Store the last values of a row in a ring buffer, for observation histories and delays.
 
-To store the last n values of ``width`` numbers, declare ``history: Row[float] = lw.memory(1 + n * width)``.
+To store the last n values of ``width`` numbers, declare ``past_values: Row[float] = lw.memory(1 + n * width)``.
 """
 
 import warp as wp
@@ -55,9 +55,12 @@ def delayed_action(action: Row[float], history: Row[float], delay: Row[float], i
     """Get element i of the action that was chosen ``delay`` steps ago; call this in ``control``.
 
     In the first ``delay`` steps of an episode, this function uses the episode's first action. ``advance`` must append
-    every action: ``terms.push_history(s1.history, action)``.
+    every action: ``terms.push_history(s1.past_actions, action)``. If the delay is longer than the history or negative,
+    the result is NaN, which is a fault of the world.
     """
     age = int(delay[0])
+    if age < 0 or age > history_length(history, action.shape[0]):
+        return wp.nan
     if age == 0 or history[0] == 0.0:
         return action[i]
     return read_history(history, action.shape[0], age - 1, i)
