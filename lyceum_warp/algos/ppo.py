@@ -8,6 +8,7 @@ clipped value loss, a learning rate adapted to the KL divergence, and the same m
 import collections
 import copy
 import dataclasses
+import logging
 import math
 from typing import Any
 
@@ -26,6 +27,8 @@ from lyceum_warp.algos.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.value import ValueFunction
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
+
+log = logging.getLogger(__name__)
 
 RECENT = 100
 
@@ -109,6 +112,11 @@ class PPO(OnPolicyLearner):
                 f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
                 "worlds or fewer mini-batches"
             )
+        if (rest := count % config.minibatches) and team.leads:
+            log.warning(
+                "%d mini-batches of equal size hold only %d of %d samples: make the number of mini-batches divide %d",
+                config.minibatches, count - rest, count, count,
+            )  # fmt: skip
         # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
         limit = math.inf if config.normalize else LIMIT
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)

@@ -151,6 +151,15 @@ def test_invalid_ppo_arguments_raise_an_error(env: lw.Env) -> None:
         made(env, seed=-1)
 
 
+def test_mini_batches_that_leave_out_samples_print_a_warning(env: lw.Env, caplog: pytest.LogCaptureFixture) -> None:
+    made(env, minibatches=4)
+    assert not caplog.messages
+    made(env, minibatches=7)
+    assert caplog.messages == [
+        "7 mini-batches of equal size hold only 42 of 48 samples: make the number of mini-batches divide 48"
+    ]
+
+
 def test_non_finite_update_ends_learning_and_names_the_largest_samples(env: lw.Env) -> None:
     ppo = made(env, learning_rate=1e30, schedule="fixed")
     with pytest.raises(FloatingPointError) as raised:
