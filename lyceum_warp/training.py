@@ -88,7 +88,8 @@ def train(
         callback: Function that is called with each iteration, after the iteration's row was written. Training ends if
             it returns True. If it raises an error, the run is saved and the error is raised again.
         target_return: Training ends when the return that selects the best policy reaches this number.
-        minutes: Training ends after the iteration that exceeds this time limit.
+        minutes: Time limit. Training ends before an iteration that would exceed it if the iteration took as long as the
+            longest one so far, not counting the first one, which may compile kernels. The first iteration always runs.
         keep_every: Iterations between policies that are saved in numbered files, or 0 for none.
         save_every: Iterations between saves, or 0 to save by time.
         tensorboard: Whether to write the metrics for TensorBoard, too.
@@ -207,12 +208,13 @@ def _learn(
     limit: float,
 ) -> None:  # fmt: skip
     """Iterate until the target return, the last iteration or the time limit. All ranks stop together."""
-    team, run, deadline = learner.team, saver.run, time.monotonic() + limit
-    ended = False
+    team, run, deadline, first = learner.team, saver.run, time.monotonic() + limit, learner.iteration + 1
+    ended, longest = False, 0.0
     with postponed(insist=team.size == 1) as noted:
         if saver.saved != learner.iteration:
             saver.save()
         while learner.iteration < iterations and not ended:
+            begin = time.monotonic()
             iteration, error = next(learner), None
             with team.together():
                 if run is not None:
@@ -225,7 +227,9 @@ def _learn(
                     ended = function(iteration) is True or ended
             except Exception as raised:
                 error = raised
-            ended = ended or error is not None or learner.iteration >= iterations or time.monotonic() >= deadline
+            now = time.monotonic()
+            longest = now - begin if learner.iteration <= first + 1 else max(longest, now - begin)
+            ended = ended or error is not None or learner.iteration >= iterations or now + longest > deadline
             numbers = max(noted, default=0), ended, error is not None, saver.due()
             signal, last, failed, due = team.largest(*map(int, numbers))
             if signal or last or due:

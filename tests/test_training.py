@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -167,6 +168,24 @@ def test_training_ends_after_the_given_minutes(tmp_path: Path, capsys: pytest.Ca
     with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
         lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
     assert not (tmp_path / "other").exists()
+
+
+def test_training_ends_before_the_iteration_that_would_exceed_the_minutes(
+    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first iteration takes 30 s, for example to compile kernels, the second 20 s, and all others 10 s."""
+    clock = [0.0]
+    monkeypatch.setattr("lyceum_warp.training.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    learner, ends = algorithm(env), []
+    for minutes in (0.01, 75 / 60, 95 / 60):
+        clock[0], first = 0.0, learner.iteration
+
+        def pass_time(it: lw.Iteration, first: int = first) -> None:
+            clock[0] += {1: 30.0, 2: 20.0}.get(it.iteration - first, 10.0)
+
+        lw.train(learner, tmp_path / f"{minutes}", iterations=100, minutes=minutes, callback=pass_time)
+        ends.append((learner.iteration - first, clock[0]))
+    assert ends == [(1, 30.0), (3, 60.0), (5, 80.0)]
 
 
 def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:

@@ -133,7 +133,8 @@ class Train:
     sampled episodes is used instead.
     """
     minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
-    """Time limit in minutes. Training ends after the iteration that exceeds the limit. --resume continues the run."""
+    """Time limit in minutes. Training ends before an iteration that would probably exceed the limit, judged by the
+    longest iteration so far. The first iteration always runs. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
