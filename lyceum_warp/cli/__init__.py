@@ -56,6 +56,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0 on success, 2 for bad input, 130 after Ctrl-C, and 143 after SIGTERM. The code 1 means that
         ``check`` found a broken rule, or that the return did not exceed --require-return.
     """
+    # on busy cores, OpenMP threads that spin at barriers slow updates by an order of magnitude; OpenMP reads the
+    # variable when torch is imported
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     argv = list(sys.argv[1:] if argv is None else argv)
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")

@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 
@@ -42,6 +43,16 @@ def test_help_all_describes_more_options_than_help(
     for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99, sac)", "sac 0.0003)", "(ppo 24, sac)"):
         assert words in " ".join(everything.split())
     assert "hyperparameter options: --samples" in help_of(["train", "-h"], capsys)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="torch uses GNU's OpenMP on Linux only")
+def test_openmp_threads_of_a_command_do_not_spin() -> None:
+    """Spinning threads multiply the time of updates on busy cores."""
+    command = [sys.executable, "-m", "lyceum_warp.cli", "train", "hopper", "--iterations", "0"]
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment["OMP_DISPLAY_ENV"] = "VERBOSE"
+    shown = subprocess.run(command, env=environment, capture_output=True, text=True).stderr
+    assert "GOMP_SPINCOUNT = '0'" in shown
 
 
 @pytest.mark.parametrize("words, message", [
