@@ -124,12 +124,13 @@ class Judge:
 
     def __call__(self, policy: lw.GaussianPolicy) -> float:
         policy, out = moved(policy, self.env), torch.empty_like(self.env.action)
-        generator = torch.Generator(out.device).manual_seed(0)
 
         def noisy(obs: torch.Tensor) -> torch.Tensor:
-            return policy.sample(obs, torch.randn(out.shape, generator=generator, device=out.device), out)
+            return policy.sample(obs, torch.randn(out.shape, device=out.device), out)
 
-        return lw.evaluate(self.env, noisy, self.env.nworld, seed=0).returns.mean().item()
+        with torch.random.fork_rng([out.device] if out.is_cuda else []):
+            torch.manual_seed(0)
+            return lw.evaluate(self.env, noisy, self.env.nworld, seed=0).returns.mean().item()
 
 
 # tables and figure

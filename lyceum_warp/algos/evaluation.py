@@ -14,7 +14,7 @@ from lyceum_warp.curriculum import Curriculum, start_episodes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, described, whole_number
+from lyceum_warp.support.validate import check_kind, described, memoryless_action, whole_number
 
 _MEAN_SEED = 2**31 - 1
 _MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")
@@ -95,8 +95,8 @@ def evaluate(
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, or the policy or the
-            curriculum does not fit the environment.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, the policy has memory, or
+            the policy or the curriculum does not fit the environment.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -156,7 +156,7 @@ def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.
 
 def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
     try:
-        action = act(env.obs)
+        action = memoryless_action(act, env.obs)
     except RuntimeError as error:
         sizes = f"{described(env.obs)}, of the task {env.task.name!r}"
         raise ValueError(f"policy cannot take the observations, {sizes}: {str(error).splitlines()[0]}") from error

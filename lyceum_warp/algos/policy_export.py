@@ -16,7 +16,7 @@ import torch
 from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import described, first_sentence
+from lyceum_warp.support.validate import described, first_sentence, memoryless_action
 
 EXTRA = "pip install 'lyceum-warp[export]'"
 
@@ -50,7 +50,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
     Raises:
         ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
-        ValueError: The file has an unsupported suffix, or the policy's network cannot be exported.
+        ValueError: The file has an unsupported suffix, or the policy has memory or cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
         raise ValueError(f"policy must be a module with act and nobs, as lw.load(run) returns, not {described(policy)}")
@@ -61,6 +61,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     example, shapes = (torch.zeros(2, nobs),), ({0: torch.export.Dim("batch")},)
     try:
         with _quiet():
+            memoryless_action(alone, *example)
             program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
             if path.suffix == ".onnx":
                 program = torch.onnx.export(

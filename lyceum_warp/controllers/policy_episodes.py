@@ -9,7 +9,7 @@ import torch
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.curriculum import Curriculum, start_episodes
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import memoryless_action, whole_number
 
 
 @torch.no_grad()
@@ -53,7 +53,7 @@ def policy_episodes(
         start = time.perf_counter()
         while not (lengths > 0).all():
             begun = time.perf_counter()
-            env.action.copy_(policy(env.obs))
+            env.action.copy_(policy(env.obs) if number or actions else memoryless_action(policy, env.obs))
             actions.append(env.action.cpu().clone())
             applied = time.perf_counter()
             env.step()

@@ -1,6 +1,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
@@ -8,8 +9,10 @@ from torch import nn
 
 import lyceum_warp as lw
 from lyceum_warp.algos.policy_check import check_policy
+from lyceum_warp.controllers.policy_episodes import policy_episodes
 from lyceum_warp.runs.checkpoints import policy_content
 from lyceum_warp.runs.folder import Run
+from lyceum_warp.viewer.session.drivers import PolicyControl
 
 
 class Net(nn.Module):
@@ -149,3 +152,88 @@ def test_policy_of_a_user_class_is_not_loaded_as_another_class(tmp_path: Path) -
         lw.load(run)
     obs = torch.randn(3, 6)
     assert torch.equal(lw.load(run, policy=Bounded(6, 2, (4,)))(obs), policy(obs))
+
+
+class Recurrent(nn.Module):
+    """A policy with a hidden state that no reset clears."""
+
+    nobs, nact = 6, 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell, self.last, self.hidden = nn.GRUCell(6, 8), nn.Linear(8, 2), None
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        self.hidden = self.cell(obs, self.hidden)
+        return self.last(self.hidden)
+
+
+class Stacking(nn.Module):
+    """A policy that also sees the last observation."""
+
+    nobs, nact, last = 6, 2, None
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        last, self.last = obs if self.last is None else self.last, obs.clone()
+        return obs[:, :2] + 10.0 * (obs - last)[:, 2:4]
+
+
+class Drawing(nn.Module):
+    """A policy with a random generator of its own."""
+
+    nobs, nact = 6, 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generator = np.random.default_rng(0)
+
+    def act(self, obs: torch.Tensor) -> torch.Tensor:
+        return obs[:, :2] + self.generator.standard_normal()
+
+
+def trained_with(policy: nn.Module, env: lw.Env, path: Path) -> object:
+    class Wrapped(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.scale = nn.Parameter(torch.ones(2))
+
+        def forward(self, obs: torch.Tensor) -> torch.Tensor:
+            return self.scale * policy.act(obs)
+
+    return lw.PPO(env, lw.GaussianPolicy(6, 2, network=Wrapped()))
+
+
+DOORS: dict[str, Callable[[nn.Module, lw.Env, Path], object]] = {
+    "evaluate": lambda policy, env, path: lw.evaluate(env, policy, 2),
+    "evaluate a function": lambda policy, env, path: lw.evaluate(env, policy.act, 2),
+    "transfer": lambda policy, env, path: lw.transfer(env, policy, 2, warp=False),
+    "train": trained_with,
+    "episodes": lambda policy, env, path: next(policy_episodes(env.replicate(autoreset=False), policy.act, 2)),
+    "view": lambda policy, env, path: PolicyControl("own", policy, env),
+    "export": lambda policy, env, path: lw.export_policy(policy, path / "policy.pt2"),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+@pytest.mark.parametrize("kind", [Recurrent, Stacking, Drawing])
+def test_policy_with_memory_is_refused_wherever_it_would_leak_over_episodes(
+    kind: type[nn.Module], door: str, shared_env: SharedEnv, tmp_path: Path
+) -> None:
+    env = shared_env("point_mass", nworld=2, horizon=4)
+    torch.manual_seed(0)
+    with pytest.raises(ValueError, match="different .*actions for the same observations: .*(memory|state)") as caught:
+        DOORS[door](kind(), env, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_policy_may_draw_from_the_global_random_generator(shared_env: SharedEnv) -> None:
+    env, draws = shared_env("point_mass", nworld=2, horizon=4), list[torch.Tensor]()
+
+    def random(obs: torch.Tensor) -> torch.Tensor:
+        draws.append(torch.rand(2, 2))
+        return draws[-1]
+
+    torch.manual_seed(0)
+    lw.evaluate(env, random, 2)
+    torch.manual_seed(0)
+    assert torch.equal(torch.stack(draws[2:]), torch.rand(4, 2, 2))  # checks leave the stream as it is

@@ -13,7 +13,7 @@ from lyceum_warp.algos.planner import Planner
 from lyceum_warp.algos.policy import Policy, acting
 from lyceum_warp.controllers.checked_controller import CheckedController, accepts, signature_of
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import described
+from lyceum_warp.support.validate import described, memoryless_action
 
 MOST_SAMPLES = 24
 """Maximum number of samples whose paths the viewer draws."""
@@ -49,7 +49,7 @@ class PolicyControl:
         self._policy, self._env = acting(_on_device(policy, env)), env
         try:
             with torch.no_grad():
-                action = self._policy(env.obs)
+                action = memoryless_action(self._policy, env.obs)
         except Exception as error:
             raise ValueError(
                 f"{ControllerError(name, error)}: it was called with the observations of {env.task.name!r}, "
