@@ -95,8 +95,8 @@ def evaluate(
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, the policy has memory, or
-            the policy or the curriculum does not fit the environment.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, the policy has memory,
+            or the policy or the curriculum does not fit the environment.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
