@@ -20,7 +20,7 @@ from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.lock import run_lock
 from lyceum_warp.runs.replay_files import read_replay
 from lyceum_warp.runs.saving import Saver
-from lyceum_warp.runs.task_copy import note_changes, task_copy
+from lyceum_warp.runs.task_copy import note_changes, note_uncopied_data, task_copy
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number, whole_number
@@ -156,6 +156,7 @@ def train(
                 if leads:
                     kept, files = task_copy(env)
                     run = Run.create(folder, run.config | {"kept": kept}, files=files)
+                    note_uncopied_data(env)
             if leads:
                 run.check = shown.enter_context(run_lock(run.folder, take_over=take_over))
             if resume:

@@ -4,15 +4,13 @@ import ast
 import contextlib
 import importlib.util
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TypeAlias
 
-Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
-"""The modification time and the size of each file."""
+from lyceum_warp.binding.data_files import Stamps, data_files, stamps
 
 _taken: dict[str, Stamps] = {}
-"""Maps each imported local module to the modification time and size that its file had when it was imported."""
+"""Maps each imported local module to the stamps of its file, and of the data files that it read, at its import."""
 
 
 def local_modules(file: Path) -> dict[str, Path]:
@@ -67,15 +65,6 @@ def _module_file(folder: Path, name: str) -> Path | None:
     return base if base.is_dir() and any(base.glob("*.py")) else None
 
 
-def stamps(files: Iterable[Path]) -> Stamps:
-    """Read the modification times and sizes of files."""
-    found: Stamps = dict.fromkeys(files)
-    for file in found:
-        with contextlib.suppress(OSError):
-            found[file] = (stat := file.stat()).st_mtime_ns, stat.st_size
-    return found
-
-
 @contextlib.contextmanager
 def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     """Let a task's file import the modules that ``local_modules`` has found in its folder.
@@ -84,7 +73,7 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
     ``sys.modules`` is restored.
     """
     before = {name: sys.modules.get(name) for name in modules}
-    if any(name in _taken and _taken[name] != stamps([path]) for name, path in modules.items()):
+    if any(name in _taken and _taken[name] != stamps({path: None} | _taken[name]) for name, path in modules.items()):
         for name in modules:  # reload all of them, because they may have imported names from each other
             if name in _taken:
                 sys.modules.pop(name, None)
@@ -105,4 +94,4 @@ def importable(file: Path, modules: Mapping[str, Path]) -> Iterator[None]:
         sys.dont_write_bytecode = bytecode
     for name, path in modules.items():
         if (module := sys.modules.get(name)) is not None and module is not before[name]:
-            _taken[name] = stamps([path])
+            _taken[name] = stamps([path]) | data_files([path])

@@ -18,14 +18,15 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from lyceum_warp.binding.local_modules import Stamps, importable, local_modules, stamps
+from lyceum_warp.binding.data_files import Stamps, data_files, stamps
+from lyceum_warp.binding.local_modules import importable, local_modules
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
 
 _loaded: dict[str, Stamps] = {}
-"""Maps the module of each task file to the times and sizes that its source files had when they were loaded."""
+"""Maps the module of each task file to the stamps that its source and data files had when they were loaded."""
 
 _LOADING = threading.RLock()
 """Held while a file is loaded, because imports and linecache are global to the process."""
@@ -264,7 +265,7 @@ def _module_of_file(path: Path) -> ModuleType:
         read, sources = stamps([path.resolve(), *modules.values()]), _read(path, modules)
         with importable(path, modules):
             _run(path, name, sources[path.resolve()])
-        _loaded[name] = read
+        _loaded[name] = read | data_files(sources)
         for value in vars(sys.modules[name]).values():
             if isinstance(value, type) and issubclass(value, Task) and value.__module__ == name:
                 _sources[value] = sources

@@ -12,6 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lyceum_warp.binding.data_files import data_files, stamps
 from lyceum_warp.binding.models import find_model
 from lyceum_warp.binding.registry import package_task_names, source_files
 from lyceum_warp.env import Env
@@ -19,6 +20,7 @@ from lyceum_warp.model_files import ModelFile, read_spec
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.folder import Run
 from lyceum_warp.runs.trust import check_trust
+from lyceum_warp.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -30,7 +32,7 @@ _APART = 2
 """If the task's file lies more than this number of levels below the folder that contains both the task and the model,
 the two are copied into separate folders."""
 _LARGEST = 512 * 2**20
-"""Maximum size of a model that is copied, in bytes."""
+"""Maximum size of a model, and of all data files, that are copied, in bytes."""
 
 
 def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
@@ -48,7 +50,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         kept["source_hash"] = _digest(loaded[file])
     if own or given:
         main, model = _model_files(env)
-        sources = loaded if own else {}
+        sources: Files = {**loaded, **_data_copies(task)[0]} if own else {}
         # relative paths stay the same, so that the copied task finds the copied model
         names = _names_in_copy([*sources, *model])
         if file is not None and names.get(file, "").count("/") > _APART:
@@ -57,7 +59,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         if own and file is not None:
             kept["modules"] = {
                 path.relative_to(file.parent).as_posix(): _digest(source)
-                for path, source in loaded.items()
+                for path, source in sources.items()
                 if path != file
             }
             kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
@@ -67,6 +69,37 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
     return kept, files
+
+
+def _data_copies(task: type[Task]) -> tuple[Files, dict[str, list[Path]]]:
+    """Return the data files that a task reads and that a run can copy, and the others by the reason against a copy.
+
+    The copy of the task's file finds only files below its own folder.
+    """
+    loaded = source_files(task)
+    folder, data = next((file.parent for file in loaded), Path()), data_files(loaded)
+    large = sum(path.stat().st_size for path in data) > _LARGEST
+    copies: Files = {}
+    uncopied: dict[str, list[Path]] = {}
+    for path, stamp in data.items():
+        if folder not in path.parents:
+            reason = f"move it into {folder}, and read it by a path that starts with Path(__file__).parent"
+        elif stamps([path]) != {path: stamp}:
+            reason = "it has changed since it was read, so make a new environment"
+        elif large:
+            reason = f"the data files are larger than {_LARGEST // 2**20} MiB"
+        else:
+            copies[path] = path
+            continue
+        uncopied.setdefault(reason, []).append(path)
+    return copies, uncopied
+
+
+def note_uncopied_data(env: Env) -> None:
+    """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
+    for reason, (path, *others) in _data_copies(env.task.task)[1].items():
+        more = f" and of {len(others)} more files" if others else ""
+        log.warning("the run has no copy of %s%s, which the task %r reads: %s", path, more, env.task.name, reason)
 
 
 def _names_in_copy(paths: Collection[Path]) -> dict[Path, str]:
@@ -172,7 +205,7 @@ def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, b
         content = (loaded or {}).get(path)
         if content is None and not path.is_file():
             changes.append(f"{path} does not exist any more")
-        elif hashed not in (None, _digest(path.read_bytes() if content is None else content)):
+        elif hashed not in (None, _digest(path if content is None else content)):
             changes.append(f"{path} has changed since the run began")
     return changes
 
@@ -202,8 +235,9 @@ def _model_changed(run: Run, env: Env) -> bool:
     return same_version and known not in (None, _model_hash(env))
 
 
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()[:16]
+def _digest(content: bytes | Path) -> str:
+    with io.BytesIO(content) if isinstance(content, bytes) else content.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def _model_hash(env: Env) -> str:

@@ -1,4 +1,6 @@
+import importlib
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,8 @@ from training_runs import QUIET, TINY, metrics, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.registry import find_task
 from lyceum_warp.env import Env
 from lyceum_warp.runs.configuration import Configuration
 from lyceum_warp.runs.folder import Run
@@ -246,3 +250,102 @@ def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:
     for file, text in original.items():
         file.write_text(text)
     assert edited == run("unedited", [])
+
+
+READING = (
+    (
+        SOURCE.replace(
+            "import warp as wp\n",
+            "import os\nfrom pathlib import Path\n\nimport numpy as np\nimport slide_data\nimport warp as wp\n\n"
+            "HERE = Path(__file__).parent\nSCALE = os.environ.get('SCALE', HERE / 'clips/scale.npy')\n",
+            1,
+        )
+        .replace("    dt: float\n", "    scale: float = float(np.load(SCALE))\n", 1)
+        .replace("    goal:", "    offset: float = slide_data.OFFSET\n    goal:", 1)
+        .replace("-wp.abs(s1.qpos[0] - p.goal[0])", "p.offset - p.scale * wp.abs(s1.qpos[0] - p.goal[0])")
+    )
+    + """
+    @staticmethod
+    def edit_model(spec):
+        spec.option.gravity[2] = float((HERE / "gravity.txt").read_text())
+"""
+)
+
+
+@pytest.fixture
+def reading(folder: Path) -> Path:
+    """A task that reads a file at its import, one in a module that it imports, and one in ``edit_model``."""
+    mine = folder / "mine"
+    (mine / "slide.py").write_text(READING)
+    (mine / "slide_data.py").write_text(
+        "import os\n\nwith open(os.path.join(os.path.dirname(__file__), 'offset.csv')) as file:\n"
+        "    OFFSET = float(file.read())\n"
+    )
+    (mine / "clips").mkdir()
+    np.save(mine / "clips" / "scale.npy", 2.0)
+    (mine / "offset.csv").write_text("5.0")
+    (mine / "gravity.txt").write_text("-3.0")
+    (mine / "unread.txt").write_text("x")
+    return folder
+
+
+def test_data_files_that_a_task_reads_are_copied_with_it(
+    reading: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    out, mine = trained(reading), reading / "mine"
+    assert not caplog.messages and not (out / "task" / "unread.txt").exists()
+    before = returns(capsys, str(out))
+    for name in ("clips/scale.npy", "offset.csv", "gravity.txt"):
+        file = mine / name
+        original = file.read_bytes()
+        np.save(file, 3.0) if file.suffix == ".npy" else file.write_text("-9.0")
+        assert returns(capsys, str(out)) == before
+        assert caplog.messages[-1].startswith(f"{file} has changed since the run began: the run's own copy is used")
+        if name == "offset.csv":
+            assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
+        file.write_bytes(original)
+    mine.rename(reading / "moved")
+    assert returns(capsys, str(out)) == before
+
+
+def test_changed_data_is_read_again(reading: Path) -> None:
+    mine = reading / "mine"
+
+    def values() -> tuple[float, float, float]:
+        task = BoundTask(find_task(mine / "slide.py"))
+        return task.params["scale"], task.params["offset"], task.model.opt.gravity[2]
+
+    assert values() == (2.0, 5.0, -3.0)
+    np.save(mine / "clips" / "scale.npy", 4.0)
+    (mine / "offset.csv").write_text("6.00")
+    (mine / "gravity.txt").write_text("-7.0")
+    assert values() == (4.0, 6.0, -7.0)
+
+
+@pytest.mark.parametrize("where", ["outside", "relative", "changed"])
+def test_run_names_data_that_it_cannot_copy(
+    where: str, reading: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine = reading / "mine"
+    monkeypatch.chdir(mine)
+    inside = mine / "clips" / "scale.npy"
+    path = {"outside": reading / "scale.npy", "relative": Path("clips/scale.npy"), "changed": inside}[where]
+    np.save(path, 2.0)
+    monkeypatch.setenv("SCALE", str(path))
+    env = lw.make(str(mine / "slide.py"), nworld=2)
+    if where == "changed":
+        np.save(path, 3)
+    lw.train(lw.NPG(env, config=SMALL), reading / "run", iterations=1)
+    (message,) = caplog.messages
+    assert message.startswith(f"the run has no copy of {path}, which the task 'slide' reads: ")
+    assert {file.name for file in (reading / "run" / "task").rglob("*") if file.is_file()} >= {"offset.csv"}
+    assert not list((reading / "run").rglob("scale.npy"))
+
+
+def test_data_of_an_imported_class_is_copied(reading: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(reading / "mine")
+    for name in ("slide", "slide_data"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    slide: Any = importlib.import_module("slide")
+    files = task_copy(lw.make(slide.Slide, nworld=1))[1]
+    assert files.keys() >= {"clips/scale.npy", "offset.csv", "gravity.txt", "slide_data.py"}
