@@ -58,10 +58,12 @@ def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Modu
     ``name`` is "policy" or "value".
     """
     if name not in content:
-        raise ValueError(f"{path} has no value function, because the run's algorithm learns none")
+        raise ValueError(f"{path} has no value function: its algorithm learns none, or the file is from rsl_rl")
     saved = content[name]
     try:
         module = given
+        if module is None and "like" in saved:
+            raise ValueError(f"rsl_rl saved this policy without its activation: pass policy={saved['like']}")
         if module is None:
             with torch.device("meta"):  # compare shapes before allocating memory
                 module = _made(name, saved)
@@ -129,8 +131,11 @@ def read_checkpoint(
         raise ValueError(
             f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({first_sentence(error)}): {_FIX}"
         ) from error
+    if isinstance(content, dict) and "actor_state_dict" in content:
+        content = _from_rsl_rl(content, path)
     if not isinstance(content, dict) or "lyceum_warp" not in content:
-        raise ValueError(f"the checkpoint {path} was not written by lyceum_warp: {_FIX}")
+        entries = f" (it has {', '.join(map(repr, list(content)[:4]))})" if isinstance(content, dict) else ""
+        raise ValueError(f"{path} was not written by lyceum_warp{entries}: pass the policy of a run, such as policy.pt")
     if not isinstance(number := content["lyceum_warp"], int) or number != FORMAT:
         raise unknown_format(path, number, FORMAT)
     if missing := set(parts) - content.keys():
@@ -148,3 +153,26 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "state": lambda value: isinstance(value, dict) and type(value.get("iteration", 0)) is int,
     "score": lambda value: isinstance(value, dict) and isinstance(value.get("value"), int | float),
 }  # fmt: skip
+
+
+def _from_rsl_rl(saved: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Convert a checkpoint of rsl_rl 5 with an MLP actor to the content of a policy's file."""
+    actor = dict(saved["actor_state_dict"])
+    state = {name.replace("mlp.", "network."): actor.pop(name) for name in list(actor) if name.startswith("mlp.")}
+    try:
+        std = actor.pop("distribution.std_param", None)
+        state["log_std"] = actor.pop("distribution.log_std_param") if std is None else std.log()
+        if normalize := "obs_normalizer.count" in actor:
+            names = ("_mean", "_var", "_std")
+            mean, var, std = (actor.pop(f"obs_normalizer.{name}").squeeze(0).double() for name in names)
+            count, scale = actor.pop("obs_normalizer.count").double(), 1.0 / (std + 0.01)  # rsl_rl's eps
+            parts = {"count": count, "mean": mean, "square": count * var, "shift": mean.float(), "scale": scale.float()}
+            state |= {f"normalizer.{name}": part for name, part in parts.items()}
+        if actor:
+            raise KeyError(next(iter(actor)))
+        sizes = [state["network.0.weight"].shape[1], *(len(x) for name, x in state.items() if name.endswith(".bias"))]
+    except KeyError as error:
+        raise ValueError(f"{path} is from rsl_rl: only MLP actors with a Gaussian can be loaded ({error})") from error
+    more = ", normalize=True, limit=math.inf" if normalize else ""
+    like = f"lw.GaussianPolicy({sizes[0]}, {sizes[-1]}, {tuple(sizes[1:-1])}, activation='elu'{more})"
+    return {"lyceum_warp": FORMAT, "iteration": saved["iter"], "policy": {"shape": None, "state": state, "like": like}}

@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import pytest
@@ -130,6 +131,39 @@ def test_rsl_rl_writer_receives_the_metrics(env: lw.Env, tmp_path: Path) -> None
     OnPolicyRunner(RslRlVecEnv(env), config, str(tmp_path), "cpu").learn(2)
     found = EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
     assert {"metrics/forward", "metrics/effort", "faults/worlds", "Train/mean_reward"} <= set(found)
+
+
+@pytest.mark.parametrize(("std_type", "normalize"), [("scalar", True), ("log", True), ("scalar", False)])
+def test_policy_of_a_checkpoint_of_rsl_rl_acts_as_in_rsl_rl(
+    std_type: str, normalize: bool, env: lw.Env, tmp_path: Path
+) -> None:
+    from rsl_rl.runners import OnPolicyRunner
+
+    worlds, file = RslRlVecEnv(env), tmp_path / "model_1.pt"
+    config = lw.PPOConfig(hidden=(8, 4), value_hidden=(8,), num_steps=10, std_type=std_type, normalize=normalize)
+    runner = OnPolicyRunner(worlds, runner_config(env, config), None, "cpu")
+    runner.learn(1)
+    runner.save(str(file))
+    with pytest.raises(ValueError) as caught:
+        lw.load(file)
+    own = eval(str(caught.value).partition("pass policy=")[2], {"lw": lw, "math": math})
+    policy = lw.load(file, policy=own)
+    obs = worlds.get_observations()
+    for values in obs.values():
+        values.uniform_(-30.0, 30.0)  # a limit of 10 would clip some normalised observations
+    actor = runner.alg.get_policy()
+    torch.testing.assert_close(policy(obs["policy"]), actor(obs), rtol=1e-6, atol=1e-6)
+    actor(obs, stochastic_output=True)
+    torch.testing.assert_close(policy.log_std.exp(), actor.output_std[0])
+    assert next(lw.PPO(env, policy, config=config)).samples == 40  # training continues
+
+
+@pytest.mark.parametrize("name", ["rnn.rnn.weight_ih_l0", "distribution.head.weight"])
+def test_other_actors_of_rsl_rl_are_refused_by_name(name: str, tmp_path: Path) -> None:
+    actor = {"mlp.0.weight": torch.zeros(2, 3), "mlp.0.bias": torch.zeros(2), "distribution.std_param": torch.ones(2)}
+    torch.save({"actor_state_dict": actor | {name: torch.zeros(2)}, "iter": 3}, tmp_path / "model_3.pt")
+    with pytest.raises(ValueError, match=name):
+        lw.load(tmp_path / "model_3.pt", policy=lw.GaussianPolicy(3, 2, ()))
 
 
 @pytest.mark.gpu

@@ -37,10 +37,12 @@ def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: 
             path.write_bytes(whole[: len(whole) // 2])
         case "foreign":
             torch.save({"model": torch.zeros(2)}, path)
+            fix = "it has 'model'.*: pass the policy of a run"
         case "code":
             torch.save({"lyceum_warp": FORMAT, "policy": path}, path)
         case "list":
             torch.save([1, 2], path)
+            fix = "was not written by lyceum_warp: pass the policy of a run"
         case "newer":
             torch.save(content | {"lyceum_warp": FORMAT + 1}, path)
             fix = "pip install --upgrade lyceum-warp"
