@@ -10,6 +10,7 @@ import tyro
 from lyceum_warp.algos.mppi_arguments import task_config
 from lyceum_warp.algos.planner import MPPI
 from lyceum_warp.algos.policy_check import check_sizes
+from lyceum_warp.binding.registry import task_names
 from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
@@ -19,8 +20,9 @@ from lyceum_warp.curriculum import start_episodes
 from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.choice import AUTO
-from lyceum_warp.runs.folder import Run, load, load_curriculum
+from lyceum_warp.runs.folder import Run, load, load_curriculum, runs_in
 from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.viewer.follow import Follower
 from lyceum_warp.viewer.session.clock import Watcher
@@ -161,8 +163,13 @@ def _kind(what: tuple[str, ...]) -> str:
     if first.is_dir():
         # a folder of lyceum-warp plan has a configuration like a run, but no policy
         kind = "episodes" if any(first.glob("*.npz")) and not (first / "policy.pt").is_file() else "run"
-    else:
+    elif first.is_file() and first.suffix != ".py":
+        kind = "run"  # Run.open raises the error
+    elif ".py" in what[0] or what[0] in (names := task_names()):
         kind = "task"
+    else:
+        hint = did_you_mean(what[0], [*names, *runs_in(first.parent)], "lyceum-warp tasks lists the tasks")
+        raise ValueError(f"there is no task {what[0]!r}, and no folder of this name: {hint}")
     if len(what) > 1 and kind != "episodes":
         raise ValueError(f"one {kind} can be shown at a time, not {len(what)}: {', '.join(what)}")
     return kind

@@ -17,6 +17,7 @@ from lyceum_warp.runs.checkpoints import FORMAT, network_of, read_checkpoint, wr
 from lyceum_warp.runs.trust import remember
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
+from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.support.versions import versions
 
@@ -160,9 +161,7 @@ class Run:
         """
         path = Path(folder) / _CONFIG
         if not path.is_file():
-            known = (PRETRAINED / file_name(str(folder)) / _CONFIG).is_file()
-            hint = f"; for the package's policy, add --pretrained, or open lw.pretrained_run({str(folder)!r})"
-            raise FileNotFoundError(f"there is no run in {folder}: it has no {_CONFIG}{hint if known else ''}")
+            raise FileNotFoundError(f"there is no run in {folder}{_instead(Path(folder))}")
         try:
             config = json.loads(path.read_text())
             number = config["format"]
@@ -338,6 +337,24 @@ class Run:
             raise
 
 
+def runs_in(folder: Path) -> list[str]:
+    """Return the paths of the runs in a folder of runs."""
+    return sorted(str(path.parent) for path in folder.glob(f"*/{_CONFIG}"))
+
+
+def _instead(folder: Path) -> str:
+    """Describe a path that is not the folder of a run, for an error message."""
+    if folder.is_file():
+        return ", which is a file: pass a run's folder (in Python, lw.load also takes a policy's file)"
+    if folder.is_dir():
+        runs = runs_in(folder)
+        return f": it has no {_CONFIG}" + (f"; the last run in this folder is {runs[-1]}" if runs else "")
+    if (PRETRAINED / file_name(str(folder)) / _CONFIG).is_file():
+        return f": for the package's policy, add --pretrained, or open lw.pretrained_run({str(folder)!r})"
+    hint = did_you_mean(str(folder), runs_in(folder.parent), "pass the folder that lyceum-warp train or lw.train wrote")
+    return f", which does not exist: {hint}"
+
+
 def load(
     run: str | Path | Run,
     *,
@@ -351,9 +368,10 @@ def load(
     ``NPG(env, policy=lw.load(RUN))`` unfreezes and trains them.
 
     Args:
-        run: A run's folder, or a policy file in this folder.
+        run: A run's folder, a policy file in this folder, or a checkpoint of rsl_rl 5.
         which: "last", "best" (see ``train``), or the number of a saved iteration.
-        policy: A policy into which the weights are loaded. Custom classes of policies or networks need it.
+        policy: A policy into which the weights are loaded. Custom classes of policies or networks, and checkpoints of
+            rsl_rl, need it.
         device: Device for the parameters.
 
     Raises:

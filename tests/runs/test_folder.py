@@ -132,6 +132,29 @@ def test_error_of_an_invalid_configuration_names_the_file(config: Any, message: 
         Run.open(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("path", "hint"),
+    [
+        ("runs/hoper-1", "did you mean {}/runs/hopper-1 or {}/runs/hopper-2?"),
+        ("nothing", "{}/nothing, which does not exist: pass the folder"),
+        ("runs", "{}/runs/hopper-2"),
+        ("runs/hopper-2/policy.pt", "{}/runs/hopper-2/policy.pt, which is a file: pass a run's folder"),
+        ("empty", "{}/empty: it has no config.json"),
+    ],
+)
+@pytest.mark.parametrize("command", ["export", "view", "eval"])
+def test_path_without_a_run_names_what_is_there(
+    command: str, path: str, hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("runs/hopper-1", "runs/hopper-2"):
+        Run.create(tmp_path / name, {}).policy.touch()
+    (tmp_path / "empty").mkdir()
+    assert cli.main([command, str(tmp_path / path)]) == 2
+    if (command, path) == ("view", "nothing"):
+        hint = "no task '{}/nothing', and no folder"
+    refused(capsys, hint.replace("{}", str(tmp_path)))
+
+
 def test_error_of_an_invalid_setting_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=1)
     run.amend(engine="x")
