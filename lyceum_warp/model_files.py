@@ -117,7 +117,7 @@ def _menagerie_place(file: str) -> tuple[Path, str]:
 
 
 def _checkout(root: str) -> Path:
-    folder = Path(root).expanduser()
+    folder = Path(os.path.expanduser(root))
     if not folder.is_dir() or next(folder.glob("*/*.xml"), None) is None:
         what = "holds no models" if folder.is_dir() else "is not a folder"
         raise FileNotFoundError(
@@ -199,5 +199,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
+    except TypeError as error:
+        raise ValueError(f"the path of the model {str(path)!r} is not UTF-8: rename it") from error
     except RuntimeError as error:  # MuJoCo's parser does not say which C++ exception it caught
         raise ValueError(f"MuJoCo can't read the model {path}: is one of its sizes too large? ({error})") from error

@@ -1,6 +1,7 @@
 """Load a task's model, and edit it before compilation, so that both engines simulate the same physics."""
 
 import logging
+import os
 import sys
 import textwrap
 import warnings
@@ -55,7 +56,7 @@ def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFil
         owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
     if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
         folder = Path(file).parent
-    path = (folder / Path(source).expanduser()).absolute()
+    path = (folder / os.path.expanduser(source)).absolute()
     if path.is_file():
         return path
     if Path(source).name != str(source):

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import io
 import linecache
+import os
 import pkgutil
 import re
 import sys
@@ -20,6 +21,7 @@ from typing import Any
 
 from lyceum_warp.binding.data_files import Stamps, data_files, stamps
 from lyceum_warp.binding.local_modules import importable, local_modules
+from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.task import Task
 
@@ -202,7 +204,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
         del sys.modules[name]
         if before is not None:
             sys.modules[name] = before
-        if not isinstance(error, Exception):
+        if isinstance(error, Interrupted | KeyboardInterrupt):
             raise
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
@@ -216,7 +218,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
         linecache.cache.pop(file, None)
 
 
-def _explained(error: Exception) -> str:
+def _explained(error: BaseException) -> str:
     """Return the message for an error in a task file, with a fix if Warp's own message is unclear."""
     text = str(error).strip()
     if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
@@ -227,7 +229,7 @@ def _explained(error: Exception) -> str:
             f"a @wp.struct has a field of the type {found.group(1)}: it can hold float, int, bool, vectors and "
             "matrices (wp.vec3, ...) and arrays"
         )
-    return text if type(error) is ValueError else f"{type(error).__name__}: {text}"
+    return text if type(error) is ValueError else f"{type(error).__name__}: {text}".removesuffix(": ")
 
 
 def _task_of_file(path: Path, attribute: str) -> type[Task]:
@@ -259,7 +261,7 @@ def _module_of_file(path: Path) -> ModuleType:
     """Return the module of a task's file. Run the file again if it or one of its local modules has changed."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no task file {str(path)!r}")
-    name = f"{_FILE}{path.stem}_{zlib.crc32(str(path.resolve()).encode()):08x}"
+    name = f"{_FILE}{path.stem}_{zlib.crc32(os.fsencode(path.resolve())):08x}"
     if name not in sys.modules or name not in _loaded or _loaded[name] != stamps(_loaded[name]):
         modules = local_modules(path)
         read, sources = stamps([path.resolve(), *modules.values()]), _read(path, modules)

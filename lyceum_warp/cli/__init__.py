@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.metadata
+import io
 import logging
 import os
 import sys
@@ -63,6 +64,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv == ["--version"]:
         print(f"lyceum-warp {importlib.metadata.version('lyceum-warp')}")
         return 0
+    if isinstance(sys.stdout, io.TextIOWrapper):  # print paths and symbols that the terminal cannot encode, too
+        sys.stdout.reconfigure(errors="backslashreplace")
     log, messages = logging.getLogger("lyceum_warp"), logging.StreamHandler()
     messages.setLevel(logging.WARNING)
     messages.setFormatter(logging.Formatter("lyceum-warp: %(message)s"))
@@ -72,6 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _run(argv)
     except Interrupted as signalled:
         return 128 + signalled.number
+    except KeyboardInterrupt:  # raised by a task's code, because signals raise Interrupted
+        print("lyceum-warp: interrupted by KeyboardInterrupt", file=sys.stderr)
+        return 130
     except BrokenPipeError:  # a pipe may be closed early, as in lyceum-warp tasks | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -166,7 +167,7 @@ def parameter(text: str) -> tuple[str, Any]:
     if not name or not parts:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")
     if value.endswith(".npy"):
-        return name, str(Path(value).expanduser().resolve())
+        return name, str(Path(os.path.expanduser(value)).resolve())
     values = [_value(part, text) for part in parts]
     return name, values[0] if len(values) == 1 else values
 

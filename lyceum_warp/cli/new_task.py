@@ -67,7 +67,7 @@ class New:
     def run(self) -> None:
         if self.template == "plain" and (self.feet or self.joints):
             raise ValueError("--feet and --joints have no effect without --template velocity")
-        path = Path(self.task if self.task.endswith(".py") else f"{self.task}.py").expanduser()
+        path = Path(os.path.expanduser(self.task if self.task.endswith(".py") else f"{self.task}.py"))
         class_name = _class_name(path)
         if path.exists():
             raise ValueError(f"{path} exists: choose another name, or remove it")
@@ -135,7 +135,7 @@ def _model(text: str, path: Path) -> tuple[str, mujoco.MjSpec]:
     where, _, file = text.partition(":")
     if where in _SOURCES:
         return f"lw.{where}_model({literal(file)})", _SOURCES[where](file).spec()
-    model = Path(text).expanduser()
+    model = Path(os.path.expanduser(text))
     if not model.is_file():
         raise FileNotFoundError(f"there is no model file {text!r}")
     given = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))

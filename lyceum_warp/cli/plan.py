@@ -4,6 +4,7 @@ import dataclasses
 import datetime
 import functools
 import math
+import os
 import signal
 import time
 from collections.abc import Callable
@@ -184,7 +185,7 @@ class Plan:
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.task), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
-            "planner_model": self.planner_model and str(self.planner_model.expanduser().resolve()),
+            "planner_model": self.planner_model and str(Path(os.path.expanduser(self.planner_model)).resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
@@ -209,7 +210,7 @@ def _worlds(
     config = options.mppi.on_top_of(task_config(task, value))
     words = vars(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
-        words["model"] = options.planner_model.expanduser().resolve()
+        words["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 
     def make(setting: RealTimeSetting | None) -> MPPI:
         chosen, physics = config, {}

@@ -1,6 +1,8 @@
+import io
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from training_runs import refused
@@ -100,3 +102,19 @@ print(*sys.modules, file=sys.stderr)
 def test_invalid_flag_value_prints_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words.split()) == 2
     refused(capsys, message)
+
+
+def test_keyboard_interrupt_of_a_task_file_prints_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "task.py").write_text("raise KeyboardInterrupt")
+    assert cli.main(["check", str(tmp_path / "task.py")]) == 130
+    refused(capsys, "KeyboardInterrupt")
+
+
+def test_output_that_the_terminal_cannot_encode_is_escaped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("\udcffä").mkdir()
+    bytes_out = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(bytes_out, "ascii"))
+    assert cli.main(["new", "\udcffä/walk", "--model", "gymnasium:hopper.xml"]) == 0
+    sys.stdout.flush()
+    assert bytes_out.getvalue().startswith(b"\\udcff\\xe4/walk.py: ")

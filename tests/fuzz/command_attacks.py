@@ -16,7 +16,7 @@ from random import Random
 
 import guarded
 import torch
-from file_attacks import content
+from file_attacks import SLIDE, content
 from guarded import ProblemError
 from minimal_cases import COMMANDS
 from mutations import NUMBERS, TEXTS
@@ -74,10 +74,13 @@ def _word(random: Random) -> str:
     return random.choice(_WORDS)
 
 
+MODELS = ("~x.xml", "\udcff.xml", "a\nb.xml", "[red].xml", "'\".xml")
+"""Unusual names of model files in the working directory."""
+
 _WORDS = (
     "1", "2", "3", "0.5", "cpu", "cuda:99", "warp", "mujoco", "auto", "True", "None", "last", "best", "good", "here",
     ".", "point_mass", "hopper.py", "x.onnx", "x.pt2", "free", "azimuth=9", "-", "--", "success_distance=1",
-    "success_distance=nan", "x=1", "=", "a=b=c", "iterations=2", "nworld=3",
+    "success_distance=nan", "x=1", "=", "a=b=c", "iterations=2", "nworld=3", *MODELS,
 )  # fmt: skip
 
 
@@ -121,6 +124,8 @@ def run(line: list[str]) -> None:
     shutil.rmtree(HERE, ignore_errors=True)
     HERE.mkdir()
     shutil.copytree(RUN, HERE / "good")
+    for name in MODELS:
+        (HERE / name).write_text(SLIDE)
     os.chdir(HERE)
     before = content(Path())
     out, err = io.StringIO(), io.StringIO()

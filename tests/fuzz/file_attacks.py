@@ -80,6 +80,7 @@ KINDS = {
     "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("the model of the task",)),
     "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
     "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("the model of the task",)),
+    "task.py": Kind("slide.py", mutations.mutated_task, ("make file", "check"), ("the task 'tiny'",)),
     "table.npy": Kind("table.npy", _table, ("table",)),
 }  # fmt: skip
 
@@ -119,6 +120,8 @@ READERS: dict[str, Callable[[], object]] = {
     "view episodes": lambda: command("view", CASE / "episodes"),
     "make": lambda: lw.make(SLIDE_PY, model=CASE / "model.xml").step(),
     "new": lambda: command("new", "case/my_new_task", "--model", CASE / "model.xml"),
+    "make file": lambda: lw.make(CASE / "slide.py").step(),
+    "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "spaces"),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}

@@ -88,6 +88,8 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "an episode whose options have another engine": ("episode.npz", "episodes", _info(source=_SOURCE)),
     "a model with a name that is not UTF-8": ("kept model", "eval kept", lambda data: data.replace(b"arm", b"\xff")),
     "a model that asks for 900 GB": ("model.xml", "make", _inside(b'<size memory="900G"/>')),
+    "a task's file that raises BaseException": ("task.py", "check", lambda data: data + b"\nraise BaseException"),
+    "a task's file that ends the program": ("task.py", "make file", lambda data: b"raise SystemExit(0)\n" + data),
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
@@ -115,6 +117,9 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",
+    "a model whose name is not UTF-8": "new my_task --model \udcff.xml",
+    "a model whose name starts like a home folder": "new my_task --model ~x.xml",
+    "a task whose name starts like a home folder": "new ~x --model ~x.xml",
     "a folder with markup": "train point_mass --out [/bold]x --iterations 1 --samples 8 --nworld 2 --horizon 4",
 }
 """Command lines that must not end with a traceback."""

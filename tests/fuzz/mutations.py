@@ -21,7 +21,7 @@ NUMBERS = (
 )  # fmt: skip
 TEXTS = (
     "", " ", "x", "nan", "1e999", "-1", "../x", "/proc/x.py", "x.npy", "a\nb", "\0", "[/bold]x", "[red]",
-    "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000,
+    "%s{}", "\u202e\u0301", "ä" * 20, "x" * 5000, "~x", "~", "\udcff",
 )  # fmt: skip
 VALUES = (*NUMBERS, *TEXTS, None, True, False, [], {}, [0], [[1.5]], [None], {"x": 1}, {"": []})
 """Values of every JSON type. Most arguments accept none of them."""
@@ -84,7 +84,7 @@ def mutated_csv(data: bytes, random: Random) -> bytes:
     text = io.StringIO()
     rows = rows if isinstance(rows, list) else [rows]  # the mutation may replace the whole table
     csv.writer(text).writerows(row if isinstance(row, list) else [row] for row in rows)
-    return text.getvalue().encode()
+    return text.getvalue().encode("utf-8", "surrogatepass")
 
 
 _ELEMENTS = (
@@ -119,6 +119,22 @@ def mutated_xml(data: bytes, random: Random) -> bytes:
             if kind == 4:
                 del element.attrib[name]
     return ET.tostring(root)
+
+
+_RAISES = (
+    "raise BaseException", "raise KeyboardInterrupt", "raise SystemExit(0)", "raise GeneratorExit", "raise ValueError",
+    "import sys; sys.exit()", "class Odd(BaseException): pass\nraise Odd('x')", "import no_such_module",
+    "raise OSError(2, 'x', 'y')", "open('/nowhere')", "def deep(): deep()\ndeep()", "raise UnicodeError", "1 / 0",
+    "raise ExceptionGroup('x', [ValueError()])", "raise StopIteration", "del World", "del lw", "x x", "\0", "\u202e",
+)  # fmt: skip
+
+
+def mutated_task(data: bytes, random: Random) -> bytes:
+    """Truncate a task's file, or insert a statement that raises an error between its top-level statements."""
+    places = [place for place in range(len(data)) if data.startswith((b"\n@", b"\nclass"), place)] + [0, len(data)]
+    place = random.choice(places)
+    statement = random.choice(_RAISES).encode()
+    return data[:place] if random.random() < 0.2 else data[:place] + b"\n" + statement + b"\n" + data[place:]
 
 
 def _mutated_archive(data: bytes, random: Random, main: str, hostile: bytes) -> bytes:
