@@ -286,6 +286,8 @@ def _check_equal(run: Run, learner: Learner) -> None:
     # horizon, fields and dynamics may differ
     options = {"horizon": old.horizon, "fields": old.fields, "dynamics": old.dynamics}
     params = dict.fromkeys(now["params"]) | dict(then.params)
+    # a table's file may have changed, and ``note_changes`` reports it
+    params |= {name: value for name, value in now["params"].items() if value == run.config["params"].get(name)}
     hyperparameters = run.config.get(algorithm, {}), json.loads(json.dumps(learner.settings()))
     for before, after in (
         ({"task": run.config.get("kept", {}).get("name", env.task.name)}, {"task": env.task.name}),

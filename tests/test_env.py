@@ -136,7 +136,7 @@ def test_environments_that_are_made_and_dropped_leave_no_memory_in_use() -> None
     bytes_before, blocks_before = in_use()
     make_and_drop(rounds := 8)
     bytes_after, blocks_after = in_use()
-    # measured: 1 kB and 20 blocks, and fewer after more rounds; one kept array of a world takes 6 kB
+    # measured: 1 kB and 20 blocks, and fewer after more rounds; one kept array of each environment takes 10 kB
     assert bytes_after - bytes_before < 5000 * rounds
     assert blocks_after - blocks_before < 100 * rounds
 

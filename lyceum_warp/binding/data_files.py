@@ -55,7 +55,11 @@ def data_files(sources: Iterable[Path]) -> Stamps:
 
 def _record(event: str, arguments: tuple[Any, ...]) -> None:
     """Record a file that is opened for reading. Python calls this function at each audit event of the process."""
-    if event != "open" or not isinstance(arguments[0], str | bytes | os.PathLike) or arguments[2] & os.O_ACCMODE:
+    if (
+        event != "open"
+        or not isinstance(arguments[0], str | bytes | os.PathLike)
+        or arguments[2] & (os.O_WRONLY | os.O_RDWR)
+    ):
         return
     frame = inspect.currentframe()
     while frame is not None and frame.f_code.co_name not in _READERS:

@@ -21,7 +21,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.options import EnvOptions
 from lyceum_warp.runs.checkpoints import network_of, read_checkpoint
 from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.task_copy import TABLES, is_table, json_value, run_env
+from lyceum_warp.runs.task_copy import json_value, run_env, table_copies
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number
@@ -76,7 +76,7 @@ class Configuration:
 
     @classmethod
     def of(cls, run: Run) -> "Configuration":
-        """Read a run's configuration. If the file of a table parameter is missing, use the run's copy of this file."""
+        """Read a run's configuration. If the file of a table is missing or has changed, use the run's copy."""
         config = run.config
         try:
             # earlier releases stored --param options in "params", or wrote no "physics"
@@ -86,10 +86,7 @@ class Configuration:
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
             options, params = EnvOptions.split(words, base)
-            for param, value in params.items():
-                copy = run.task_folder / TABLES / f"{param}.npy"
-                if is_table(value) and not Path(value).is_file() and copy.is_file():
-                    params[param] = str(copy)
+            params |= {param: str(copy) for param, copy in table_copies(run).items()}
             name: str = config["algorithm"]
             return cls(
                 task=config["task"], params=params, options=options, algorithm=name,

@@ -1,5 +1,6 @@
 """Copy a run's task into the run's folder, and later choose between the copy and the original."""
 
+import filecmp
 import hashlib
 import io
 import logging
@@ -110,7 +111,7 @@ def _names_in_copy(paths: Collection[Path]) -> dict[Path, str]:
 def json_value(name: str, value: Any) -> Any:
     """Convert a task parameter to a JSON value for config.json."""
     if (table := _table(value)) is not None:
-        return str(value) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
+        return str(Path(value).absolute()) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
     if isinstance(value, bool | int | float | str):
         return value
     return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
@@ -127,6 +128,25 @@ def _table(value: Any) -> Any:
 def is_table(value: Any) -> bool:
     """Check whether a parameter is the path of a ``.npy`` file."""
     return isinstance(value, str | Path) and str(value).endswith(".npy")
+
+
+def table_copies(run: Run) -> dict[str, Path]:
+    """Return the run's copies of those tables whose files are missing or have changed since the run began."""
+    tables = {name: value for name, value in run.config["params"].items() if is_table(value)}
+    copies = {name: (run.task_folder / TABLES / f"{name}.npy").absolute() for name in tables}
+    return {
+        name: copy
+        for name, copy in copies.items()
+        if copy.is_file() and not (Path(tables[name]).is_file() and filecmp.cmp(tables[name], copy, shallow=False))
+    }
+
+
+def _note_tables(run: Run, params: Mapping[str, Any], text: str, *, copies: bool) -> None:
+    """Log a warning for each changed table of which the copy, or the new version, is used."""
+    for name, copy in table_copies(run).items():
+        file = run.config["params"][name]
+        if Path(file).is_file() and name in params and json_value(name, params[name]) == str(copy if copies else file):
+            log.warning("%s has changed since the run began: %s", file, text.format(copy))
 
 
 def _npy(array: np.ndarray) -> bytes:
@@ -154,11 +174,12 @@ def run_env(
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
     kept, chosen = run.config.get("kept", {}), run.config["task"]
-    saved, tables = run.config["params"], run.task_folder / TABLES
+    saved, tables = run.config["params"], (run.task_folder / TABLES).absolute()
     read: list[str | Path] = [
         value for name, value in params.items()
-        if is_table(value) and (value is saved.get(name) or tables in Path(value).parents)
+        if is_table(value) and (value is saved.get(name) or tables in Path(value).absolute().parents)
     ]  # fmt: skip
+    _note_tables(run, params, "the run's own copy is used, {}", copies=True)
     read += [options.model] if isinstance(options.model, str) else []
     if task is not None:
         if read:
@@ -221,6 +242,7 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
     hashed = None if kept.get("program") else kept.get("source_hash")
     for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
         log.warning("%s", f"{change}: the new version is used" if "changed" in change else change)
+    _note_tables(run, env.given_params, "the new version is used", copies=False)
     if model and _model_changed(run, env):
         log.warning("the model of the task %r has changed since the run began: the new version is used", env.task.name)
 

@@ -190,6 +190,38 @@ def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplo
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
 
+def test_run_uses_its_copy_of_a_changed_table(
+    folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    out, table = trained(folder), folder / "mine" / "goal.npy"
+    before = returns(capsys, str(out))
+    np.save(table, np.array([9.0, 0.4]))
+    assert returns(capsys, str(out)) == before
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    copy = out / "task" / "tables" / "goal.npy"
+    text = f"{table} has changed since the run began: the run's own copy is used, {copy}"
+    assert caplog.messages == [text, text]
+    assert returns(capsys, str(out), "--param", f"goal={table}") != before
+    assert caplog.messages[2:] == [f"{table} has changed since the run began: the new version is used"]
+
+
+def test_relative_path_of_a_table_does_not_depend_on_the_working_directory(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(folder / "mine")
+    env = lw.make("slide.py", nworld=2, goal="goal.npy", horizon=10)
+    lw.train(lw.NPG(env, config=SMALL), folder / "run", iterations=1)
+    monkeypatch.chdir(folder)
+    np.save("goal.npy", np.array([9.0, 0.4]))
+    assert np.allclose(env_of(folder / "run").task.params["goal"], [0.3, 0.4]) and not caplog.messages
+    monkeypatch.chdir(folder / "mine")
+    np.save("goal.npy", np.array([9.0, 0.4]))
+    env = lw.make("slide.py", nworld=2, goal="goal.npy", horizon=10)
+    lw.train(lw.NPG(env, config=SMALL), folder / "run", iterations=2, resume=True)
+    (message,) = caplog.messages
+    assert message == f"{folder / 'mine' / 'goal.npy'} has changed since the run began: the new version is used"
+
+
 def test_eval_of_a_run_from_a_notebook_needs_a_given_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
     Run.open(tmp_path / "run").amend(task=None)
