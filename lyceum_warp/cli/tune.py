@@ -128,8 +128,10 @@ def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
     def divergence(i: int) -> Cell:
         return lambda row: _short(row["divergence"][i] / max(reference["nudged_divergence"][i], 1e-300))
 
-    def returns(source: str) -> Cell:
-        return lambda row: str(Difference(**row["returns"][source])) if source in row["returns"] else ""
+    def interval(name: str, source: str) -> Cell:
+        return lambda row: str(Difference(**row[name][source])) if source in row[name] else ""
+
+    judged = {"returns": "return, %", "clearly_worse": "clearly worse, %"}
 
     return {
         "steps/s": lambda row: f"{row['steps_per_second']:,.0f}",
@@ -137,7 +139,12 @@ def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
         "kB/\nworld": lambda row: f"{row['bytes_per_world'] / 1e3:.1f}",
         "faults/\nmillion": lambda row: f"{row['faults_per_million']:.3g}" if row["returns"] else "",
         **{f"diverg.\n{steps}": divergence(i) for i, steps in enumerate(DIVERGENCE_STEPS)},
-        **{f"return, %,\n{source}": returns(source) for source in reference["returns"]},
+        **{
+            f"{heading},\n{source}": interval(name, source)
+            for name, heading in judged.items()
+            if name in reference
+            for source in reference[name]
+        },
     }
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -26,11 +26,7 @@ def student_quantile(probability: float, freedom: float) -> float:
         density = math.sqrt(freedom) * np.exp(log_factor) * np.cos(at) ** (freedom - 1)
         return 0.5 * angle * float(_WEIGHTS @ density)
 
-    low, high = 0.0, 0.5 * math.pi
-    for _ in range(100):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if beyond_half(middle) < probability - 0.5 else (low, middle)
-    return math.sqrt(freedom) * math.tan(low)
+    return math.sqrt(freedom) * math.tan(_root(lambda angle: beyond_half(angle) - probability + 0.5, 0.5 * math.pi))
 
 
 def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
@@ -42,21 +38,68 @@ def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(array.mean()), quantile * float(array.std(ddof=1)) / math.sqrt(len(array))
 
 
-def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """Compute the difference of two paired proportions, with its 95 % confidence interval.
+def clear_losses(first: np.ndarray, second: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the pairs in which one value is clearly smaller than the other.
 
-    Source: Agresti and Min (2005), "Simple improved confidence intervals for comparing matched proportions". A pair has
-    four possible outcomes. The method adds 0.5 to the count of each. The width is thus positive even if all pairs
-    agree.
+    A change is clear if it lies outside the quartiles of all changes by more than ``margin`` plus three interquartile
+    ranges. Three interquartile ranges are the fence of values that are "far out" (Tukey 1977, "Exploratory Data
+    Analysis"), so changes that all pairs share are not clear.
+
+    Args:
+        first: First value of each pair, (pairs,).
+        second: Second value of each pair, (pairs,).
+        margin: Smallest clear change if most pairs do not change.
+
+    Returns:
+        Whether the first value is clearly smaller, and whether the second value is, each (pairs,) bool.
+    """
+    change = second - first
+    low, high = np.percentile(change, (25, 75))
+    fence = margin + 3.0 * (high - low)
+    return change > high + fence, change < low - fence
+
+
+def share_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """Compute the 95 % confidence interval of the difference of two paired proportions, second minus first.
+
+    Pairs with different outcomes determine the difference: the share with only the second outcome, minus the share with
+    only the first. The interval combines the mid-p limits of these two shares (Zou and Donner 2008, "Construction of
+    confidence limits about effect measures"). If all of n pairs agree, it is ± (1 - 0.05^(1/n)).
 
     Args:
         first: First outcome of each pair, (pairs,) bool.
         second: Second outcome of each pair, (pairs,) bool.
-
-    Returns:
-        The estimated difference, second minus first, and the half-width of the interval.
     """
-    gained, lost = (np.count_nonzero(~first & second) + 0.5, np.count_nonzero(first & ~second) + 0.5)
-    pairs = len(first) + 2.0
-    width = math.sqrt(gained + lost - (gained - lost) ** 2 / pairs) / pairs
-    return (gained - lost) / pairs, 1.959964 * width
+    pairs = len(first)
+    gained, lost = int((~first & second).sum()), int((first & ~second).sum())
+    a, b = gained / pairs, lost / pairs
+    (a_low, a_high), (b_low, b_high) = _share_limits(gained, pairs), _share_limits(lost, pairs)
+    # the two shares exclude each other, so they are negatively correlated
+    correlation = -math.sqrt(a * b / ((1.0 - a) * (1.0 - b))) if max(a, b) < 1.0 else 0.0
+
+    def width(one: float, other: float) -> float:
+        return math.sqrt(one**2 + other**2 - 2.0 * correlation * one * other)
+
+    return a - b - width(a - a_low, b_high - b), a - b + width(a_high - a, b - b_low)
+
+
+@functools.lru_cache(maxsize=4096)
+def _share_limits(count: int, pairs: int) -> tuple[float, float]:
+    """Compute the mid-p limits (95 %) of a proportion of which ``count`` of ``pairs`` cases were seen."""
+    counts = np.arange(count + 1)
+    weight = np.where(counts < count, 1.0, 0.5)
+    ways = [math.lgamma(pairs + 1) - math.lgamma(k + 1) - math.lgamma(pairs - k + 1) for k in counts]
+
+    def at_most(share: float) -> float:
+        return float(weight @ np.exp(ways + counts * math.log(share) + (pairs - counts) * math.log1p(-share)))
+
+    return _root(lambda share: 0.975 - at_most(share), 1.0), _root(lambda share: 0.025 - at_most(share), 1.0)
+
+
+def _root(increasing: Callable[[float], float], high: float) -> float:
+    """Find the zero of an increasing function between 0 and ``high`` by bisection, or the end next to it."""
+    low = 0.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if increasing(middle) < 0.0 else (low, middle)
+    return low

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.support.intervals import mean_interval
+from lyceum_warp.support.intervals import clear_losses, mean_interval, share_interval
 
 TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 """Largest accepted difference of returns, relative to the unchanged task's mean absolute return."""
@@ -23,7 +23,10 @@ _LEAST_SAVING = 0.95
 
 @dataclasses.dataclass(frozen=True)
 class Difference:
-    """How much a setting changes the return, as a fraction of the unchanged task's mean absolute return."""
+    """How much a setting changes the mean return, relative to the unchanged task's mean absolute return.
+
+    For ``failures``, it is how much the setting changes the fraction of clearly worse episodes.
+    """
 
     mean: float
     low: float
@@ -54,6 +57,19 @@ def difference(reference: np.ndarray, returns: np.ndarray) -> Difference:
     return Difference(mean, mean - half, mean + half, len(change))
 
 
+def failures(reference: np.ndarray, returns: np.ndarray) -> Difference:
+    """Compare how many of the same episodes are clearly worse than the other episode of their pair.
+
+    Failures that do not end an episode may be too rare for the interval of the mean return. A return is clearly lower
+    if it differs by more than 2 % of the unchanged task's mean absolute return plus three interquartile ranges of all
+    differences. The result is the fraction of pairs in which the setting is clearly worse, minus the fraction in which
+    the unchanged task is.
+    """
+    first, second = clear_losses(reference, returns, TOLERANCES["strict"] * float(np.abs(reference).mean()))
+    low, high = share_interval(first, second)
+    return Difference(float(second.mean() - first.mean()), low, high, len(returns))
+
+
 def episodes_needed(found: Difference, half_width: float) -> int:
     """Estimate how many episodes give an interval of a given half-width.
 
@@ -69,7 +85,10 @@ def buys(speedup: float, memory: float) -> bool:
 
 
 def verdict(row: Mapping[str, Any], tolerance: str) -> str:
-    """Return the verdict on a row of results; see ``Tuning.rows``."""
+    """Return the verdict on a row of results; see ``Tuning.rows``.
+
+    Rows of tasks with terminations have no fraction of clearly worse episodes.
+    """
     if row["refused"]:
         return "refused"
     if "ranks" in row:
@@ -79,7 +98,7 @@ def verdict(row: Mapping[str, Any], tolerance: str) -> str:
     if row["faults_per_million"] > 2 * row["reference_faults_per_million"]:
         return "faults"
     limit = TOLERANCES[tolerance]
-    found = [Difference(**part) for part in row["returns"].values()]
+    found = [Difference(**part) for name in ("returns", "clearly_worse") for part in row.get(name, {}).values()]
     if all(part.within(limit) for part in found):
         return "same"
     return "different" if any(part.beyond(limit) for part in found) else "not shown"

@@ -35,8 +35,9 @@ class Tuning:
 
     rows: list[Row]
     """Results of each setting, the fastest first. docs/physics.md describes the entries. The entry ``verdict`` is
-    "same" if the interval of the returns lies within the tolerance. It is "different" if the interval lies outside, and
-    "not shown" if it lies partly outside. The verdict is "faults" if there are more than twice as many faults as in the
+    "same" if the intervals of the returns (and of the fraction of clearly worse episodes, for tasks without
+    terminations) lie within the tolerance. It is "different" if an interval lies outside, and "not shown" if it lies
+    partly outside. The verdict is "faults" if there are more than twice as many faults as in the
     unchanged task. The verdict is "no gain", without a comparison of returns, if the setting is less than 3 % faster
     and saves no memory. The verdict is "refused" if MuJoCo or the engine raises an error for the setting. The entry
     ``refused`` then contains the error. A planner's setting may also get the verdict "ranks badly"."""
@@ -90,7 +91,8 @@ def tune(
             parameters replace the task's defaults.
         which: Policy of the run: "last", "best", or the number of a saved iteration.
         tolerance: Bound on the 95 % interval of the difference of returns, relative to the mean absolute return. It is
-            "strict" (2 %), "loose" (5 %) or "any" (only faults count).
+            "strict" (2 %), "loose" (5 %) or "any" (only faults count). For tasks without terminations, it is also the
+            bound on the interval of the fraction of clearly worse episodes.
         short: Whether to compare only the first 100 steps of episodes, which takes a few seconds.
         episodes: Number of episodes per setting, rounded up to a multiple of the number of worlds. The default gives a
             narrow interval, unless the episodes would take more than a minute (5 s with ``short``).

@@ -12,17 +12,18 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.evaluation import ENDLESS_STEPS
+from lyceum_warp.algos.transfer import terminates
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.tuning.candidates import Setting
-from lyceum_warp.tuning.judgement import TOLERANCES, Difference, buys, difference, episodes_needed
+from lyceum_warp.tuning.judgement import TOLERANCES, buys, difference, episodes_needed, failures
 
 DIVERGENCE_STEPS = (1, 10, 50)
 NUDGE = 1e-6
 """Standard deviation of a perturbation of positions and velocities. The growth of this perturbation shows how chaotic
 the task is."""
-_HALF_WIDTH = TOLERANCES["strict"] / 2
-"""Target half-width of the difference's confidence interval. It determines the number of episodes."""
+_HALF_WIDTHS = {"returns": TOLERANCES["strict"] / 2, "clearly_worse": TOLERANCES["strict"]}
+"""Target half-widths of the confidence intervals. They determine the number of episodes."""
 _CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
@@ -59,6 +60,8 @@ class Trials:
     ) -> None:
         self.reference, self.policy, self.effort, self.seed = reference, policy, effort, seed
         self.batches = None if episodes is None else math.ceil(episodes / reference.nworld)
+        # failures that end episodes change the returns of many episodes, so the mean return shows them
+        self.judges = {"returns": difference} | ({} if terminates(reference) else {"clearly_worse": failures})
         self.sources = {"random": None} | ({} if policy is None else {"policy": policy})
         self.steps = effort.steps or reference.horizon or ENDLESS_STEPS
         if reference.horizon:
@@ -135,11 +138,13 @@ class Trials:
         row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
         row["divergence"] = self._distance([self._velocities(env, k) for k in range(len(self._starts))])
         row["nudged_divergence"] = self.nudged
-        row["returns"], faults, steps = {}, np.zeros(2), np.zeros(2)
+        row |= {name: {} for name in self.judges}
+        faults, steps = np.zeros(2), np.zeros(2)
         if not setting.physics or buys(low, row["memory"]):
             for source in self.sources:
-                found, *counts = self._compare(env, source)
-                row["returns"][source] = dataclasses.asdict(found)
+                pairs, *counts = self._compare(env, source)
+                for name, judge in self.judges.items():
+                    row[name][source] = dataclasses.asdict(judge(*pairs))
                 faults, steps = faults + counts[0], steps + counts[1]
         rates = 1e6 * faults / np.maximum(steps, 1)
         row |= {"faults_per_million": rates[0], "reference_faults_per_million": rates[1]}
@@ -190,8 +195,8 @@ class Trials:
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
         return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
-    def _compare(self, env: Env, source: str) -> tuple[Difference, np.ndarray, np.ndarray]:
-        """Compare returns, and count faults and steps with and without the setting.
+    def _compare(self, env: Env, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Get pairs of returns, (2, episodes), and count faults and steps with and without the setting.
 
         The spread in the first batch determines the number of batches.
         """
@@ -209,11 +214,12 @@ class Trials:
             faults += (own[1], exact[1])
             steps += (own[2], exact[2])
             if batch == 0 and self.batches is None:
-                first = difference(*pairs[0])
-                if not first.beyond(TOLERANCES["loose"]):
+                first = {name: judge(*pairs[0]) for name, judge in self.judges.items()}
+                if not any(found.beyond(TOLERANCES["loose"]) for found in first.values()):
                     most = max(1, int(self.effort.judging_seconds / self._batch_seconds[source]))
-                    wanted = min(most, math.ceil(episodes_needed(first, _HALF_WIDTH) / env.nworld))
-        return difference(*np.concatenate(pairs, axis=1)), faults, steps
+                    needed = max(episodes_needed(found, _HALF_WIDTHS[name]) for name, found in first.items())
+                    wanted = min(most, math.ceil(needed / env.nworld))
+        return np.concatenate(pairs, axis=1), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
         """Run one episode per world, and get the episodes' returns (nworld,), the faults and the steps.

@@ -1,9 +1,10 @@
+import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.algos.transfer import Difference, task_physics
+from lyceum_warp.algos.transfer import Comparison, Difference, Episodes, _compared, task_physics
 from lyceum_warp.tasks import hopper
 
 
@@ -53,6 +54,57 @@ def test_each_set_of_physics_options_is_compared_with_exact_physics() -> None:
 )  # fmt: skip
 def test_verdict_compares_the_interval_with_the_margin(low: float, high: float, verdict: str) -> None:
     assert Difference(quantity="return", first=0.0, second=0.0, low=low, high=high, margin=1.0).verdict == verdict
+
+
+def comparison(first: np.ndarray, second: np.ndarray) -> Comparison:
+    """Compare two simulations of a task without terminations, whose episodes have the given returns."""
+
+    def episodes(returns: np.ndarray) -> Episodes:
+        zeros = torch.zeros(len(returns))
+        return Episodes(torch.from_numpy(returns), zeros + 100.0, zeros, zeros, zeros, zeros)
+
+    return _compared("a", "b", (episodes(first), 0), (episodes(second), 0), margin=0.05, terminates=False)
+
+
+def verdicts(pairs: int, loss: float, share: float, noise: float, both: float = 0.0) -> dict[str, float]:
+    """Simulate comparisons in which ``share`` more episodes of the second simulation lose ``loss`` of their return.
+
+    Return how often each verdict is given, in percent. In the fraction ``both``, episodes of both simulations lose.
+    """
+    rng, counts = np.random.default_rng(0), {"same": 0, "different": 0, "not shown": 0}
+    for _ in range(1000):
+        first, second = 1.0 + noise * rng.normal(size=(2, pairs))
+        first -= loss * (rng.random(pairs) < both)
+        second -= loss * (rng.random(pairs) < both + share)
+        counts[comparison(first, second).verdict] += 1
+    return {name: count / 10 for name, count in counts.items()}
+
+
+@pytest.mark.parametrize("pairs", [32, 64, 256])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_rare_failures_that_end_no_episode_are_seldom_called_the_same(pairs: int, noise: float) -> None:
+    """In each case, the second simulation's mean return is 5 % lower. The nominal rate is 2.5 %."""
+    for loss in (1.0, 0.7, 0.5, 0.3):
+        assert verdicts(pairs, loss, 0.05 / loss, noise)["same"] <= 5.0
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.05])
+def test_equal_simulations_are_called_the_same(noise: float) -> None:
+    equal = verdicts(64, 0.0, 0.0, noise)
+    assert equal["same"] >= 95.0 and equal["different"] == 0.0
+    rare = verdicts(256, 1.0, 0.0, noise, both=0.02)
+    assert rare["same"] >= 75.0 and rare["different"] <= 0.5
+    assert verdicts(256, 1.0, 0.2, noise)["different"] >= 95.0
+
+
+def test_failures_are_terminations_only_if_the_task_terminates(shared_env: SharedEnv) -> None:
+    env = shared_env("point_mass", horizon=20, integrator="implicitfast")
+    (point,) = lw.transfer(env, lambda obs: obs[:, :2], 4, warp=False).comparisons
+    assert [one.quantity for one in point.differences] == ["return", "length", "clearly worse"]
+    first = np.full(64, 10.0)
+    found = comparison(first, np.where(np.arange(64) < 2, 0.0, first)).differences[2]
+    assert (found.quantity, found.first, found.second) == ("clearly worse", 0.0, 2 / 64)
+    assert found.low < 2 / 64 < found.high and found.verdict == "not shown"
 
 
 def test_wrong_arguments_raise_a_one_line_error(shared_env: SharedEnv) -> None:

@@ -4,7 +4,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lyceum_warp.tuning.judgement import Difference, difference, episodes_needed, verdict
+from lyceum_warp.tuning.judgement import Difference, difference, episodes_needed, failures, verdict
 
 
 def test_interval_covers_the_difference_of_returns_and_shrinks_with_more_episodes() -> None:
@@ -28,6 +28,27 @@ def test_reference_returns_of_zero_give_no_verdict() -> None:
     assert not found.within(0.05) and not found.beyond(0.05)
 
 
+def test_a_true_loss_of_2_percent_by_rare_failures_is_seldom_called_the_same() -> None:
+    rng = np.random.default_rng(0)
+    for pairs in (256, 512):
+        same = {"mean": 0, "both": 0}
+        for _ in range(1000):
+            reference, returns = np.ones(pairs), 1.0 - (rng.random(pairs) < 0.02)
+            mean = difference(reference, returns).within(0.02)
+            same = {
+                "mean": same["mean"] + mean,
+                "both": same["both"] + (mean and failures(reference, returns).within(0.02)),
+            }
+        assert same["both"] <= 45 < same["mean"]  # nominal: 25
+
+
+def test_failures_of_the_unchanged_task_are_subtracted() -> None:
+    reference, returns = np.ones(1000), np.ones(1000)
+    reference[:3], returns[3:10] = 0.0, 0.0
+    found = failures(reference, returns)
+    assert found.mean == pytest.approx(0.004) and -0.003 < found.low < 0.0 < found.high < 0.012
+
+
 def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
     returns = {str(i): {"mean": 0.0, "low": low, "high": high, "episodes": 9} for i, (low, high) in enumerate(bounds)}
     known = {"refused": "", "speedup": 2.0, "speedup_low": 1.9, "memory": 1.0, "faults_per_million": 0.0}
@@ -45,6 +66,10 @@ def row(*bounds: tuple[float, float], **entries: Any) -> dict[str, Any]:
         (row((0.0, 0.0), speedup_low=1.01, memory=0.6), "same"),
         (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=1.0), "faults"),
         (row((0.0, 0.0), faults_per_million=3.0, reference_faults_per_million=2.0), "same"),
+        (
+            row((0.0, 0.0), clearly_worse={"random": {"mean": 0.0, "low": 0.0, "high": 0.03, "episodes": 9}}),
+            "not shown",
+        ),
         ({"refused": "MuJoCo refuses it"}, "refused"),
     ],
 )

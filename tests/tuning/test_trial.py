@@ -29,7 +29,7 @@ def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | 
 def test_unchanged_task_gives_unchanged_returns() -> None:
     row = trials(policy=True).measure(SAME)
     assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
-    assert set(row["returns"]) == {"random", "policy"}
+    assert set(row["returns"]) == set(row["clearly_worse"]) == {"random", "policy"}
     for found in row["returns"].values():
         assert found == {"mean": 0.0, "low": 0.0, "high": 0.0, "episodes": 16}
     assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
@@ -45,7 +45,7 @@ def test_coarse_physics_change_returns_and_states_more_than_a_perturbation_does(
 def test_sparse_jacobian_changes_results_only_by_rounding() -> None:
     own = trials("hopper", nworld=8)
     row = own.measure(Setting("", "", {"jacobian": "sparse"}))
-    assert row["divergence"][0] < 1e-9 < own.nudged[0]
+    assert row["divergence"][0] < 1e-9 < own.nudged[0] and "clearly_worse" not in row
     assert 0.0 < own.in_contact < 1.0  # some robots are in the air
 
 
