@@ -1,6 +1,6 @@
 import mujoco
 import pytest
-from conftest import TaskFile
+from conftest import SharedEnv, TaskFile
 
 import lyceum_warp as lw
 from lyceum_warp.engines.warp import sizes
@@ -101,3 +101,19 @@ def test_buffers_have_rows_for_every_limit_if_ranges_are_randomized() -> None:
     )
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/><worldbody>{joints}</worldbody></mujoco>')
     assert probe_sizes(model)[1] < 20 <= probe_sizes(model, ["jnt_range"])[1]
+
+
+def test_buffers_have_room_for_contacts_at_the_end_of_slow_servos() -> None:
+    """Random velocities average out, so random controls do not bring this plate of 8 balls to the floor."""
+    plate = "".join(f'<geom size=".1" pos="{i} 0 0"/>' for i in range(8))
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco>
+        <worldbody><geom type="plane" size="9 9 1"/>
+            <body pos="0 0 .7"><joint name="z" type="slide" axis="0 0 1"/>{plate}</body></worldbody>
+        <actuator><intvelocity joint="z" kp="1e5" kv="1e4" ctrlrange="-1 1" actrange="-1 1"/></actuator></mujoco>""")
+    contacts, constraints = probe_sizes(model)
+    assert contacts >= 8 and constraints >= 8 * 4
+
+
+def test_buffers_of_panda_lift_have_room_for_a_million_random_steps(shared_env: SharedEnv) -> None:
+    """A million random steps of the task on the C engine had at most 83 constraints."""
+    assert probe_sizes(shared_env("panda_lift").model)[1] > 83
