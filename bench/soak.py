@@ -12,8 +12,9 @@ bitwise equal to its copy there until its first fault. Every fourth world gets n
 A run is divided into chunks. Each chunk continues from the states that the previous chunk stored in the folder
 ``--work``.
 
-Part "random": worlds step under random actions, without injected faults. Part "memory": environments are made and
-deleted. Part "kills": training runs are killed and resumed, and must give the same results as an uninterrupted run.
+Part "random": worlds of every task step under random actions, without injected faults. Part "memory": environments are
+made and deleted. Part "kills": training runs are killed and resumed, and must give the same results as an uninterrupted
+run.
 """
 
 import collections
@@ -202,10 +203,11 @@ def cases(options: Options) -> list[Any]:
             # continue from the last stored state; another machine may have stored it
             done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
             found += chunks[done - 1 :]
-        for task, sizes, _ in runs if "random" in parts else ():
-            many = options.nworld or (sizes[0] if short else OTHERS[0])
-            found.append(Random(task, options.steps or (sizes if short else OTHERS)[1], many, options.engine,
-                                options.device, seed))  # fmt: skip
+        if "random" in parts:
+            sizes = SHORT if short else OTHERS
+            nworld, steps = options.nworld or sizes[0], options.steps or sizes[1]
+            found += [Random(task, steps, nworld, options.engine, options.device, seed)
+                      for task in (tuple(known) if short else options.tasks or lw.task_names())]  # fmt: skip
         if "kills" in parts and not cuda:
             trainings = {"point_mass": SHORT_TRAINING} if short else TRAININGS
             kills = (1, 0.2) if short else (10, options.kill_every)
@@ -429,7 +431,7 @@ def step_randomly(case: Random, options: Options) -> dict[str, Any]:
             world = int(faulty.nonzero()[0])
             first = [t, world, Done(int(env.done_reason[world]) & int(FAULTS)).name]
     seconds = time.perf_counter() - began
-    return {"faults": env.fault_counts, "first": first, "steps": steps * case.nworld,
+    return {"faults": env.fault_counts, "first": first, "engine": env.engine.name, "steps": steps * case.nworld,
             "steps_per_second": steps * case.nworld / seconds}  # fmt: skip
 
 
@@ -521,7 +523,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         elif case["part"] == "random":
             counts = ", ".join(f"{name} {number:,}" for name, number in result["faults"].items() if number)
             first = result["first"] and "step {:,}, world {}: {}".format(*result["first"])
-            calm.append([case["task"], f"{case['engine']}, {case['device']}", f"{case['nworld']}",
+            engine = result.get("engine", case["engine"])  # the case may say "auto"
+            calm.append([case["task"], f"{engine}, {case['device']}", f"{case['nworld']}",
                          f"{result['steps']:,}", f"{result['steps_per_second']:,.0f}", counts or "none",
                          first or ""])  # fmt: skip
         elif case["part"] == "kills":
@@ -561,7 +564,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         ),
         Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
               ["task", "memory", "first", "most", "last", "growth"], grown),
-        Table("Uniformly random actions: faults by reason, and the first fault.",
+        Table("Uniformly random actions under the task's own physics: faults by reason, and the first fault.",
               ["task", "engine", "worlds", "steps", "steps/s", "faults", "first"], calm),
         Table("Bytes that remain allocated per environment that was made and deleted.",
               ["task", "device", "worlds", "made", "resident", "GPU"], made),

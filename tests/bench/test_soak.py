@@ -83,4 +83,10 @@ def test_soak_run_with_random_actions_counts_faults_without_injecting_any(
     words = ("--short", "--parts", "random", "--threads", "1", "--nworld", "16", "--steps", "1600")
     (result,) = run(tmp_path / "soak.jsonl", *words)
     assert result["steps"] == 1600 and result["first"] is None and not any(result["faults"].values())
-    assert "| point_mass | auto, cpu | 16 | 1,600 | " in capsys.readouterr().out
+    assert "| point_mass | mujoco, cpu | 16 | 1,600 | " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_random_part_of_the_soak_runs_every_task(device: str) -> None:
+    cases = soak.cases(soak.Options(parts=("random",), device=device))
+    assert [case.task for case in cases] == lw.task_names() and {case.steps for case in cases} == {10**6}
