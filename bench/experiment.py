@@ -34,8 +34,8 @@ from lyceum_warp.support.versions import versions
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "equivalence",
-         "soak")  # fmt: skip
+NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "agreement",
+         "equivalence", "soak")  # fmt: skip
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
 """Fields of stored results. Results are compared only if these fields are equal."""
