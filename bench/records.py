@@ -6,7 +6,8 @@
 The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
 when the run's config.json says that the target is reached. With a cold cache, the command compiles all kernels. Before
 a measurement with a warm cache, one iteration of the same command fills the cache. A run that lasts longer than
---seconds is stopped. The same command continues it, and the result is the sum of the seconds.
+--seconds is stopped. The same command continues it, and the result is the sum of the seconds. A run that does not reach
+its target within --limit seconds is stored as well. Medians count it as slower than every run that reached the target.
 """
 
 import contextlib
@@ -15,6 +16,7 @@ import json
 import os
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -24,7 +26,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import experiment
-from experiment import Experiment, Row, Skipped, Table, choose, median_and_range
+from experiment import Experiment, Row, Skipped, Table, choose
 
 from lyceum_warp.binding.registry import file_name, package_task_names
 from lyceum_warp.runs.folder import Run
@@ -106,6 +108,8 @@ class Options(experiment.Options):
     """State of the cache of compiled kernels."""
     seconds: float = 540.0
     """Seconds after which a run is stopped; the same command continues the run."""
+    limit: float = 1800.0
+    """Seconds after which a run is stored without having reached its target."""
     runs: Path = Path("runs/records")
     """Folder in which the runs are stored."""
 
@@ -145,25 +149,26 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    """Train until the target is reached; raise Skipped after the time limit of this call."""
+    """Train until the target or the limit is reached; raise Skipped after the time limit of this call."""
     name = f"{file_name(case.task)}-{case.device}-{case.cache}-{case.seed}"
     folder, notes = options.runs / name, options.runs / f"{name}.json"
     earlier = json.loads(notes.read_text()) if notes.exists() and (folder / "checkpoint.pt").exists() else [0.0, 0]
     if not earlier[1]:
         shutil.rmtree(folder, ignore_errors=True)  # an earlier call was killed and left this folder
     options.runs.mkdir(parents=True, exist_ok=True)
+    left = min(options.seconds, options.limit - earlier[0])
     with cache(case, options, folder) as environment:
-        reached, seconds = timed(command(case, folder, options.device), folder, environment, options.seconds)
+        reached, seconds = timed(command(case, folder, options.device), folder, environment, left)
     total, starts = earlier[0] + seconds, earlier[1] + 1
-    if reached is None:
+    if reached is None and total < options.limit:
         notes.write_text(json.dumps([total, starts]))
         raise Skipped(f"{name} has not reached {case.target:g} after {total:.0f} s: repeat the command to continue")
     notes.unlink(missing_ok=True)
-    rows = [row for row in Run.open(folder).rows() if row["iteration"] <= reached["iteration"]]
+    rows = [row for row in Run.open(folder).rows() if reached is None or row["iteration"] <= reached["iteration"]]
     learning = sum(row[part] or 0.0 for row in rows for part in row if part.startswith("time_"))
     return {
-        "seconds": total, "samples": rows[-1]["samples"], "return": reached["return"], "learning_seconds": learning,
-        "starts": starts,
+        "reached": reached is not None, "seconds": total, "samples": rows[-1]["samples"] if rows else 0,
+        "return": reached and reached["return"], "learning_seconds": learning, "starts": starts,
     }  # fmt: skip
 
 
@@ -219,15 +224,31 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     for (task, target, device, cached, flags), same in groups.items():
         results = [row.result for row in same]
         lines.append([
-            task, f"{target:,g}", device, cached, " ".join(str(row.case["seed"]) for row in same),
-            median_and_range([one["seconds"] for one in results], ".1f"),
-            median_and_range([one["learning_seconds"] for one in results], ".1f"),
-            median_and_range([one["samples"] / 1e6 for one in results], ".3g"), f"`{flags}`",
+            task, f"{target:,g}", device, cached, " ".join(map(str, sorted(row.case["seed"] for row in same))),
+            censored(results, "seconds", ".1f"), censored(results, "learning_seconds", ".1f"),
+            censored(results, "samples", ".3g", 1e6), f"`{flags}`",
         ])  # fmt: skip
     header = ["task", "target", "device", "kernels", "seeds", "seconds from process start", "of these learning",
               "million samples", "flags of `lyceum-warp train`"]  # fmt: skip
-    title = "Until the mean return reaches a threshold: median over the seeds, with the smallest and the largest."
+    title = (
+        "Until the mean return reaches a threshold: median over the seeds, with the smallest and the largest. A number "
+        'after ">" is the limit at which a run was stopped without reaching the threshold. Such a run counts as slower '
+        'than all others; "not reached" means that its limit is not known.'
+    )
     return [Table(title, header, lines)]
+
+
+def censored(results: Sequence[dict[str, Any]], name: str, form: str, unit: float = 1.0) -> str:
+    """Write the median and the range of a number; runs that did not reach their targets count as the largest."""
+    ordered = sorted((not one.get("reached", True), (one[name] or 0.0) / unit) for one in results)
+
+    def text(*runs: tuple[bool, float]) -> str:
+        values = [value for _, value in runs]
+        missed = any(missed for missed, _ in runs)
+        return "not reached" if 0.0 in values else f"{'> ' if missed else ''}{statistics.fmean(values):{form}}"
+
+    middle = text(*ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1])
+    return middle if len(ordered) == 1 else f"{middle} ({text(ordered[0])} to {text(ordered[-1])})"
 
 
 EXPERIMENT = Experiment(

@@ -16,5 +16,36 @@ def test_resumed_run_adds_to_the_measured_seconds(
     assert "point_mass-cpu-warm-3 has not reached -10000" in capsys.readouterr().out
     assert experiment.main(records.EXPERIMENT, words) == 0
     (row,) = experiment.read(tmp_path / "records.jsonl")
-    assert row.result["samples"] == 100 and row.result["seconds"] > row.result["learning_seconds"] > 0.0
+    assert (
+        row.result["reached"]
+        and row.result["samples"] == 100
+        and row.result["seconds"] > row.result["learning_seconds"] > 0.0
+    )
     assert "| point_mass | -10,000 | cpu | warm | 3 |" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_run_that_misses_its_target_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ("--algorithm", "npg", "--mean-every", "1", "--nworld", "2", "--samples", "100", "--mean-episodes", "2")
+    monkeypatch.setitem(records.RECORDS, "point_mass", {"cpu": (1e9, flags)})
+    words = ["--tasks", "point_mass", "--seeds", "3", "--out", str(tmp_path / "records.jsonl"), "--runs", str(tmp_path)]
+    assert experiment.main(records.EXPERIMENT, [*words, "--limit", "12"]) == 0
+    (row,) = experiment.read(tmp_path / "records.jsonl")
+    assert not row.result["reached"] and row.result["seconds"] >= 12.0
+    assert "| point_mass | 1e+09 | cpu | warm | 3 | > 1" in capsys.readouterr().out
+
+
+def test_medians_count_missed_targets_as_slower_than_all_others() -> None:
+    def text(*runs: float) -> str:
+        """Describe runs by seconds; a negative number is a limit at which a run was stopped, 0 an unknown limit."""
+        results = [{"reached": run > 0.0, "seconds": abs(run) or None} for run in runs]
+        return records.censored(results, "seconds", ".0f")
+
+    assert text(30.0, 40.0, -20.0) == "40 (30 to > 20)"
+    assert text(30.0, -263.0, 40.0, -20.0) == "> 30 (30 to > 263)"
+    assert text(30.0, -263.0) == "> 146 (30 to > 263)"
+    assert text(-263.0) == "> 263" and text(50.0) == "50"
+    assert text(30.0, 0.0) == "not reached (30 to not reached)" and text(30.0, 40.0, 0.0) == "40 (30 to not reached)"
+    assert records.censored([{"seconds": 5.0}], "seconds", ".1f") == "5.0"
