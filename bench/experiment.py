@@ -35,7 +35,7 @@ from lyceum_warp.support.versions import versions
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "agreement",
-         "equivalence", "soak")  # fmt: skip
+         "equivalence", "policies", "soak")  # fmt: skip
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
 """Fields of stored results. Results are compared only if these fields are equal."""

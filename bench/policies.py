@@ -1,0 +1,82 @@
+"""Compare the pretrained policies between the two engines and between physics options, by `lw.transfer`.
+
+lyceum-warp bench policies
+lyceum-warp bench policies --tasks ant --episodes 256
+"""
+
+import dataclasses
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import experiment
+import torch
+from experiment import Experiment, Row, Skipped, Table, choose
+
+import lyceum_warp as lw
+from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.runs.folder import Run
+from lyceum_warp.runs.pretrained_runs import pretrained_tasks
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(experiment.Options):
+    episodes: int = 64
+    """Number of pairs of episodes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    task: str
+    episodes: int
+    seed: int
+    device: str
+
+
+def cases(options: Options) -> list[Case]:
+    tasks = choose(options.tasks, pretrained_tasks(), ("cartpole_swingup",) if options.short else (), what="task")
+    episodes = min(options.episodes, 4) if options.short else options.episodes
+    return [Case(task, episodes, seed, options.device) for task in tasks for seed in options.seeds or (0,)]
+
+
+def measure(case: Case, options: Options) -> dict[str, Any]:
+    torch.set_num_threads(1)
+    run = Run.open(lw.pretrained_run(case.task))
+    words = {} if options.threads is None else {"nthread": options.threads}
+    try:
+        env = run_worlds(run, words, {}, nworld=1, task=None, trust=False)
+    except (FileNotFoundError, ImportError) as error:
+        raise Skipped(f"{case.task}: {error}") from error
+    return lw.transfer(env, lw.load(run), case.episodes, seed=case.seed, device=case.device).to_dict()
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    lines = []
+    for row in rows:
+        for found in row.result["comparisons"]:
+            returns, _, failures = found["differences"]
+            half = (returns["high"] - returns["low"]) / 2
+            lines.append([
+                row.case["task"], f"{row.case['episodes']}", found["second"], found["first"],
+                f"{returns['second']:,.4g}", f"{returns['first']:,.4g}",
+                f"{(returns['high'] + returns['low']) / 2:+.3g} ± {half:.2g}",
+                f"{failures['second']:.1%}, {failures['first']:.1%} {failures['quantity']}",
+                f"{sum(found['faults'])}", found["verdict"],
+            ])  # fmt: skip
+    title = (
+        "Pretrained policies on pairs of episodes: mean returns of a simulation and of its reference, their difference "
+        'with a 95 % interval, failures (see docs/runs.md) and faults. "C engine" and "Warp engine" run the exact '
+        'physics of the task; "exact physics" and "fast physics" run on the C engine.'
+    )
+    header = ["task", "pairs", "simulation", "reference", "return", "reference's", "difference", "failures", "faults",
+              "verdict"]  # fmt: skip
+    return [Table(title, header, lines)]
+
+
+EXPERIMENT = Experiment(
+    name="policies", summary="Transfer of the pretrained policies between engines and physics options.",
+    cases=cases, estimate=lambda case: 2.0 * case.episodes, measure=measure, tables=tables, options=Options,
+)  # fmt: skip
+
+if __name__ == "__main__":
+    sys.exit(experiment.main(EXPERIMENT))
