@@ -139,7 +139,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = Experiment(
-    name="agreement", summary="Largest differences between tasks and unmodified Gymnasium environments.",
+    name="agreement", conditions="Tasks run on the C engine with exact physics.",
+    summary="Largest differences between tasks and unmodified Gymnasium environments.",
     cases=cases, estimate=lambda case: 10.0, measure=measure, tables=tables, options=Options,
     packages=("gymnasium", "gymnasium-robotics"),
 )  # fmt: skip

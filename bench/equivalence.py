@@ -118,7 +118,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = Experiment(
-    name="equivalence", summary="Equivalence of NPG's learning curves on the two engines (TOST).",
+    name="equivalence", conditions="Both engines step tasks with exact physics.",
+    summary="Equivalence of NPG's learning curves on the two engines (TOST).",
     cases=cases, estimate=estimate, measure=measure, tables=tables, parallel=True, pooled=True,
 )  # fmt: skip
 

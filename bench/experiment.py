@@ -135,6 +135,8 @@ class Experiment:
     """Make tables from the stored results of one machine."""
     figure: Callable[[Sequence[Row]], Any] | None = None
     """Draw the stored results of one machine; return None if there is nothing to draw."""
+    conditions: str = ""
+    """Engine and physics of the results, for the page of tables."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Other libraries whose versions are stored with the results."""

@@ -172,7 +172,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = Experiment(
-    name="fidelity", summary="Agreement of the engines: divergence of trajectories under random actions.",
+    name="fidelity", conditions="Both engines step tasks with exact physics.",
+    summary="Agreement of the engines: divergence of trajectories under random actions.",
     cases=cases, estimate=lambda case: 10.0 + 2e-3 * case.nworld * case.steps, measure=measure, tables=tables,
     options=Options, parallel=True,
 )  # fmt: skip

@@ -247,7 +247,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = Experiment(
-    name="gate", summary="Whether a policy of a velocity task walks: tracking, falls and gait, with limits.",
+    name="gate", conditions="Robots run on the C engine with exact physics.",
+    summary="Whether a policy of a velocity task walks: tracking, falls and gait, with limits.",
     cases=cases, estimate=lambda case: 20.0, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

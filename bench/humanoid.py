@@ -143,7 +143,9 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="humanoid", summary="Humanoids planned in real time: standing, walking, getting up.",
+    name="humanoid",
+    conditions="Plants and planners run on the C engine: plants with exact physics, planners with fast physics.",
+    summary="Humanoids planned in real time: standing, walking, getting up.",
     cases=cases, estimate=estimate, measure=measure, tables=tables,
 )  # fmt: skip
 

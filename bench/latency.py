@@ -164,7 +164,9 @@ def number(value: float | None, form: str) -> str:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="latency", summary="Planning in real time: planning time, deadlines met, age of actions and rewards.",
+    name="latency",
+    conditions="Plants run on the C engine with exact physics; tables name the planner's engine and physics.",
+    summary="Planning in real time: planning time, deadlines met, age of actions and rewards.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options, packages=("gymnasium-robotics",),
 )  # fmt: skip
 

@@ -180,7 +180,8 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="learning", summary="Seconds of learning until NPG or PPO reaches a target return.",
+    name="learning", conditions="The Warp engine on a GPU, the C engine on a CPU, both with exact physics.",
+    summary="Seconds of learning until NPG or PPO reaches a target return.",
     cases=cases, estimate=lambda case: 0.3 * case.seconds, measure=measure, tables=tables, figure=figure,
     options=Options,
 )  # fmt: skip

@@ -306,7 +306,10 @@ def plan_table(found: dict[str, dict[str, list[Row]]]) -> Table:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="mppi", summary="MPPI and a Python planner: episode results and planning time.",
+    name="mppi",
+    conditions="Plants run on the C engine with exact physics. Planners use exact physics on the C engine (unless a "
+    "table says otherwise), and the physics that the task suggests on the Warp engine.",
+    summary="MPPI and a Python planner: episode results and planning time.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
     packages=("gymnasium-robotics",), parallel=True,
 )  # fmt: skip

@@ -458,7 +458,10 @@ def draw(axes: Any, group: Sequence[Row], name: str, x: int) -> None:
 
 
 EXPERIMENT = experiment.Experiment(
-    name="npg", summary="NPG's learning curves on lyceum_warp's and Gymnasium's environments, with PPO and TRPO.",
+    name="npg",
+    conditions="NPG learns on the C engine, on Gymnasium's environments or (on a GPU) on the Warp engine, with exact "
+    "physics.",
+    summary="NPG's learning curves on lyceum_warp's and Gymnasium's environments, with PPO and TRPO.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("stable-baselines3", "sb3-contrib"), apart=True,
 )  # fmt: skip

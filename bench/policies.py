@@ -74,7 +74,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 
 EXPERIMENT = Experiment(
-    name="policies", summary="Transfer of the pretrained policies between engines and physics options.",
+    name="policies", conditions="Tables name the engines and the physics.",
+    summary="Transfer of the pretrained policies between engines and physics options.",
     cases=cases, estimate=lambda case: 2.0 * case.episodes, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

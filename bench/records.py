@@ -252,7 +252,8 @@ def censored(results: Sequence[dict[str, Any]], name: str, form: str, unit: floa
 
 
 EXPERIMENT = Experiment(
-    name="records", summary="Seconds and samples from process start until a policy reaches a threshold.",
+    name="records", conditions="The C engine (device cpu) or the Warp engine (device cuda), both with exact physics.",
+    summary="Seconds and samples from process start until a policy reaches a threshold.",
     cases=cases, estimate=lambda case: 120.0, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

@@ -576,6 +576,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = Experiment(
     name="soak",
+    conditions="Tasks run with exact physics, on the C engine or on the engine that a table names.",
     summary="Very long runs: injected faults, memory growth, and training runs that are killed and resumed.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip

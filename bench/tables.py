@@ -11,7 +11,8 @@ from lyceum_warp.support.files import replaced
 def main(options: experiment.Stored) -> int:
     for name, path in experiment.stored(options.names, options.results).items():
         found = experiment.load(name)
-        parts = [f"# {name}", f"{found.summary} Written by `lyceum-warp bench tables {name}` from `{path.name}`."]
+        source = f"Written by `lyceum-warp bench tables {name}` from `{path.name}`."
+        parts = [f"# {name}", f"{found.summary} {found.conditions} {source}"]
         machines = experiment.by_machine(experiment.read(path))
         for machine, rows in machines.items():
             parts += [f"## {machine}", experiment.described(rows)]

@@ -233,7 +233,9 @@ def figure(rows: Sequence[Row]) -> Any:
 
 
 EXPERIMENT = Experiment(
-    name="throughput", summary="Environment steps per second, compared with native C and other libraries.",
+    name="throughput",
+    conditions="lyceum_warp steps tasks with their own (exact) physics, on the engine that a table names.",
+    summary="Environment steps per second, compared with native C and other libraries.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, figure=figure, options=Options,
     packages=("envpool",),
 )  # fmt: skip

@@ -9,7 +9,11 @@ from experiment import RESULTS, Table
 from lyceum_warp.support.files import replaced
 from lyceum_warp.tuning.judgement import Difference, verdict
 
-TEXT = "# tune\n\nFaster physics at equal returns. Written by `lyceum-warp bench tune_page` from {}."
+TEXT = (
+    "# tune\n\nFaster physics at equal returns. Each title names the engine; the task as it is has exact physics. "
+    "Verdicts on tasks without terminations use returns alone unless the table gives the fraction of clearly worse "
+    "episodes. Written by `lyceum-warp bench tune_page` from {}."
+)
 
 
 def searches(name: str) -> list[list[dict[str, Any]]]:
@@ -30,7 +34,8 @@ def fastest(rows: Sequence[dict[str, Any]], *verdicts: str) -> dict[str, Any] | 
 
 
 def changes(row: dict[str, Any]) -> str:
-    return "; ".join(f"{source} {Difference(**found)}" for source, found in row["returns"].items())
+    both = [("", row["returns"]), ("clearly worse, ", row.get("clearly_worse", {}))]
+    return "; ".join(f"{text}{source} {Difference(**found)}" for text, part in both for source, found in part.items())
 
 
 def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Table:
@@ -76,7 +81,7 @@ def main() -> None:
     parts = [TEXT.format(", ".join(f"`{name}`" for name in names))]
     for name in names:
         found = searches(name)
-        machine = found[0][0]["identity"]["device"]
+        machine = "{device} ({engine} engine)".format(**found[0][0]["identity"])
         planning = [rows for rows in found if "planner" in rows[0]["identity"]]
         worlds = [rows for rows in found if rows not in planning]
         tables = [make(machine, kind) for make, kind in ((worlds_table, worlds), (planning_table, planning)) if kind]

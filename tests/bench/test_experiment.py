@@ -117,6 +117,14 @@ def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("name", experiment.NAMES)
+def test_tables_of_every_experiment_name_engine_and_physics(name: str) -> None:
+    conditions = experiment.load(name).conditions
+    assert "engine" in conditions and "physics" in conditions
+    path = experiment.RESULTS / f"{name}.md"
+    assert not path.exists() or conditions in path.read_text()
+
+
 def test_results_file_with_invalid_lines_raises_an_error(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
