@@ -162,14 +162,18 @@ def figure(rows: Sequence[Row]) -> Any:
     made = new_figure("learning", 6.5, 3.9)
     axes = made.subplots()
     color, marker, line = STYLES[0]
+    gpu = runs[0].provenance.get("gpu")
+    ours = f"lyceum_warp on {f'an {gpu.split()[1]}' if gpu else 'CPU cores'}"
     for k, row in enumerate(runs):
         _, seconds, returns = zip(*row.result["curve"], strict=True)
         axes.plot(seconds, returns, color=color, linestyle=line, marker=marker, markevery=0.15, markersize=4,
-                  linewidth=1.3, label="lyceum_warp" if k == 0 else None)  # fmt: skip
-    with (experiment.RESULTS / "ppo-go1_velocity-mjlab.csv").open(newline="") as file:
-        points = [(float(row["seconds"]), float(row["return_recent"])) for row in csv.DictReader(file)]
+                  linewidth=1.3, label=ours if k == 0 else None)  # fmt: skip
+    with (experiment.RESULTS / "other-projects.csv").open(newline="") as file:
+        curve = [row for row in csv.DictReader(file) if row["project"] == "mjlab" and row["threshold"]]
+    points = [(float(row["value"]), float(row["threshold"])) for row in curve]
     color, marker, line = STYLES[1]
-    axes.plot(*zip(*points, strict=True), color=color, linestyle=line, marker=marker, label="mjlab 1.6.0 with rsl_rl")
+    label = f"mjlab {curve[0]['version']} on an {curve[0]['machine'].split(' (')[0].removeprefix('NVIDIA ')}"
+    axes.plot(*zip(*points, strict=True), color=color, linestyle=line, marker=marker, label=label)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("seconds of sampling and learning")
     axes.set_ylabel("mean return of the last 100 episodes")
