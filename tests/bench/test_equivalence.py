@@ -31,3 +31,9 @@ def test_engines_are_equivalent_only_with_a_small_difference_and_enough_seeds() 
         a, b = random.normal(size=(2, 40, seeds))
         found = [equivalence.equivalence(one, other + difference)["verdict"] for one, other in zip(a, b, strict=True)]
         assert found.count(verdict) > 28
+
+
+def test_a_margin_above_the_mean_permits_no_verdict() -> None:
+    (table,) = equivalence.tables(experiment.read(experiment.RESULTS / "equivalence.jsonl"))
+    verdicts = {line[0]: line[-1] for line in table.rows}
+    assert verdicts["hopper"] == "equivalent" and verdicts["half_cheetah"] == "margin exceeds the mean"
