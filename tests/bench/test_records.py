@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import experiment
@@ -49,3 +50,24 @@ def test_medians_count_missed_targets_as_slower_than_all_others() -> None:
     assert text(-263.0) == "> 263" and text(50.0) == "50"
     assert text(30.0, 0.0) == "not reached (30 to not reached)" and text(30.0, 40.0, 0.0) == "40 (30 to not reached)"
     assert records.censored([{"seconds": 5.0}], "seconds", ".1f") == "5.0"
+
+
+def test_training_times_in_the_readme_are_medians_of_the_records() -> None:
+    rows = experiment.read(experiment.RESULTS / "records.jsonl")
+    readme = (experiment.FOLDER.parent / "README.md").read_text()
+    table = re.findall(r"^\| `(\w+)` \|(( [-\d,.]+ \|){5})$", readme, re.MULTILINE)
+    assert len(table) == 16
+    for task, cells, _ in table:
+        target, warm, cold, cores_target, cores = (float(cell.replace(",", "")) for cell in cells.split("|")[:5])
+        for device, cache, wanted, seconds in (
+            ("cuda", "warm", target, warm), ("cuda", "cold", target, cold), ("cpu", "warm", cores_target, cores),
+        ):  # fmt: skip
+            machine, discount = ("Intel", "--gamma 0.995") if device == "cpu" else ("H200", "none")
+            results = [
+                row.result for row in rows
+                if (row.case["task"], row.case["device"], row.case["cache"]) == (task, device, cache)
+                and row.case["target"] == wanted and machine in f"{row.provenance['cpu']} {row.provenance.get('gpu')}"
+                and discount not in row.case["flags"]
+            ]  # fmt: skip
+            median = records.censored(results, "seconds", ".1f").split(" (")[0]
+            assert abs(float(median) - seconds) <= 0.55, (task, device, cache, median)
