@@ -40,7 +40,8 @@ class Tune:
     """The policy of --run to use: last, best, or the number of a saved iteration."""
     tolerance: Annotated[str, tyro.conf.arg(metavar="strict|loose|any")] = "strict"
     """How much the mean return may change. The 95 % interval of the change must lie within 2 % (strict) or 5 % (loose)
-    of the mean absolute return. With "any", returns may change, but a setting must not cause additional faults.
+    of the mean absolute return. For tasks without terminations, the same holds for the fraction of clearly worse
+    episodes. With "any", returns may change, but a setting must not cause additional faults.
     """
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""

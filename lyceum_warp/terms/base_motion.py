@@ -111,9 +111,9 @@ def vertical_velocity_l2(linear_velocity: wp.vec3) -> float:
 
 @wp.func
 def roll_pitch_rate_l2(angular_velocity: wp.vec3) -> float:
-    """w_x^2 + w_y^2, (rad/s)^2.
+    """w_x^2 + w_y^2, (rad/s)^2, in the base's axes.
 
-    Sources: legged_gym (Rudin et al. 2022), and mjlab 1.6.0, ``body_angular_velocity_penalty``.
+    Source: legged_gym (Rudin et al. 2022). mjlab's ``body_angular_velocity_penalty`` uses the world's axes.
     """
     return angular_velocity[0] * angular_velocity[0] + angular_velocity[1] * angular_velocity[1]
 
