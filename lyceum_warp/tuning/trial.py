@@ -12,7 +12,6 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.evaluation import ENDLESS_STEPS
-from lyceum_warp.algos.transfer import terminates
 from lyceum_warp.done import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.tuning.candidates import Setting
@@ -61,7 +60,9 @@ class Trials:
         self.reference, self.policy, self.effort, self.seed = reference, policy, effort, seed
         self.batches = None if episodes is None else math.ceil(episodes / reference.nworld)
         # failures that end episodes change the returns of many episodes, so the mean return shows them
-        self.judges = {"returns": difference} | ({} if reference.task.ends_by("terminated") else {"clearly_worse": failures})
+        self.judges = {"returns": difference}
+        if not reference.task.ends_by("terminated"):
+            self.judges["clearly_worse"] = failures
         self.sources = {"random": None} | ({} if policy is None else {"policy": policy})
         self.steps = effort.steps or reference.horizon or ENDLESS_STEPS
         if reference.horizon:
