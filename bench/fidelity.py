@@ -23,8 +23,8 @@ from experiment import Experiment, Row, Skipped, Table
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.done import FAULTS
-from lyceum_warp.spaces import COUNTERS
+from lyceum_warp.core.done import FAULTS
+from lyceum_warp.core.spaces import COUNTERS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)

@@ -23,7 +23,7 @@ import torch
 from experiment import STYLES, Experiment, Row, Table, choose
 
 import lyceum_warp as lw
-from lyceum_warp.algos.networks import moved
+from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.viz.style import finish_axes, new_figure
 
 TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {

@@ -15,8 +15,8 @@ from experiment import Experiment, Row, Skipped, Table, choose
 
 import lyceum_warp as lw
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.runs.folder import Run
-from lyceum_warp.runs.pretrained_runs import pretrained_tasks
+from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,7 +29,7 @@ import experiment
 from experiment import Experiment, Row, Skipped, Table, choose
 
 from lyceum_warp.binding.registry import file_name, package_task_names
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.training.runs.folder import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
 """Command-line flags for tasks whose threshold is a mean return of training episodes."""

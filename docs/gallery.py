@@ -21,7 +21,7 @@ from PIL import Image
 
 import lyceum_warp as lw
 from lyceum_warp.binding.registry import file_name, find_task
-from lyceum_warp.runs.configuration import ALGORITHMS
+from lyceum_warp.training.runs.configuration import ALGORITHMS
 from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots

@@ -19,9 +19,9 @@ from sphinx.ext.napoleon import Config, GoogleDocstring
 import lyceum_warp as lw
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.registry import file_name, find_task
-from lyceum_warp.spaces import action_space
+from lyceum_warp.core.spaces import action_space
+from lyceum_warp.core.task import Element, FromModel
 from lyceum_warp.support.docstrings import attribute_docs, field_docs
-from lyceum_warp.task import Element, FromModel
 
 DOCS = Path(__file__).parent
 

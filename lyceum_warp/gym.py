@@ -12,7 +12,7 @@ import gymnasium
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
 from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.task import Task
+from lyceum_warp.core.task import Task
 
 __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
 

@@ -16,7 +16,7 @@ from training_runs import TINY
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.binding.registry import file_name, package_task_names
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.tuning import search
 from lyceum_warp.viewer import show as views
 from lyceum_warp.viz.video import NoVideoError, check_video

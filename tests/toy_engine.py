@@ -7,10 +7,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.core.fields import STATE_FIELDS, Field, Stage, state_columns
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.kernels import faults, state
-from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value

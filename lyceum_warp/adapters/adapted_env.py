@@ -5,9 +5,9 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.env import Env, make
+from lyceum_warp.core.task import Task
+from lyceum_warp.env.env import Env, make
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.task import Task
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
 """The options of ``lw.make`` that adapters refuse. Each value names the argument to use instead."""

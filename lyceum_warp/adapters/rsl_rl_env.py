@@ -5,10 +5,10 @@ from typing import Any
 import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
-from lyceum_warp.done import FAULTS
-from lyceum_warp.env import Env
+from lyceum_warp.core.done import FAULTS
+from lyceum_warp.core.task import Task
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.validate import described
-from lyceum_warp.task import Task
 
 try:
     from rsl_rl.env import VecEnv

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Sequence
 
 import torch
 
-from lyceum_warp.algos.dense import DensePolicy
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.policy import GaussianPolicy
+from lyceum_warp.algos.common.dense import DensePolicy
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.policy import GaussianPolicy
 
 
 def score_gradient(

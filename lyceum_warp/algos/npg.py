@@ -14,18 +14,18 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.dense import DensePolicy, DenseValue
-from lyceum_warp.algos.distributed import Team
+from lyceum_warp.algos.common.dense import DensePolicy, DenseValue
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.algos.common.on_policy import OnPolicyLearner
+from lyceum_warp.algos.common.policy import GaussianPolicy, divergence
+from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered, pooled
+from lyceum_warp.algos.common.timing import PhaseTimer, beside, one_thread
+from lyceum_warp.algos.common.value import BOUND, ValueFunction
+from lyceum_warp.algos.common.value_fit import ValueFit
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
-from lyceum_warp.algos.networks import Normalizer
 from lyceum_warp.algos.npg_config import NPGConfig, enough_samples, least_restarts
-from lyceum_warp.algos.on_policy import OnPolicyLearner
-from lyceum_warp.algos.policy import GaussianPolicy, divergence
-from lyceum_warp.algos.rollout_statistics import OnPolicyIteration, gathered, pooled
-from lyceum_warp.algos.timing import PhaseTimer, beside, one_thread
-from lyceum_warp.algos.value import BOUND, ValueFunction
-from lyceum_warp.algos.value_fit import ValueFit
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 
 log = logging.getLogger(__name__)
@@ -92,7 +92,7 @@ class NPG(OnPolicyLearner):
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
-            trainable (``lyceum_warp.algos.policy_check``).
+            trainable (``lyceum_warp.algos.common.policy_check``).
         FloatingPointError: The policy's step or the value function's fit was not finite in 10 consecutive iterations.
             Non-finite updates are skipped and counted in ``NPGIteration.skipped_updates``.
     """

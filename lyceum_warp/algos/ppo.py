@@ -15,17 +15,17 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.distributed import Team
-from lyceum_warp.algos.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.networks import LIMIT
-from lyceum_warp.algos.on_policy import OnPolicyLearner
-from lyceum_warp.algos.policy import GaussianPolicy, divergence, log_density
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
+from lyceum_warp.algos.common.networks import LIMIT
+from lyceum_warp.algos.common.on_policy import OnPolicyLearner
+from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
+from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
+from lyceum_warp.algos.common.symmetry import apply_symmetry
+from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
+from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.rollout_statistics import OnPolicyIteration, gathered
-from lyceum_warp.algos.symmetry import apply_symmetry
-from lyceum_warp.algos.timing import PhaseTimer, one_thread
-from lyceum_warp.algos.value import ValueFunction
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 
 log = logging.getLogger(__name__)
@@ -83,7 +83,7 @@ class PPO(OnPolicyLearner):
 
     Raises:
         ValueError: The environment does not reset automatically, an argument is of the wrong type, or the policy is not
-            trainable (``lyceum_warp.algos.policy_check``).
+            trainable (``lyceum_warp.algos.common.policy_check``).
         FloatingPointError: A loss, or a parameter of a network, is not finite after an iteration.
     """
 

@@ -3,8 +3,8 @@
 import dataclasses
 from typing import Any, Literal
 
-from lyceum_warp.algos.hyperparameters import check_fields
-from lyceum_warp.algos.networks import Activation
+from lyceum_warp.algos.common.hyperparameters import check_fields
+from lyceum_warp.algos.common.networks import Activation
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import whole_number

@@ -18,21 +18,21 @@ from typing import Any
 import torch
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from lyceum_warp.algos.distributed import Captured, Team
-from lyceum_warp.algos.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.learner import Learner
-from lyceum_warp.algos.minibatches import precision, room
-from lyceum_warp.algos.networks import trainable
-from lyceum_warp.algos.replay import Replay, Transitions, default_capacity
-from lyceum_warp.algos.rollout_buffer import Rollout
-from lyceum_warp.algos.rollout_statistics import SampledIteration, gathered
+from lyceum_warp.algos.common.distributed import Captured, Team
+from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
+from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.common.minibatches import precision, room
+from lyceum_warp.algos.common.networks import trainable
+from lyceum_warp.algos.common.replay import Replay, Transitions, default_capacity
+from lyceum_warp.algos.common.rollout_buffer import Rollout
+from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
+from lyceum_warp.algos.common.squashed_policy import SquashedPolicy
+from lyceum_warp.algos.common.symmetry import apply_symmetry
+from lyceum_warp.algos.common.timing import PhaseTimer
+from lyceum_warp.algos.common.twin_critic import TwinCritic, quantile_loss
+from lyceum_warp.algos.common.value import value_group
 from lyceum_warp.algos.sac_config import SACConfig
-from lyceum_warp.algos.squashed_policy import SquashedPolicy
-from lyceum_warp.algos.symmetry import apply_symmetry
-from lyceum_warp.algos.timing import PhaseTimer
-from lyceum_warp.algos.twin_critic import TwinCritic, quantile_loss
-from lyceum_warp.algos.value import value_group
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind
 

@@ -19,13 +19,13 @@ from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.binding.sources import is_struct, overloads
 from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
-from lyceum_warp.fields import DATA_FIELDS, INITIAL, INPUTS, Field, describe, is_data_field, vec10
-from lyceum_warp.model_fields import VARYING_FIELDS, describe_model_field, is_model_field
-from lyceum_warp.options import ModelSource, PhysicsOptions
-from lyceum_warp.spaces import OWN_PARTS
+from lyceum_warp.core.fields import DATA_FIELDS, INITIAL, INPUTS, Field, describe, is_data_field, vec10
+from lyceum_warp.core.model_fields import VARYING_FIELDS, describe_model_field, is_model_field
+from lyceum_warp.core.options import ModelSource, PhysicsOptions
+from lyceum_warp.core.spaces import OWN_PARTS
+from lyceum_warp.core.task import FUNCTIONS, MEMORIES, RESULTS, Row, Task, TaskFunction, observer_name
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.task import FUNCTIONS, MEMORIES, RESULTS, Row, Task, TaskFunction, observer_name
 
 _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",

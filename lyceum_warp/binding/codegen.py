@@ -16,12 +16,12 @@ from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parts import Layout, view_lines
 from lyceum_warp.binding.sources import free_module_name, is_struct, run_source
 from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.fields import is_data_field
+from lyceum_warp.core.fields import is_data_field
+from lyceum_warp.core.model_fields import NOT_NEGATIVE
+from lyceum_warp.core.task import FUNCTIONS, Row, TaskFunction
 from lyceum_warp.kernels import random, steps
 from lyceum_warp.kernels import rows as kernel_rows
 from lyceum_warp.kernels.step_types import TaskCode
-from lyceum_warp.model_fields import NOT_NEGATIVE
-from lyceum_warp.task import FUNCTIONS, Row, TaskFunction
 
 _BATCH = """
 @wp.struct

@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.fields import is_data_field
-from lyceum_warp.model_fields import is_model_field
+from lyceum_warp.core.fields import is_data_field
+from lyceum_warp.core.model_fields import is_model_field
+from lyceum_warp.core.task import FUNCTIONS
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.upstream import builtin_functions
-from lyceum_warp.task import FUNCTIONS
 
 _NUMBERS = "write numbers as floats, as in 2.0, and convert integers by float(n)"
 

@@ -15,7 +15,7 @@ from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import is_struct, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
-from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
+from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
 
 
 class TaskSource:

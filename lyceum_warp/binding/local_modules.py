@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lyceum_warp.binding.data_files import Stamps, data_files, stamps
+from lyceum_warp.binding.opened_files import Stamps, data_files, stamps
 
 _taken: dict[str, Stamps] = {}
 """Maps each imported local module to the stamps of its file, and of the data files that it read, at its import."""

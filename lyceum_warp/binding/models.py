@@ -12,10 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.fields import ON_DEMAND, SENSED
-from lyceum_warp.model_fields import MOVED_INERTIA
-from lyceum_warp.model_files import ModelFile, gymnasium_model, read_spec
-from lyceum_warp.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
+from lyceum_warp.core.fields import ON_DEMAND, SENSED
+from lyceum_warp.core.model_fields import MOVED_INERTIA
+from lyceum_warp.core.model_files import ModelFile, gymnasium_model, read_spec
+from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
 from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.suggestions import did_you_mean
 

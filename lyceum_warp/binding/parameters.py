@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.fields import elements, rows
-from lyceum_warp.options import OPTIONS, suggestion
-from lyceum_warp.task import Element, FromModel
+from lyceum_warp.core.fields import elements, rows
+from lyceum_warp.core.options import OPTIONS, suggestion
+from lyceum_warp.core.task import Element, FromModel
 
 _FILLED_IN = ("dt", "substep_dt")
 """Parameters that the package sets: the durations of a step and of a substep, in seconds."""

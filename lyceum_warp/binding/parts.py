@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.sources import is_row
+from lyceum_warp.core.task import Part
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.task import Part
 
 
 @dataclasses.dataclass(frozen=True)

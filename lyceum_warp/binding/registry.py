@@ -19,11 +19,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from lyceum_warp.binding.data_files import Stamps, data_files, stamps
 from lyceum_warp.binding.local_modules import importable, local_modules
+from lyceum_warp.binding.opened_files import Stamps, data_files, stamps
+from lyceum_warp.core.task import Task
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.task import Task
 
 _tasks: dict[str, type[Task]] = {}
 

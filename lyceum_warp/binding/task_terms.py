@@ -13,7 +13,7 @@ from typing import Any, Literal
 import warp as wp
 
 from lyceum_warp.binding.sources import is_struct, overloads, run_source, source_of
-from lyceum_warp.task import Row, Task
+from lyceum_warp.core.task import Row, Task
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
 """Maps each possible argument of a reward term or metric to a variable of the generated text."""

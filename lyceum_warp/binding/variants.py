@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.binding.sources import has_source, is_struct, name_of, overloads
-from lyceum_warp.task import FUNCTIONS, GROUP_PREFIX, Task
+from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, Task
 
 
 class Variant:

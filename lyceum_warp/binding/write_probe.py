@@ -9,10 +9,10 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import Layout, sizes
+from lyceum_warp.core.spaces import Space
+from lyceum_warp.core.task import observer_name
 from lyceum_warp.kernels import step_types
-from lyceum_warp.spaces import Space
 from lyceum_warp.support.arrays import launch_parts, launch_worlds
-from lyceum_warp.task import observer_name
 
 _ROOM = 2**18
 """Bytes of guard memory before and after every row. A write outside a row changes only guard memory."""

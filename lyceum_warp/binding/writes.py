@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.binding.sources import has_source, is_row, is_struct, name_of, overloads, source_of
-from lyceum_warp.fields import DERIVED_FIELDS
+from lyceum_warp.core.fields import DERIVED_FIELDS
 
 _READERS = {"len", "lower_bound", "sample_cdf", "print", "printf"}
 

@@ -13,12 +13,12 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp import training
-from lyceum_warp.algos.learner import Iteration, Learner
+from lyceum_warp.algos.common.learner import Iteration, Learner
 from lyceum_warp.controllers.episode_collector import ControlProgress
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.runs.folder import Run
 from lyceum_warp.support.long_work import LongWork
+from lyceum_warp.training import loop as training
+from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz.policy_videos import one_line
 
 _TABLE_ROWS = 15

@@ -9,27 +9,27 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.policy import Policy, acting
-from lyceum_warp.algos.policy_check import check_sizes
-from lyceum_warp.algos.transfer import Transfer, simulation, transfer
+from lyceum_warp.algos.common.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.common.policy import Policy, acting
+from lyceum_warp.algos.common.policy_check import check_sizes
+from lyceum_warp.algos.common.transfer import Transfer, simulation, transfer
 from lyceum_warp.binding.registry import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameter, parameters
 from lyceum_warp.cli.display import console, fitting_table, note, say, tried
-from lyceum_warp.controllers.policy_episodes import policy_episodes
+from lyceum_warp.controllers.batch import policy_episodes
 from lyceum_warp.controllers.trajectory import source
-from lyceum_warp.curriculum import Curriculum
+from lyceum_warp.core.options import EnvOptions
 from lyceum_warp.engines.placement import options_for_few_worlds, options_on_cores
-from lyceum_warp.env import Env
-from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.choice import AUTO, EPISODES, choose_policy
-from lyceum_warp.runs.configuration import Configuration
-from lyceum_warp.runs.folder import Run, load, load_curriculum
-from lyceum_warp.runs.pretrained_runs import pretrained_run, pretrained_text
-from lyceum_warp.runs.task_copy import note_changes, run_env
+from lyceum_warp.env.curriculum import Curriculum
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import whole_number
+from lyceum_warp.training.runs.choice import AUTO, EPISODES, choose_policy
+from lyceum_warp.training.runs.configuration import Configuration
+from lyceum_warp.training.runs.folder import Run, load, load_curriculum
+from lyceum_warp.training.runs.pretrained_runs import pretrained_run, pretrained_text
+from lyceum_warp.training.runs.task_copy import note_changes, run_env
 from lyceum_warp.viz.cameras import find_camera, parsed_camera
 from lyceum_warp.viz.policy_videos import policy_video
 from lyceum_warp.viz.video import check_video

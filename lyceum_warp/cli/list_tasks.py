@@ -18,9 +18,9 @@ from lyceum_warp.binding.parameters import defaults
 from lyceum_warp.binding.parts import length
 from lyceum_warp.binding.registry import find_task, task_names
 from lyceum_warp.cli.display import console
-from lyceum_warp.model_files import ModelFile
-from lyceum_warp.options import PhysicsOptions
-from lyceum_warp.task import Task
+from lyceum_warp.core.model_files import ModelFile
+from lyceum_warp.core.options import PhysicsOptions
+from lyceum_warp.core.task import Task
 
 _HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
 

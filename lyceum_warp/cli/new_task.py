@@ -16,8 +16,14 @@ from lyceum_warp.binding.registry import find_task, package_task_names, snake_ca
 from lyceum_warp.cli.display import say
 from lyceum_warp.cli.task_text import literal, task_text
 from lyceum_warp.cli.velocity_text import TRAINING, Walker, substeps, velocity_text
-from lyceum_warp.model_files import ModelFile, gymnasium_model, gymnasium_robotics_model, menagerie_model, read_spec
-from lyceum_warp.options import CONES, PhysicsOptions
+from lyceum_warp.core.model_files import (
+    ModelFile,
+    gymnasium_model,
+    gymnasium_robotics_model,
+    menagerie_model,
+    read_spec,
+)
+from lyceum_warp.core.options import CONES, PhysicsOptions
 from lyceum_warp.support.files import replaced
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {

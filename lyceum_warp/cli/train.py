@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.algos.distributed import Team, join
-from lyceum_warp.algos.evaluation import evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.learner import Learner
-from lyceum_warp.algos.squashed_policy import SquashedPolicy
+from lyceum_warp.algos.common.distributed import Team, join
+from lyceum_warp.algos.common.evaluation import evaluation_seed, evaluation_worlds
+from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.common.squashed_policy import SquashedPolicy
 from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -26,18 +26,18 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
-from lyceum_warp.options import EnvOptions
-from lyceum_warp.runs.checkpoints import read_checkpoint
-from lyceum_warp.runs.choice import EPISODES, choose_policy
-from lyceum_warp.runs.configuration import ALGORITHMS, Configuration, saved_networks
-from lyceum_warp.runs.folder import Run, load
-from lyceum_warp.runs.task_copy import note_changes
+from lyceum_warp.core.options import EnvOptions
+from lyceum_warp.core.task import Training
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.task import Training
-from lyceum_warp.training import train
+from lyceum_warp.training.curve import learning_curve
+from lyceum_warp.training.loop import train
+from lyceum_warp.training.runs.checkpoints import read_checkpoint
+from lyceum_warp.training.runs.choice import EPISODES, choose_policy
+from lyceum_warp.training.runs.configuration import ALGORITHMS, Configuration, saved_networks
+from lyceum_warp.training.runs.folder import Run, load
+from lyceum_warp.training.runs.task_copy import note_changes
 from lyceum_warp.viz.cameras import parsed_camera
-from lyceum_warp.viz.learning_curve import learning_curve
 from lyceum_warp.viz.policy_videos import policy_video
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.controller import Controller
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.validate import described, positive_number
 
 

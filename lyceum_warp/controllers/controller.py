@@ -5,7 +5,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 
 
 class Controller(Protocol):

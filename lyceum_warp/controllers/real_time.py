@@ -24,7 +24,7 @@ from lyceum_warp.controllers.episode_collector import (
     begin_episode,
 )
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number
 
 # all in seconds

@@ -9,7 +9,7 @@ import numpy as np
 
 from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.controllers.real_time import control_async
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 
 SHARE = 0.8
 """A setting meets a deadline if 99 % of its plans take at most this fraction of the deadline."""

@@ -10,8 +10,8 @@ from typing import Any
 
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.env import Env
-from lyceum_warp.task import Task
+from lyceum_warp.core.task import Task
+from lyceum_warp.env.env import Env
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:

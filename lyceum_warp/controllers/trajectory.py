@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from lyceum_warp.binding.registry import spelled_task
-from lyceum_warp.done import Done
-from lyceum_warp.env import Env
+from lyceum_warp.core.done import Done
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.validate import first_sentence

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.fields import Field, Stage, describe
+from lyceum_warp.core.fields import Field, Stage, describe
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels.state import narrow, widen
-from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import flat, launch_rows
 from lyceum_warp.support.docstrings import document_attributes
 

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.core.fields import Field
+from lyceum_warp.core.model_fields import ModelField
+from lyceum_warp.core.options import EnvOptions
 from lyceum_warp.engines.base import Engine, EngineFactory
 from lyceum_warp.engines.memory import check_fit
-from lyceum_warp.fields import Field
-from lyceum_warp.model_fields import ModelField
-from lyceum_warp.options import EnvOptions
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.warp_log import start_warp
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lyceum_warp.done import FAULTS
+from lyceum_warp.core.done import FAULTS
 
 _FAULTS = wp.constant(int(FAULTS))
 _BITS = wp.constant(int(FAULTS).bit_length())

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lyceum_warp.done import Done
+from lyceum_warp.core.done import Done
 
 MAX_MAGNITUDE = wp.constant(1.0e10)
 NAN = wp.constant(int(Done.NAN))

@@ -6,7 +6,7 @@ samples of a plant in consecutive rows. With spline knots, the first axis has on
 
 import warp as wp
 
-from lyceum_warp.done import Done
+from lyceum_warp.core.done import Done
 from lyceum_warp.kernels.faults import is_out_of_range
 from lyceum_warp.kernels.random import stream, world_key
 

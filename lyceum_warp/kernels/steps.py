@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.done import FAULTS, Done
+from lyceum_warp.core.done import FAULTS, Done
 from lyceum_warp.kernels.random import stream, substream
 from lyceum_warp.kernels.step_types import Counters, TaskCode
 from lyceum_warp.kernels.transitions import judge_kernels, rollout_kernels

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from lyceum_warp.done import Done
+from lyceum_warp.core.done import Done
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.random import stream, substream
 from lyceum_warp.kernels.rows import copy_row

@@ -9,7 +9,7 @@ A task's ``advance`` stores earlier actions in memory, which terms and observati
 
 import warp as wp
 
-from lyceum_warp.task import Row
+from lyceum_warp.core.task import Row
 
 
 @wp.func

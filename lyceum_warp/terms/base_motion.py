@@ -6,8 +6,8 @@ The free joint of the base is the first joint of the model. For a different base
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.rotations import quat_rotate, quat_rotate_inverse
-from lyceum_warp.task import Row
 
 
 @wp.func

@@ -6,9 +6,9 @@ nominal value, because a reset restores the field first.
 
 import warp as wp
 
-from lyceum_warp.fields import vec10
+from lyceum_warp.core.fields import vec10
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.random import uniform
-from lyceum_warp.task import Row
 
 
 @wp.func

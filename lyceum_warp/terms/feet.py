@@ -7,8 +7,8 @@ plane z = 0. On uneven ground, a task must measure the heights itself and sum ``
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.support.docstrings import document_overloads
-from lyceum_warp.task import Row
 
 
 @wp.func

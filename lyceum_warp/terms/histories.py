@@ -5,7 +5,7 @@ To store the last n values of ``width`` numbers, declare ``past_values: Row[floa
 
 import warp as wp
 
-from lyceum_warp.task import Row
+from lyceum_warp.core.task import Row
 
 
 @wp.func

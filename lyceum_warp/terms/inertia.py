@@ -8,9 +8,9 @@ scales its density.
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.random import uniform
 from lyceum_warp.kernels.rotations import quat_from_mat, quat_mul, quat_to_mat
-from lyceum_warp.task import Row
 
 
 @wp.func

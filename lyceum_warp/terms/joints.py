@@ -5,7 +5,7 @@ All tables list the joints in the same order.
 
 import warp as wp
 
-from lyceum_warp.task import Row
+from lyceum_warp.core.task import Row
 from lyceum_warp.terms.velocity_commands import command_size
 
 

@@ -2,9 +2,9 @@
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.random import normal, uniform
 from lyceum_warp.support.docstrings import document_overloads
-from lyceum_warp.task import Row
 
 
 @wp.func

@@ -2,9 +2,9 @@
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.random import uniform
 from lyceum_warp.kernels.rotations import quat_rotate_inverse
-from lyceum_warp.task import Row
 from lyceum_warp.terms.base_motion import orientation
 
 

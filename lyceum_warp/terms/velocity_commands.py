@@ -13,8 +13,8 @@ The order of the calls follows ``UniformVelocityCommand`` of mjlab 1.6.0.
 
 import warp as wp
 
+from lyceum_warp.core.task import Row
 from lyceum_warp.kernels.random import uniform
-from lyceum_warp.task import Row
 from lyceum_warp.terms.draws import chosen
 
 

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import EngineFactory
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.task import Task
 from lyceum_warp.testing import buffer_rules as buffers
 from lyceum_warp.testing import episode_rules as episodes
 from lyceum_warp.testing import fault_rules as faults

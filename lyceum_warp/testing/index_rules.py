@@ -8,12 +8,12 @@ import torch
 import warp as wp
 
 from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.done import FAULTS, Done
+from lyceum_warp.core.done import FAULTS, Done
+from lyceum_warp.core.task import FUNCTIONS, MEMORIES, observer_name
+from lyceum_warp.env.worlds import Worlds
 from lyceum_warp.support.arrays import torch_view
-from lyceum_warp.task import FUNCTIONS, MEMORIES, observer_name
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context
-from lyceum_warp.worlds import Worlds
 
 _RESET = ("startup", "initialize", "randomize")
 

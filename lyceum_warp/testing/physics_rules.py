@@ -10,11 +10,11 @@ import mujoco
 import numpy as np
 import torch
 
-from lyceum_warp.env import Env
-from lyceum_warp.fields import INPUTS
+from lyceum_warp.core.fields import INPUTS
+from lyceum_warp.env.arrays import memory_columns
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.testing.context import SHORT, Context
-from lyceum_warp.world_arrays import memory_columns
 
 _SMALLEST = 1e-4
 """Inputs and model fields are not checked if they move all coordinates by less than this distance."""

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.algos.planner import MPPI
-from lyceum_warp.options import PhysicsOptions
+from lyceum_warp.algos.planning.planner import MPPI
+from lyceum_warp.core.options import PhysicsOptions
+from lyceum_warp.core.task import Task
 from lyceum_warp.support.intervals import mean_interval
-from lyceum_warp.task import Task
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.trial import random_actions
 

@@ -9,13 +9,13 @@ from typing import TypeAlias
 
 import torch
 
-from lyceum_warp.algos.evaluation import evaluation_worlds
-from lyceum_warp.algos.learner import Iteration, Learner
-from lyceum_warp.algos.networks import moved
-from lyceum_warp.algos.policy import Policy, acting
-from lyceum_warp.controllers.policy_episodes import policy_episodes
-from lyceum_warp.curriculum import Curriculum
-from lyceum_warp.env import Env
+from lyceum_warp.algos.common.evaluation import evaluation_worlds
+from lyceum_warp.algos.common.learner import Iteration, Learner
+from lyceum_warp.algos.common.networks import moved
+from lyceum_warp.algos.common.policy import Policy, acting
+from lyceum_warp.controllers.batch import policy_episodes
+from lyceum_warp.env.curriculum import Curriculum
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.video import Progress, write_video

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import mujoco
 import torch
 
-from lyceum_warp.env import Env
+from lyceum_warp.env.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz import NoVideoError

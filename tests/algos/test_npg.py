@@ -10,7 +10,7 @@ import torch
 from full_task import Full
 
 import lyceum_warp as lw
-from lyceum_warp.algos.dense import DensePolicy, DenseValue
+from lyceum_warp.algos.common.dense import DensePolicy, DenseValue
 from lyceum_warp.algos.npg import NPGIteration
 
 SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)

@@ -10,7 +10,7 @@ from conftest import SharedEnv
 from metered_task import Metered
 
 import lyceum_warp as lw
-from lyceum_warp.algos.networks import Normalizer
+from lyceum_warp.algos.common.networks import Normalizer
 
 SMALL = lw.SACConfig(
     hidden=(8,), value_hidden=(8, 8), num_steps=12, warmup=60, updates=2, batch=16, replay=78, mean_every=2,

@@ -5,7 +5,7 @@ import tiny_task
 
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.task import FUNCTIONS
+from lyceum_warp.core.task import FUNCTIONS
 
 MEANT = {
     name: f"def {function.signature}:\n    {function.default}"

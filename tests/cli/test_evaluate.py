@@ -12,7 +12,7 @@ from training_runs import interrupted, refused, train
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
-from lyceum_warp.runs.folder import load
+from lyceum_warp.training.runs.folder import load
 from lyceum_warp.viz import policy_videos
 from lyceum_warp.viz.cameras import find_camera
 

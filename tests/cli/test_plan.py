@@ -19,7 +19,7 @@ from lyceum_warp.binding.registry import find_task
 from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.training.runs.folder import Run
 
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 

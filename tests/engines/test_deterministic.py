@@ -13,13 +13,13 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
+from lyceum_warp.core.fields import describe
 from lyceum_warp.engines import memory
 from lyceum_warp.engines.deterministic import order_kernels as order
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.deterministic.sort_memory import Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import describe
 
 
 @pytest.fixture

@@ -7,12 +7,12 @@ import warp as wp
 from test_refresh import WholeWarpEngine
 from toy_engine import ToyEngine
 
+from lyceum_warp.core.fields import describe, state_columns
+from lyceum_warp.core.model_fields import describe_model_field
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.placement import bytes_per_world, open_engine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import describe, state_columns
-from lyceum_warp.model_fields import describe_model_field
 
 XML = """<mujoco><option integrator="implicitfast" cone="elliptic" timestep=".004"/>
 <worldbody><geom name="floor" type="plane" size="5 5 .1" friction=".3"/>

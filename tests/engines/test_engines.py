@@ -10,10 +10,10 @@ from conftest import TaskFile
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
+from lyceum_warp.core.fields import describe
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import describe
 from lyceum_warp.testing import check_task
 from lyceum_warp.testing.state_rules import check_reset, check_restoring
 

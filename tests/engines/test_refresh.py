@@ -8,10 +8,10 @@ import pytest
 import step_table as table
 import warp as wp
 
+from lyceum_warp.core.fields import Stage, describe, early_sensor_columns, state_columns
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import Stage, describe, early_sensor_columns, state_columns
 
 SENSORS = {name: table.SENSORS[name] for name in ("position", "velocity", "limits", "histories")}
 SENSORS["limits"] = re.sub(r"<\w+frc [^>]*>", "", SENSORS["limits"])  # the acceleration stage computes force sensors

@@ -11,10 +11,10 @@ import warp as wp
 from mujoco_warp._src import constraint
 from step_table import Case
 
+from lyceum_warp.core.fields import Stage, describe, early_sensor_columns
+from lyceum_warp.core.model_fields import VARYING_FIELDS, Constants, ModelField, describe_model_field
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import Stage, describe, early_sensor_columns
-from lyceum_warp.model_fields import VARYING_FIELDS, Constants, ModelField, describe_model_field
 
 N = 2
 SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value

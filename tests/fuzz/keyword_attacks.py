@@ -23,7 +23,7 @@ from minimal_cases import KEYWORDS
 from mutations import VALUES
 
 import lyceum_warp as lw
-from lyceum_warp.algos.mppi_config import SETTINGS
+from lyceum_warp.algos.planning.config import SETTINGS
 from lyceum_warp.support.validate import described
 
 HERE = Path("keywords").absolute()

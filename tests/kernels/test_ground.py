@@ -4,7 +4,7 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.terrain import height_table
+from lyceum_warp.models.terrain import height_table
 
 NROW, NCOL, SIZE = 6, 9, (2.0, 1.25, 0.8, 0.3)
 OFFSET = (0.5, -0.25, 0.125)

@@ -4,8 +4,8 @@ import torch
 from training_runs import train
 
 import lyceum_warp as lw
-from lyceum_warp.runs.checkpoints import policy_content, write_content
-from lyceum_warp.runs.folder import Run
+from lyceum_warp.training.runs.checkpoints import policy_content, write_content
+from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viewer.follow import Follower
 
 

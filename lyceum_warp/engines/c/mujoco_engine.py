@@ -10,12 +10,7 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
-from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.c.batch_faults import call_batch
-from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
-from lyceum_warp.engines.c.world_models import WorldModels
-from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
-from lyceum_warp.fields import (
+from lyceum_warp.core.fields import (
     DERIVED_FIELDS,
     READ_ONLY,
     STATE_FIELDS,
@@ -24,6 +19,12 @@ from lyceum_warp.fields import (
     early_sensor_columns,
     state_columns,
 )
+from lyceum_warp.core.model_fields import ModelField
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.c.batch_faults import call_batch
+from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
+from lyceum_warp.engines.c.world_models import WorldModels
+from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import (
@@ -35,7 +36,6 @@ from lyceum_warp.kernels.state import (
     widen_bool,
     widen_four,
 )
-from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, launch_worlds
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.mujoco_log import quiet

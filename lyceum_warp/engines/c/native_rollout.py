@@ -8,10 +8,10 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch
 
+from lyceum_warp.core.fields import STATE_FIELDS, Field, Stage, state_columns
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.engines.c.world_models import WorldModels
-from lyceum_warp.fields import STATE_FIELDS, Field, Stage, state_columns
-from lyceum_warp.model_fields import ModelField
 
 
 def is_exact(model: mujoco.MjModel, fields: Iterable[Field]) -> bool:

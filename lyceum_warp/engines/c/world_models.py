@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from mujoco.batch import MODEL_FIELDS, Batch
 
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.c.batch_faults import call_batch
-from lyceum_warp.model_fields import ModelField
 
 
 class WorldModels:

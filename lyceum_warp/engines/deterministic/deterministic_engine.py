@@ -9,14 +9,14 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from lyceum_warp.core.fields import Field
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.sort_memory import LARGEST_BUFFER, Scratch, ScratchSizes
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.engines.warp import forward
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.fields import Field
 from lyceum_warp.graphs.capture import capturing
-from lyceum_warp.model_fields import ModelField
 
 _TIMES_THE_MEMORY = 5
 """This engine's memory per world, divided by the Warp engine's estimate. Measured factors are 4.9 on humanoid, 6.1 on

@@ -10,10 +10,10 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from lyceum_warp.core.fields import Stage
 from lyceum_warp.engines.warp.group import Turns
 from lyceum_warp.engines.warp.sizes import report_pool_overflow
 from lyceum_warp.engines.warp.varied_model import ModelRows, StaticGeoms
-from lyceum_warp.fields import Stage
 from lyceum_warp.kernels.state import copy_rows
 from lyceum_warp.support.arrays import launch_rows
 from lyceum_warp.support.upstream import forward_functions

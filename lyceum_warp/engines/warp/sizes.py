@@ -14,10 +14,10 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.kernels import faults
-from lyceum_warp.model_fields import ModelField
 
 log = logging.getLogger(__name__)
 

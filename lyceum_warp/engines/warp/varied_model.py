@@ -8,9 +8,9 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from lyceum_warp.core.model_fields import Constants, ModelField
 from lyceum_warp.engines.warp.group import Turns, group_size
 from lyceum_warp.engines.warp.warp_kernels import correct_weights, mark_changed, place_geoms
-from lyceum_warp.model_fields import Constants, ModelField
 from lyceum_warp.support.arrays import flat
 
 _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}

@@ -9,6 +9,8 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
+from lyceum_warp.core.fields import Field, Stage, early_sensor_columns
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import forward, sizes
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
@@ -23,10 +25,8 @@ from lyceum_warp.engines.warp.varied_model import (
     owner,
     put_varied_model,
 )
-from lyceum_warp.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
-from lyceum_warp.model_fields import ModelField
 from lyceum_warp.support.arrays import alias, flat, launch_rows
 from lyceum_warp.support.upstream import has_sdf_functions, quicken_mujoco_warp
 from lyceum_warp.support.validate import whole_number

@@ -1,0 +1,1 @@
+"""Share what learners need: policies, values, buffers, evaluation, processes."""

@@ -1,0 +1,200 @@
+"""Evaluate and differentiate small fully connected networks on the CPU without autograd.
+
+With a hundred units per layer, torch's modules and autograd take longer than the arithmetic itself. For each layer,
+this module computes only one matrix product, into a preallocated buffer.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from torch import nn
+
+from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.algos.common.policy import GaussianPolicy
+from lyceum_warp.algos.common.value import ValueFunction
+
+_Array: TypeAlias = np.ndarray[Any, np.dtype[np.float32]]
+
+
+def _elu_(x: _Array) -> None:
+    np.copyto(x, np.expm1(x), where=x < 0.0)
+
+
+_tanh_slope, _relu_slope, _elu_slope = (
+    getattr(torch.ops.aten, f"{name}_backward").grad_input for name in ("tanh", "threshold", "elu")
+)
+
+# NumPy's tanh is several times as fast as torch's on some processors
+_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[torch.Tensor, torch.Tensor], Any]]] = {
+    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda d, y: _tanh_slope(d, y, grad_input=d)),
+    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
+    nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
+}
+"""Two functions for each activation: one applies it in place, the other multiplies by its derivative in place."""
+
+_FEW = 2**18  # up to this number of multiplications, use NumPy, whose calls have less overhead than torch's
+
+
+class DensePasses:
+    """Computes forward passes y = f(x), and products with the Jacobian J = dy / dparameters.
+
+    The next call overwrites the returned tensors. The parameters are the weight and bias of each layer.
+    """
+
+    def __init__(self, parameters: Iterable[torch.Tensor], activation: type[nn.Module]) -> None:
+        self.parameters = [parameter.detach() for parameter in parameters]
+        self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
+        self.activation = activation
+        self._activate, self._times_slope = _ACTIVATIONS[activation]
+        self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
+        self._pulled = [torch.empty_like(parameter) for parameter in self.parameters]
+        self._rows = 0
+        self._buffers: list[list[torch.Tensor]] = []
+        self._allocate(0)
+
+    @staticmethod
+    def of(network: nn.Module) -> "DensePasses | None":
+        """Wrap a CPU network made by ``mlp``; return None for any other network."""
+        if type(network) is not nn.Sequential or len(network) % 2 == 0:
+            return None
+        layers: list[Any] = list(network)[::2]
+        activations = list(network)[1::2]
+        kind = type(activations[0]) if activations else nn.Tanh
+        linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
+        parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
+        if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
+            return None
+        if (
+            any(p.device.type != "cpu" or p.dtype != torch.float32 for p in parameters)
+            or any(type(module) is not kind or getattr(module, "alpha", 1.0) != 1.0 for module in activations)
+            or any(map(_hooked, network.modules()))
+        ):
+            return None
+        return DensePasses(parameters, kind)
+
+    def _allocate(self, rows: int) -> None:
+        widths = [len(bias) for bias in self.biases]
+        self._buffers = [[torch.empty(rows, n) for n in widths] for _ in range(2)]
+
+    def _resize(self, rows: int) -> None:
+        if rows > len(self._buffers[0][0]):
+            self._allocate(rows)
+        self._rows, self._few = rows, rows * max(weight.numel() for weight in self.weights) <= _FEW
+        self.results, self.derivatives = [[b[:rows] for b in kind] for kind in self._buffers]
+        self._arrays = [result.numpy() for result in self.results]
+
+    def __call__(self, x: torch.Tensor) -> torch.Tensor:
+        """Compute outputs, (rows, outputs), and store the inputs for ``push`` and ``pull``."""
+        if len(x) != self._rows:
+            self._resize(len(x))
+        self._inputs = [x, *self.results[:-1]]
+        last = len(self.weights) - 1
+        array = x.numpy()
+        for i, (result, (weights, biases)) in enumerate(zip(self._arrays, self._parameter_arrays, strict=True)):
+            if self._few:
+                np.matmul(array, weights, out=result)
+                np.add(result, biases, out=result)
+            else:
+                torch.addmm(self.biases[i], self._inputs[i], self.weights[i].t(), out=self.results[i])
+            if i < last:
+                self._activate(result)
+            array = result
+        return self.results[-1]
+
+    def push(self, parts: Sequence[torch.Tensor]) -> torch.Tensor:
+        """Compute J v, (rows, outputs), at the last inputs; v has one tensor for each parameter."""
+        last = len(self.weights) - 1
+        for i, derivative in enumerate(self.derivatives):
+            torch.addmm(parts[2 * i + 1], self._inputs[i], parts[2 * i].t(), out=derivative)
+            if i:
+                derivative.addmm_(self.derivatives[i - 1], self.weights[i].t())
+            if i < last:
+                self._times_slope(derivative, self.results[i])
+        return self.derivatives[-1]
+
+    def pull(self, u: torch.Tensor, out: Sequence[torch.Tensor] | None = None) -> list[torch.Tensor]:
+        """Compute J^T u at the last inputs, in ``out`` or in own buffers; u has the shape (rows, outputs)."""
+        out = list(self._pulled if out is None else out)
+        for i in reversed(range(len(self.weights))):
+            x, weight = self._inputs[i], self.weights[i]
+            # compute the product or its transpose, whichever has longer rows, because this is faster
+            if x.shape[1] < u.shape[1]:
+                out[2 * i].copy_((x.t() @ u).t())
+            else:
+                torch.mm(u.t(), x, out=out[2 * i])
+            torch.sum(u, 0, out=out[2 * i + 1])
+            if i:
+                u = torch.mm(u, weight, out=self.derivatives[i - 1])
+                self._times_slope(u, x)
+        return out
+
+
+class DensePolicy:
+    """Evaluates a ``GaussianPolicy`` without autograd."""
+
+    def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
+        self.policy, self.passes = policy, passes
+        self._x = torch.empty(0, policy.nobs)
+
+    @staticmethod
+    def of(policy: GaussianPolicy) -> "DensePolicy | None":
+        """Wrap a policy, or return None if its class or network is not supported."""
+        plain = (
+            type(policy) is GaussianPolicy
+            and policy.mirror is None
+            and type(policy.normalizer) in (Normalizer, nn.Identity)
+        )
+        if not plain or _hooked(policy) or _hooked(policy.normalizer):
+            return None
+        if not all(parameter.requires_grad for parameter in policy.network.parameters()):
+            return None
+        passes = DensePasses.of(policy.network)
+        return None if passes is None else DensePolicy(policy, passes)
+
+    def __call__(self, obs: torch.Tensor) -> torch.Tensor:
+        """Compute mean actions, (rows, nact)."""
+        normalizer = self.policy.normalizer
+        if not isinstance(normalizer, Normalizer):
+            return self.passes(obs)
+        if len(obs) > len(self._x):
+            self._x = torch.empty_like(obs)
+        x = self._x[: len(obs)]
+        array = x.numpy()
+        np.subtract(obs.numpy(), normalizer.shift.numpy(), out=array)
+        np.multiply(array, normalizer.scale.numpy(), out=array)
+        np.clip(array, -normalizer.limit, normalizer.limit, out=array)
+        return self.passes(x)
+
+    def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
+        """Sample actions; see ``GaussianPolicy.sample``."""
+        action = out.numpy()
+        np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
+        np.add(action, self(obs).numpy(), out=action)
+        return out
+
+
+class DenseValue:
+    """Evaluates a ``ValueFunction`` without autograd."""
+
+    def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
+        self.value, self.passes = value, passes
+
+    @staticmethod
+    def of(value: ValueFunction) -> "DenseValue | None":
+        """Wrap a value function, or return None if its class or network is not supported."""
+        if type(value) is not ValueFunction or _hooked(value):
+            return None
+        passes = DensePasses.of(value.network)
+        return None if passes is None else DenseValue(value, passes)
+
+    def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        """Predict returns, (...,)."""
+        features = self.value.features(obs, step)
+        output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
+        return output * self.value.scale.float() + self.value.shift.float()
+
+
+def _hooked(module: nn.Module) -> bool:
+    return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))

@@ -1,0 +1,124 @@
+"""Define the base class of NPG and PPO, with their networks, rollouts, advantages, evaluation and checkpoints."""
+
+import dataclasses
+from typing import Any, ClassVar
+
+import torch
+import warp as wp
+
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
+from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.common.networks import LIMIT, initialize_as_torch, trainable
+from lyceum_warp.algos.common.policy import GaussianPolicy
+from lyceum_warp.algos.common.policy_check import check_policy, check_value
+from lyceum_warp.algos.common.rollout_buffer import Rollout
+from lyceum_warp.algos.common.value import ValueFunction, value_group
+from lyceum_warp.env.env import Env
+from lyceum_warp.kernels import returns
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_kind
+
+
+@document_attributes
+class OnPolicyLearner(Learner):
+    """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout."""
+
+    config_type: ClassVar[type]
+    twice: ClassVar[bool]
+    """Whether the policy must be twice differentiable."""
+    policy: GaussianPolicy
+    value: ValueFunction
+    generator: torch.Generator
+    """Random generator of the noise."""
+    rollout: Rollout
+    """The samples of the last iteration."""
+    count: int
+    """Samples per iteration, over all processes."""
+
+    def __init__(
+        self,
+        env: Env,
+        policy: GaussianPolicy | None,
+        value: ValueFunction | None,
+        config: Any,
+        *,
+        seed: int,
+        team: Team | None,
+    ) -> None:
+        name, kind = type(self).__name__, self.config_type
+        check_kind(f"env of {name}", env, Env, "as lw.make(...) makes it")
+        check_kind(f"config of {name}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
+        check_kind(f"team of {name}", team, Team | None, "as lyceum_warp.algos.common.distributed.Team() makes it")
+        check_kind(f"value of {name}", value, ValueFunction | None, "as lw.load_value(run) returns it")
+        super().__init__(env, seed=seed, team=team)
+        if value is not None:
+            check_value(trainable(value), env)
+        if policy is not None:
+            check_policy(trainable(policy), env, twice=self.twice)
+        self.config = config or kind()
+
+    def _make_networks(
+        self,
+        policy: GaussianPolicy | None,
+        value: ValueFunction | None,
+        *,
+        scale: float,
+        time_orders: int = 0,
+        limit: float = LIMIT,
+        as_torch: bool = False,
+    ) -> None:
+        env, config, device = self.env, self.config, self.env.obs.device
+        nobs, nact = env.obs_space.size, env.action_space.size
+        group = value_group(env, config.value_group) if value is None else value.group
+        init = torch.Generator().manual_seed(self.seed)
+        options: dict[str, Any] = dict(normalize=config.normalize, limit=limit, generator=init)
+        self.policy = policy or GaussianPolicy(
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
+        )
+        self.value = value or ValueFunction(
+            env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
+            time_orders=time_orders, group=group, **options,
+        )  # fmt: skip
+        for given, module in ((policy, self.policy), (value, self.value)):
+            if given is None and as_torch:
+                initialize_as_torch(module, init)
+        self.value.discount = config.gamma
+        self.policy.to(device)
+        self.value.to(device)
+        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
+
+    def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
+        self.count = steps * self.env.nworld * self.team.size
+        self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
+        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
+        self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config, self.team)
+
+    def _estimate(
+        self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        arrays = (reward, value, next_value, self.rollout.terminated, self.rollout.done)
+        outputs = [wp.from_torch(self._advantage), wp.from_torch(self._return)]
+        args = [*map(wp.from_torch, arrays), self.config.gamma, self.config.lam, *outputs]
+        wp.launch(returns.advantages, self.env.nworld, args, device=self.env.device)
+        return self._advantage, self._return
+
+    def settings(self) -> dict[str, Any]:
+        """Return the hyperparameters and the networks' sizes for a run's config.json."""
+        policy, value = self.policy.shape, self.value.shape
+        found = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
+        found |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
+        found["time_orders"] = value["time_orders"]
+        if self.config.value_group is not None or value["group"] != value_group(self.env, None):
+            found["value_group"] = value["group"]
+        own = {name: setting for name, setting in found.items() if setting is not None and hasattr(self.config, name)}
+        return dataclasses.asdict(dataclasses.replace(self.config, **own))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Copy the complete state; see ``Learner``."""
+        return super().state_dict() | {"returns": self.team.gather(self.rollout.running_return).clone()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Resume from a result of ``state_dict``; see ``Learner``."""
+        super().load_state_dict(state)
+        self.rollout.running_return.copy_(state["returns"][self.own_worlds])

@@ -1,0 +1,134 @@
+"""Check policies and value functions that a user passes to an algorithm."""
+
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.common.networks import moved
+from lyceum_warp.algos.common.policy import GaussianPolicy
+from lyceum_warp.algos.common.value import ValueFunction
+from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
+from lyceum_warp.env.env import Env
+from lyceum_warp.support.validate import check_group, described, first_sentence
+
+_ROWS = 4
+
+
+def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
+    """Check that an algorithm can train a policy in an environment.
+
+    The policy must be a ``GaussianPolicy``. It must map observations (..., nobs) to mean actions (..., nact)
+    deterministically, and independently for each observation. It must be differentiable with respect to its trainable
+    parameters. For NPG, the policy must be twice differentiable.
+
+    Raises:
+        ValueError: The policy violates one of these rules.
+    """
+    if not isinstance(policy, GaussianPolicy):
+        kind = getattr(policy, "__name__", None) or type(policy).__name__
+        fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one from your own network"
+        raise ValueError(f"policy must be a GaussianPolicy, not {kind}: {fix}")
+    policy = moved(policy, env)
+    check_sizes(policy, env)
+    if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
+        raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
+    obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
+    noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))
+    obs = obs + 0.1 * noise.to(obs.device)
+    _check_output(policy, obs)
+    _check_derivatives(policy, obs, twice=twice)
+
+
+def check_sizes(policy: Any, env: Env, name: str = "the policy") -> None:
+    """Check that a policy fits an environment's observations and actions; error messages call it ``name``.
+
+    Raises:
+        ValueError: The sizes of the policy and the environment differ.
+    """
+    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
+    if sizes != wanted:
+        raise ValueError(
+            f"{name} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} has "
+            f"{wanted[0]} observations and {wanted[1]} actions"
+        )
+
+
+@torch.no_grad()
+def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
+    mean, _, again = (_called(policy, rows) for rows in (obs, obs + 0.1, obs))
+    if mean.isfinite().all() and not torch.equal(mean, again):
+        raise ValueError(
+            "the policy gives two different mean actions for the same observations: a policy must not draw random "
+            "numbers (for dropout, call eval() on its network) or keep state between calls"
+        )
+    if not mean.isfinite().all():
+        raise ValueError("the policy's mean actions are not finite for finite observations")
+    alone = torch.cat([_called(policy, row) for row in obs.split(1)])
+    if not torch.allclose(mean, alone, rtol=0.0, atol=1e-2 * max(mean.abs().max().item(), 1e-6)):
+        raise ValueError(
+            "the policy's mean action depends on other rows of the batch, as with batch normalisation: use "
+            "normalize=True, or LayerNorm"
+        )
+
+
+def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
+    shape = (len(obs), policy.nact)
+    try:
+        mean: object = policy(obs)
+    except Exception as error:  # a user's network may raise any error
+        reason = f"{type(error).__name__}: {first_sentence(error)}"
+        raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
+    if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
+        wanted = f"a {str(obs.dtype).removeprefix('torch.')} tensor of shape {shape}"
+        given = described(mean) if isinstance(mean, torch.Tensor) else type(mean).__name__
+        raise ValueError(f"the policy must give {wanted} for observations of shape {tuple(obs.shape)}, not {given}")
+    return mean
+
+
+def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool) -> None:
+    named = [(name, p) for name, p in policy.named_parameters() if p.requires_grad and p is not policy.log_std]
+    with torch.enable_grad():
+        mean = policy(obs)
+        sums = mean.sum()
+        if not sums.requires_grad:
+            raise ValueError("the policy's mean actions depend on no parameter: remove detach() and no_grad()")
+        gradients = torch.autograd.grad(sums, [p for _, p in named], allow_unused=True)
+        if unused := [name for (name, _), gradient in zip(named, gradients, strict=True) if gradient is None]:
+            raise ValueError(
+                f"the policy's mean actions do not depend on its parameter {unused[0]!r}: use the parameter, without "
+                "detach() or no_grad(), or freeze it with requires_grad_(False)"
+            )
+        if not twice:
+            return
+        try:
+            product = FisherProduct(policy, obs, 0.0)(
+                flatten(p.detach() for p in policy.parameters() if p.requires_grad)
+            )
+        except RuntimeError as error:
+            raise ValueError(
+                "the policy cannot be differentiated twice, which NPG needs for the Fisher information "
+                f"({first_sentence(error)}): use other layers"
+            ) from error
+    if not product.isfinite().all():
+        raise ValueError("the policy's derivatives are not finite")
+
+
+def check_value(value: ValueFunction, env: Env) -> None:
+    """Check that a value function fits an environment's observations.
+
+    Raises:
+        ValueError: The group or the input size does not fit, or a parameter is not finite.
+    """
+    name = env.task.name
+    check_group(value.group, env.obs_groups, name)
+    size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
+    if size != wanted:
+        raise ValueError(
+            f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
+            f"{wanted} observations"
+        )
+    for part, numbers in value.state_dict().items():
+        if not numbers.isfinite().all():
+            raise ValueError(
+                f"the value function's {part!r} is not finite: omit the value function to get a new value function"
+            )

@@ -1,0 +1,148 @@
+"""Export policies to ONNX or to torch's format, so that they run without this package."""
+
+import contextlib
+import copy
+import importlib.util
+import json
+import logging
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.env.env import Env
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import described, first_sentence, memoryless_action
+
+EXTRA = "pip install 'lyceum-warp[export]'"
+
+_SUFFIXES = (".onnx", ".pt2")
+
+
+def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None = None) -> Path:
+    """Export a policy's ``act`` to a file that runs without this package.
+
+    The exported file includes the normaliser. It maps float32 observations (n, nobs), with any n, to actions without
+    noise. Unlike environments, it does not clip controls to the actuators' ranges.
+
+    ===========  ======================================================================================
+    ``.onnx``    input ``obs``, output ``action``; for ONNX Runtime, TensorRT, OpenVINO, ...
+    ``.pt2``     ``torch.export.load(path).module()(obs)``, needs only torch; also for C++ (AOTInductor)
+    ===========  ======================================================================================
+
+    Example:
+        >>> export_policy(load("runs/mine"), "policy.onnx")
+        >>> session = onnxruntime.InferenceSession("policy.onnx")
+        >>> (action,) = session.run(["action"], {"obs": obs})  # NumPy arrays, (n, nobs) and (n, nact)
+
+    Args:
+        policy: A module with the method ``act`` and the attribute ``nobs``.
+        path: Path of the file; an existing file is replaced.
+        env: An environment of the policy's task. With an environment, an ONNX file also contains the
+            ``deployment_metadata``. Its memory tells how far the training's curricula had come.
+
+    Returns:
+        The file's path.
+
+    Raises:
+        ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
+        ValueError: The file has an unsupported suffix, or the policy has memory or cannot be exported.
+    """
+    if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
+        raise ValueError(f"policy must be a module with act and nobs, as lw.load(run) returns, not {described(policy)}")
+    path = Path(path)
+    check_export(path)
+    nobs: Any = policy.nobs
+    alone = _Acting(copy.deepcopy(policy)).cpu().eval().requires_grad_(False)
+    example, shapes = (torch.zeros(2, nobs),), ({0: torch.export.Dim("batch")},)
+    try:
+        with _quiet():
+            memoryless_action(alone, *example)
+            program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
+            if path.suffix == ".onnx":
+                program = torch.onnx.export(
+                    program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
+                )
+                if env is not None:
+                    metadata = deployment_metadata(policy, env)
+                    program.model.metadata_props.update({name: json.dumps(value) for name, value in metadata.items()})
+    except Exception as error:  # torch raises many types of errors
+        reason = first_sentence(error)
+        raise ValueError(f"the policy's network cannot be exported to {path.suffix} ({reason})") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced(path) as temporary:
+        if path.suffix == ".onnx":
+            program.save(str(temporary), external_data=False)
+        else:
+            with temporary.open("wb") as file:
+                torch.export.save(program, file)
+    return path
+
+
+def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
+    """Describe a policy's inputs, outputs and timing, as needed on a robot or in another simulator.
+
+    ================  ===================================================================================
+    ``task``          name of the task
+    ``timestep``      seconds between two actions
+    ``substep``       seconds between two steps of the physics
+    ``observations``  the parts of an observation in order: name, size, and the normaliser's offset and
+                      scale of each column; the file applies them: (obs - offset) * scale
+    ``actions``       the parts of an action in order: name and size
+    ``actuators``     names of the model's actuators, in order
+    ================  ===================================================================================
+
+    A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
+    """
+    task, model = env.task, env.task.model
+    memory = {name: values.numpy(force=True) for name, values in {**env.shared, **env.lasting}.items()}
+    parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
+    normalizer: Any = getattr(policy, "normalizer", None)
+    if isinstance(normalizer, Normalizer):
+        for entry, part in zip(parts, env.obs_space.parts.values(), strict=True):
+            entry |= {"offset": normalizer.shift[part].tolist(), "scale": normalizer.scale[part].tolist()}
+    return {
+        "task": task.name,
+        "timestep": env.timestep,
+        "substep": model.opt.timestep,
+        "observations": parts,
+        "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
+        "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
+        **task.task.deployment(model, SimpleNamespace(**task.params), memory),
+    }
+
+
+class _Acting(torch.nn.Module):
+    def __init__(self, policy: Any) -> None:
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        action: torch.Tensor = self.policy.act(obs)
+        return action
+
+
+def check_export(path: Path) -> None:
+    """Check a file's suffix, and whether the packages for its format are installed."""
+    if path.suffix not in _SUFFIXES:
+        raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
+    missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
+    if path.suffix == ".onnx" and missing:
+        raise ImportError(f"export to ONNX needs {' and '.join(missing)}: {EXTRA}")
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

@@ -1,0 +1,233 @@
+"""Store the samples of a fixed number of steps in a preallocated buffer."""
+
+from collections.abc import Collection, Mapping
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.algos.common.dense import DensePolicy
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.policy import GaussianPolicy
+from lyceum_warp.engines.memory import check_fit
+from lyceum_warp.env.env import Env
+from lyceum_warp.graphs.capture import Graphs, Phase
+from lyceum_warp.kernels import collect
+from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
+
+_Pair: TypeAlias = tuple[Any, wp.array]
+"""An array of an environment, and the buffer that stores it for each step."""
+
+
+@document_attributes
+class Rollout:
+    """Preallocated buffer that holds the samples from a fixed number of steps in every world.
+
+    Args:
+        env: The environment.
+        steps: Number of steps.
+        groups: Groups of observations to store in addition to "policy", such as ``("critic",)``.
+        first_only: Whether the statistics include only each world's first episode since ``restart``. If all worlds
+            start together, statistics of all finished episodes are biased towards short episodes.
+
+    Raises:
+        ValueError: The task has no group of observations of this name.
+    """
+
+    obs: torch.Tensor
+    """Observations before each step, (steps, nworld, nobs)."""
+    action: torch.Tensor
+    """Actions, (steps, nworld, nact)."""
+    step: torch.Tensor
+    """Number of steps between the reset and each step, (steps, nworld)."""
+    final_obs: torch.Tensor
+    """Observations after each step, before any reset, (steps, nworld, nobs)."""
+    obs_groups: dict[str, torch.Tensor]
+    """Observations of each group before each step; the entry "policy" is ``obs``."""
+    final_obs_groups: dict[str, torch.Tensor]
+    """Observations of each group after each step; the entry "policy" is ``final_obs``."""
+    reward: torch.Tensor
+    """Rewards, (steps, nworld)."""
+    eval: torch.Tensor
+    """Evaluation metric after each step, (steps, nworld)."""
+    terminated: torch.Tensor
+    """Whether the task ended the episode, (steps, nworld) bool. A fault is a truncation, not a termination."""
+    done: torch.Tensor
+    """Whether the episode ended for any reason, (steps, nworld) bool."""
+    success: torch.Tensor
+    """Whether the goal is met after each step, (steps, nworld) bool."""
+    episode_return: torch.Tensor
+    """Sum of the episode's rewards so far, (steps, nworld); NaN in episodes that the statistics exclude."""
+    episode_length: torch.Tensor
+    """Number of the episode's steps so far, (steps, nworld)."""
+    episode_metrics: dict[str, torch.Tensor]
+    """Each metric of the task, summed over the episode so far, (steps, nworld)."""
+    metrics: dict[str, torch.Tensor]
+    """Each metric of the task at each step, (steps, nworld)."""
+
+    running_return: torch.Tensor
+    """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that the statistics exclude."""
+    faults: torch.Tensor
+    """Number of faults of each world in these steps, (nworld,) int32."""
+
+    def __init__(self, env: Env, steps: int, *, groups: Collection[str] = (), first_only: bool = False) -> None:
+        check_kind("env of Rollout", env, Env, "as lw.make(...) makes it")
+        check_kind("groups", groups, list | tuple | set | frozenset, "as in groups=['critic']")
+        check_flag("first_only", first_only)
+        steps = whole_number("steps", steps, low=1)
+        for group in groups:
+            check_group(group, env.obs_groups, env.task.name)
+        self.env = env
+        self.steps = steps
+        self._first_only = first_only
+        n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
+        numbers = len(collect.RolloutArrays.vars) + 2 * nobs + nact  # type: ignore[attr-defined]
+        check_fit(4 * steps * numbers, n, env.device, model=f"{steps} steps")
+        last = {"obs": (nobs,), "final_obs": (nobs,), "action": (nact,)}
+        flags = {"terminated", "done", "success"}
+        self._arrays = collect.RolloutArrays()
+        with wp.ScopedDevice(env.device):
+            for name in collect.RolloutArrays.vars:  # type: ignore[attr-defined]
+                shape = (steps, n, *last.get(name, ()))
+                array = wp.zeros(shape, dtype=bool if name in flags else float)
+                setattr(self._arrays, name, array)
+                setattr(self, name, torch_view(array))
+            self._index = wp.zeros(1, dtype=int)
+            self._return = wp.zeros(n, dtype=float)
+            self._fault = wp.zeros(n, dtype=int)
+        self.running_return, self.faults = torch_view(self._return), torch_view(self._fault)
+        self._rows_before: list[_Pair] = []
+        self._rows_after: list[_Pair] = []
+        self.obs_groups, self.final_obs_groups = {"policy": self.obs}, {"policy": self.final_obs}
+        for group in dict.fromkeys(groups):
+            if group != "policy":
+                self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
+                self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+        self.metrics, self.episode_metrics = {}, {}
+        if env.metrics:
+            self.metrics, self.episode_metrics = (
+                dict(zip(env.metrics, self._stored(source, self._rows_after).unbind(-1), strict=True))
+                for source in (torch_view(env.worlds.metrics), env.episode_metric_sums)
+            )
+        inputs = (env.obs, env.action, env.episode_step)
+        outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
+        self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
+        graphs = Graphs(env.device, enabled=env.options.graphs)
+        self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
+        self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
+
+    def _stored(self, source: torch.Tensor, into: list[_Pair]) -> torch.Tensor:
+        rows: wp.array = wp.zeros((self.steps, *source.shape), dtype=float, device=self.env.device)
+        into.append((wp.from_torch(source), rows))
+        return torch_view(rows)
+
+    @torch.no_grad()
+    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
+        """Fill the buffer by running the policy for ``steps`` steps from the current states.
+
+        Args:
+            policy: The policy.
+            noise: Standard normal numbers, (steps, nworld, nact).
+        """
+        env = self.env
+        self.begin()
+        for t in range(self.steps):
+            policy.sample(env.obs, noise[t], out=env.action)
+            self.store_inputs()
+            env.step()
+            self.store_outputs()
+
+    def begin(self) -> None:
+        """Prepare the buffer for a caller that steps the environment itself, without ``collect``."""
+        self._index.zero_()
+        self._fault.zero_()
+
+    def store_inputs(self) -> None:
+        """Store the observations, the actions and the step counters before a step."""
+        for call in self._before_step:
+            call()
+
+    def store_outputs(self) -> None:
+        """Store the results of a step."""
+        for call in self._after_step:
+            call()
+
+    def restart(self) -> None:
+        """Start new episodes in all worlds."""
+        self.env.rand_reset()
+        self.running_return.zero_()
+
+    def stagger(self, generator: torch.Generator, team: Team | None = None) -> None:
+        """Set the worlds' step counters to random values, so that time limits are spread over time.
+
+        Otherwise, worlds that start together and never terminate reach their time limits in the same rollout. The
+        statistics exclude the shortened episodes. On the Warp engine, this method does nothing if the task sets
+        ``lw.Task.settle``. On this engine, all worlds wait while one world settles after a reset.
+
+        Args:
+            generator: Random generator with the same state in every process.
+            team: The processes.
+        """
+        env, team = self.env, team or Team()
+        if env.horizon == 0 or (env.task.task.settle and env.engine.capturable):
+            return
+        state = env.get_state()
+        steps = torch.randint(env.horizon, (team.size * env.nworld,), generator=generator, device=state.device)
+        first = steps[team.rank * env.nworld :][: env.nworld]
+        state[:, env.state_space.parts["step"]] = first.unsqueeze(-1).double()
+        env.set_state(state)
+        self.running_return.masked_fill_(first > 0, torch.nan)
+
+    def restart_some(self, least: int, generator: torch.Generator, team: Team | None = None) -> None:
+        """Restart random worlds so that at least ``least`` worlds started an episode within the last ``steps`` steps.
+
+        The statistics exclude interrupted episodes. Do not call this method if ``first_only`` is set, because the
+        statistics would then include the second episode of a restarted world. The host does not wait for the device.
+
+        Args:
+            least: Minimum number of such worlds, over all processes.
+            generator: Random generator with the same state in every process.
+            team: The processes.
+        """
+        env, team = self.env, team or Team()
+        began = team.gather((env.episode_step < self.steps).int())
+        order = torch.rand(len(began), generator=generator, device=began.device) + 2.0 * began
+        rank = order.argsort(stable=True).argsort()
+        chosen = (rank < least - began.sum()) & (began == 0)
+        mask = chosen[team.rank * env.nworld :][: env.nworld]
+        env.rand_reset(mask=mask)
+        self.running_return.masked_fill_(mask, 0.0)
+
+    def extremes(self) -> str:
+        """Describe the reward and the observation of each group that have the largest magnitude, for error messages."""
+        rows: dict[str, tuple[torch.Tensor, Mapping[str, slice]]] = {"reward": (self.reward.unsqueeze(-1), {})}
+        for group, obs in self.obs_groups.items():
+            name = "observation" if group == "policy" else f"observation of the group {group!r}"
+            rows[name] = obs, self.env.obs_spaces[group].parts
+        texts = []
+        for name, (values, parts) in rows.items():
+            t, world, column = (int(i) for i in np.unravel_index(int(values.abs().argmax()), values.shape))
+            part = "".join(f" in {part!r}" for part, columns in parts.items() if columns.start <= column < columns.stop)
+            where = f"in step {t + 1} of world {self.env.first_world + world}"
+            texts.append(f"the largest {name} is {values[t, world, column]:g}{part} {where}")
+        return "; ".join(texts)
+
+    def _launch_inputs(self) -> None:
+        dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))
+        args = [self._index, *self._inputs, self._arrays]
+        wp.launch(collect.store_inputs, dim, args, device=self.env.device)
+        self._launch_rows(self._rows_before)
+
+    def _launch_outputs(self) -> None:
+        dim = (self.env.nworld, self.env.obs_space.size)
+        args = [self._index, *self._outputs, self._first_only, self._return, self._fault, self._arrays]
+        wp.launch(collect.store_outputs, dim, args, device=self.env.device)
+        self._launch_rows(self._rows_after)
+        wp.launch(collect.advance_index, 1, [self._index], device=self.env.device)
+
+    def _launch_rows(self, pairs: list[_Pair]) -> None:
+        for source, rows in pairs:
+            wp.launch(collect.store_rows, source.shape, [self._index, source, rows], device=self.env.device)

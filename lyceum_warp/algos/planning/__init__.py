@@ -1,0 +1,1 @@
+"""Plan by sampling: MPPI, CEM and predictive sampling."""

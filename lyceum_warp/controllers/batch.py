@@ -1,0 +1,87 @@
+"""Run a policy's episodes in many worlds at once, and return them as trajectories."""
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import torch
+
+from lyceum_warp.controllers.trajectory import Trajectory, provenance
+from lyceum_warp.env.curriculum import Curriculum, start_episodes
+from lyceum_warp.env.env import Env
+from lyceum_warp.support.validate import memoryless_action, whole_number
+
+
+@torch.no_grad()
+def policy_episodes(
+    env: Env,
+    policy: Callable[[torch.Tensor], torch.Tensor],
+    episodes: int,
+    *,
+    seed: int | None = None,
+    curriculum: Curriculum | None = None,
+    controller: Mapping[str, Any] | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Iterator[Trajectory]:
+    """Run a policy for whole episodes from random initial states, and yield them as trajectories.
+
+    The episodes equal those of ``lw.evaluate`` with the same curriculum, number of worlds and seed (which it derives by
+    ``evaluation_seed``). One call of the policy acts in
+    all worlds, so the times in a trajectory are those of the whole batch.
+
+    Yields:
+        The first episode of each world, then the second episode of each world, and so on.
+    """
+    episodes = whole_number("episodes", episodes, low=1)
+    if env.autoreset:
+        raise ValueError("trajectories need an environment without automatic resets: make(..., autoreset=False)")
+    if env.horizon == 0:
+        raise ValueError(f"an episode of {env.task.name!r} has no time limit: set one, as in make(..., horizon=1000)")
+    named = {"name": type(policy).__name__, **(controller or {})}
+    origin = provenance(env)
+    rounds = -(-episodes // env.nworld)
+    for number in range(rounds):
+        if number == 0 or env.task.curriculum:
+            start_episodes(env, seed, curriculum, first=number * env.nworld, total=rounds * env.nworld)
+        else:
+            env.rand_reset()
+        states, obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
+        actions: list[torch.Tensor] = []
+        outcomes: list[torch.Tensor] = []
+        times: list[tuple[float, float, float]] = []  # action's time, duration of the policy's call, step's end
+        lengths, reasons = (torch.zeros(env.nworld, dtype=torch.long) for _ in range(2))
+        start = time.perf_counter()
+        while not (lengths > 0).all():
+            begun = time.perf_counter()
+            env.action.copy_(policy(env.obs) if number or actions else memoryless_action(policy, env.obs))
+            actions.append(env.action.cpu().clone())
+            applied = time.perf_counter()
+            env.step()
+            states.append(env.get_state().cpu())
+            obs.append(env.final_obs.cpu().clone())
+            outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
+            times.append((applied - start, applied - begun, time.perf_counter() - start))
+            over = env.done.cpu() & (lengths == 0)
+            lengths[over] = len(actions)
+            reasons[over] = env.done_reason.cpu()[over].long()
+            if progress is not None and len(actions) % 10 == 0:
+                progress(number * env.horizon + len(actions), rounds * env.horizon)
+        for world in range(min(env.nworld, episodes - number * env.nworld)):
+            steps = int(lengths[world])
+            own = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
+            rewards, evals, success = torch.stack([row[:, world] for row in outcomes[:steps]], 1)
+            applied_at, policy_times, ends = torch.tensor(times[:steps], dtype=torch.float64).unbind(1)
+            yield Trajectory(
+                states=torch.stack([row[world] for row in states[: steps + 1]]).double(),
+                obs=torch.stack([row[world] for row in obs[: steps + 1]]),
+                actions=torch.stack([row[world] for row in actions[:steps]]),
+                rewards=rewards, evals=evals, success=success > 0, times=applied_at, ages=policy_times,
+                late=torch.zeros(steps, dtype=torch.bool), plan_of=torch.arange(steps), plan_steps=torch.arange(steps),
+                plan_starts=applied_at - policy_times, plan_times=policy_times,
+                plan_failed=torch.full((steps,), torch.nan, dtype=torch.float64),
+                plan_effective=torch.full((steps,), torch.nan, dtype=torch.float64),
+                timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
+                done_reason=int(reasons[world]), seed=seed,
+                controller=named | {"world": env.first_world + world, "episode": number},
+                **origin | {"params": origin["params"] | own},
+            )  # fmt: skip

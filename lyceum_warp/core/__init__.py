@@ -1,0 +1,1 @@
+"""Define the vocabulary: tasks, options, spaces, fields, model files, mirrors and reasons for an end."""

@@ -1,0 +1,1 @@
+"""Run one task in many worlds: environments, open-loop rollouts, curricula."""

@@ -1,0 +1,211 @@
+"""Allocate the arrays of an environment's worlds, and convert them to and from state vectors."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.binding.parts import sizes
+from lyceum_warp.core.done import FAULTS
+from lyceum_warp.core.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.core.task import MEMORIES
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.kernels import state, step_types, transitions
+from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.support.validate import check_tensor
+
+
+def own_bytes_per_world(task: BoundTask) -> int:
+    """Estimate the bytes that each world needs outside the engine's arrays."""
+    snapshots = [field for field in task.fields if field.snapshot]
+    state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
+    copies = sum(field.size for field in task.fields)
+    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
+    return 4 * copies + 8 * state_size + 8 * observations + 300
+
+
+def own_parts(task: BoundTask) -> dict[str, int]:
+    """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, except for the counters."""
+    form, found = task.task, dict[str, int]()
+    for layout in task.memory.values():
+        found |= sizes(layout)
+    own = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
+    return found | {name: size for name, size in own.items() if size}
+
+
+def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
+    """Get the columns of ``memory`` and ``lasting_memory`` in a state."""
+    ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
+    return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
+
+
+class WorldArrays:
+    """All arrays of an environment's worlds."""
+
+    def __init__(self, task: BoundTask, engine: Engine) -> None:
+        self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
+        with wp.ScopedDevice(self.device):
+            self._allocate_fields()
+            self._allocate_outcome()
+            self._allocate_actions()
+            self._allocate_counters()
+            self._allocate_masks()
+            self.state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64)
+        self.state_view = torch_view(self.state)
+
+    def _allocate_fields(self) -> None:
+        n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
+        self.memory, self.lasting_memory, self._lasting_before = (
+            wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
+            for name in ("memory", "lasting_memory", "lasting_memory")
+        )
+        self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
+        self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
+        """Number of consecutive successes, (nworld, 1), or (nworld, 0) if ``success_steps`` is 1."""
+        own = ("memory", "lasting_memory", "metric_sums", "success_counts")
+        self._clearable = {name: getattr(self, name) for name in own}
+        self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
+        self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
+        self.after, self.before = kernels.Batch(), kernels.Batch()
+        self._copies: dict[str, wp.array] = {}
+        constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
+        varied = [field.name for field in self.task.dynamics]
+        for name in self.task.types:
+            live: Any = getattr(self, name) if name in MEMORIES else constant.get(name, self.engine.arrays.get(name))
+            self.task.check_field(name, live)
+            live = with_memory(live)
+            setattr(self.after, name, live)
+            if live.size and name not in constant and name not in varied:  # steps do not change the model
+                self._copies[name] = wp.zeros_like(live)
+            setattr(self.before, name, self._copies.get(name, live))
+        self._allocate_shared()
+        self.fields = {**self.engine.arrays, **constant}
+        """Arrays of all fields, (nworld, ...), by name."""
+        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
+        self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
+        self.params = self.task.parameters.array(self.device)
+        self.weights = self.task.parameters.weights(self.device)
+        self.action_space = action_space(model, task.action_range, self.task.actions)
+        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
+        self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
+
+    def _allocate_shared(self) -> None:
+        layouts = self.task.shared
+        shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
+        self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
+        """``shared`` has shape (1, size of Shared). ``sums`` has shape (size of Sums,). It stores 1.0 as ``UNIT``."""
+        self._shares = wp.zeros((self.nworld, sums), dtype=float)
+        if layouts:
+            for batch in (self.after, self.before):
+                batch.shared = self.shared
+
+    def _allocate_outcome(self) -> None:
+        n, kernels = self.nworld, self.task.kernels
+        self.outcome = step_types.Outcome()
+        self.buffers: dict[str, torch.Tensor] = {}
+        for name, dtype in step_types.OUTCOMES.items():
+            setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
+            self.buffers[name] = torch_view(getattr(self.outcome, name))
+        self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
+        self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
+        """Sums of the metrics over the episode up to the last step."""
+        self.outcome.metrics = self.metrics  # type: ignore[assignment]
+        self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
+        parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
+        self._judging = parts if self.device.is_cuda else 1  # threads per transition
+        self._found = step_types.Findings()
+        self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
+        for name in ("terminated", "truncated", "success"):
+            setattr(self._found, name, wp.zeros(n, dtype=bool))
+        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
+        self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
+        # threads per observation
+        self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
+        self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
+        self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
+
+    def _allocate_actions(self) -> None:
+        n, model, task = self.nworld, self.task.model, self.task.task
+        naction = self.action_space.size
+        self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
+        self.buffers["action"] = torch_view(self.action)
+        ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
+        if self.task.functions["control"] is None:
+            scale = control_scale(model, task.action_range)
+        self.ranges: wp.array = wp.array(ranges, dtype=float)
+        self.scale: wp.array = wp.array(scale, dtype=float)
+
+    def _allocate_counters(self) -> None:
+        n = self.nworld
+        self.counters = step_types.Counters()
+        self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
+        self.counters.key = wp.zeros(n, dtype=wp.uint32)
+        self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]
+        self._seed = wp.zeros(1, dtype=int)
+        self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
+        self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
+
+    def _allocate_masks(self) -> None:
+        n = self.nworld
+        self.everyone = wp.full(n, True, dtype=bool)
+        self.mask = wp.zeros(n, dtype=bool)
+        """Worlds that the next reset or restore changes."""
+        self.restarting = wp.zeros(n, dtype=bool)
+        """Worlds whose episode ended in the last step."""
+        self._rejected = wp.zeros(n, dtype=bool)
+        self._continuing = wp.zeros(n, dtype=bool)
+        """Worlds that did not restart, and thus ran events."""
+        self._physics_changed = wp.zeros(n, dtype=bool)
+        """Worlds whose physics an event changed."""
+        self._changed = wp.zeros(n, dtype=bool)
+        """Worlds whose physics or memory an event changed."""
+        self._outdated = wp.zeros(n, dtype=bool)
+        """Worlds that need a new observation after a restart or an event."""
+        self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
+        self.terminated_view = torch_view(self._found.terminated)
+
+    def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
+        for group, space in self.obs_spaces.items():
+            setattr(into, group, wp.zeros((self.nworld, space.size), dtype=float))
+        return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
+
+    def set_mask(self, mask: torch.Tensor | None) -> None:
+        """Choose the worlds that the next reset or restore changes; None means all."""
+        if mask is None:
+            self.mask_view.fill_(True)
+        else:
+            check_tensor(mask, "a mask", self.mask_view)
+            self.mask_view.copy_(mask)
+
+    def pack_state(self, ended: wp.array) -> None:
+        """Write the state of every world into ``state``. Its part ``done_reason`` is taken from ``ended``."""
+        size = self.engine.state_size
+        self.engine.get_state(self.state[:, :size])
+        own = self.counters
+        counters = [own.step, own.key, own.episode, ended, self.state[:, size:]]
+        wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
+        for array, columns in self._own_parts():
+            launch_rows(state.widen, self.everyone, array, columns)
+
+    def unpack_state(self) -> None:
+        """Set counters, memory and sums of the selected worlds from ``state``."""
+        self.restore_counters(self.mask, self.state[:, self.engine.state_size :])
+        for array, columns in self._own_parts():
+            launch_rows(state.narrow, self.mask, columns, array)
+
+    def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
+        columns = memory_columns(self.task, self.state_space)
+        columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
+        arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
+        for name, place in columns.items():
+            yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
+
+    def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
+        """Set the selected worlds' counters from ``columns``, the state's columns after those of the engine."""
+        own = self.counters
+        counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
+        wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

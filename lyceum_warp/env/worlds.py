@@ -1,0 +1,365 @@
+"""Run the phases of a step, of a reset, and of reading and restoring states."""
+
+import dataclasses
+from collections.abc import Iterable
+from functools import partial
+
+import torch
+import warp as wp
+
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.core.fields import Stage
+from lyceum_warp.core.options import EnvOptions
+from lyceum_warp.core.task import MEMORIES
+from lyceum_warp.engines.base import Engine
+from lyceum_warp.env.arrays import WorldArrays
+from lyceum_warp.graphs.capture import Calls, Graphs, Phase
+from lyceum_warp.graphs.workers import Workers
+from lyceum_warp.kernels import random, rows, state, steps
+from lyceum_warp.support.arrays import (
+    flat,
+    launch_lanes,
+    launch_parts,
+    launch_rows,
+    launch_worlds,
+    torch_view,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Programs:
+    """The callables of an environment's phases. Each combination of horizon, autoreset and graphs has its own."""
+
+    graphs: Graphs
+    step: Calls
+    reset: Calls
+    rand_reset: Calls
+    read_state: Calls
+    restore_state: Calls
+
+
+class Worlds(WorldArrays):
+    """Many worlds of one task on one engine, with the phases that update their arrays.
+
+    A captured graph repeats launches, so a phase must always launch the same kernels on the same arrays.
+    """
+
+    def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
+        super().__init__(task, engine)
+        self._workers = self._make_workers()
+        self._programs: dict[tuple[int, bool, bool], Programs] = {}
+        horizon = task.task.horizon if options.horizon is None else options.horizon
+        self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
+
+    def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
+        """Set the horizon, automatic restarts, and whether to capture launches as graphs."""
+        self.horizon, self.autoreset = horizon, autoreset
+        key = (horizon, autoreset, graphs)
+        if key not in self._programs:
+            capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, workers=self._workers)
+            self._programs[key] = Programs(
+                capture,
+                step=capture.sequence(self.step_phases(skip=graphs and self.engine.capturable)),
+                reset=capture.sequence(self.reset_phases(randomly=False)),
+                rand_reset=capture.sequence(self.reset_phases(randomly=True)),
+                read_state=capture.sequence(self.read_phases()),
+                restore_state=capture.sequence(self.restore_phases()),
+            )
+        self.programs = self._programs[key]
+
+    def drop_programs(self) -> None:
+        """Delete the programs, whose reference cycles would keep threads and memory alive."""
+        self._programs.clear()
+        del self.programs
+
+    def _make_workers(self) -> Workers | None:
+        # Warp's kernels in debug mode are not thread-safe
+        if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
+            return None
+        nthread = self.engine.launch_threads
+        return Workers(nthread) if nthread > 1 else None
+
+    # phases
+
+    def step_phases(self, substeps: int | None = None, *, skip: bool = False) -> list[Phase]:
+        """List the phases of a step in order.
+
+        With ``skip``, the phases of restarts and events are merged, so that a graph skips them if no world needs them.
+        """
+
+        def only(mask: wp.array, *parts: list[Phase]) -> list[Phase]:
+            phases = [phase for part in parts for phase in part]
+            return [self._merged(mask, phases)] if skip and phases else phases
+
+        restarting = self.restarting
+        restart, refresh = self._restart_phases(restarting, randomly=True), self._refresh_phases(restarting)
+        if not (events := self._event_phases()):
+            return [*self.transition_phases(substeps), *only(restarting, restart, refresh, self._observe_phases())]
+        return [
+            *self.transition_phases(substeps),
+            *only(restarting, restart),
+            *events,
+            *only(self._physics_changed, self._moved_phases()),
+            *only(restarting, refresh),
+            *self._observe_phases(),
+        ]
+
+    def _merged(self, mask: wp.array, phases: list[Phase]) -> Phase:
+        """Merge phases into one that is skipped if the mask is empty."""
+
+        def run() -> None:
+            for phase in phases:
+                phase.run()
+
+        return Phase(phases[0].name, partial(self.engine.run_for, mask, run), engine=True)
+
+    def transition_phases(self, substeps: int | None = None) -> list[Phase]:
+        """List the phases of a step that advance and evaluate the worlds, without resets and events."""
+        phases = [
+            Phase("act", self.act, by_world=True),
+            *self.physics_phases(substeps),
+            Phase("judge", self._judge_step, by_world=True),
+        ]
+        if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
+            phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
+        return phases
+
+    def physics_phases(self, substeps: int | None = None) -> list[Phase]:
+        """List the phases of a step's substeps."""
+        skip = self.task.frame_skip if substeps is None else substeps
+        if (kernel := self.task.kernels.substep_memory) is None:
+            return self.engine.step_phases(skip)
+        substep = [*self.engine.step_phases(1), Phase("substep", partial(self._substep, kernel), by_world=True)]
+        return substep * skip
+
+    def reset_phases(self, *, randomly: bool) -> list[Phase]:
+        """List the phases that start episodes in the worlds of ``mask``."""
+        return [
+            *self._restart_phases(self.mask, randomly=randomly),
+            *self._refresh_phases(self.mask),
+            Phase("judge", self._judge_state, by_world=True),
+        ]
+
+    def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
+        phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
+        if self.task.reset_dynamics:
+            phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
+        if randomly and (kernel := self.task.kernels.reject_worlds) is not None:
+            phases.append(Phase("redraw", partial(self._redraw, kernel, mask), engine=True))
+        if settle := self.task.task.settle:
+            phases.append(Phase("settle", partial(self.engine.settle, mask, settle), engine=True))
+        return phases
+
+    def _event_phases(self) -> list[Phase]:
+        kernel = self.task.kernels.run_events
+        return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
+
+    def _moved_phases(self) -> list[Phase]:
+        phases, changed = [], self._physics_changed
+        if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
+            phases.append(Phase("event dynamics", partial(self.engine.apply_model, changed), engine=True))
+        if self.engine.stage > Stage.NONE:
+            phases.append(Phase("event refresh", partial(self.engine.refresh_current, changed), engine=True))
+        return phases
+
+    def _observe_phases(self) -> list[Phase]:
+        """List the phases that write new observations after a restart or an event."""
+        changed = self.restarting if self.task.kernels.run_events is None else self._outdated
+        return [Phase("observe", partial(self._observe, changed), by_world=True)]
+
+    def _refresh_phases(self, mask: wp.array) -> list[Phase]:
+        if self.engine.reset_stage == Stage.NONE:
+            return []
+        return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
+
+    def read_phases(self) -> list[Phase]:
+        """List the phases that write all states into ``state``."""
+        # with automatic resets, done_reason describes only the last step
+        ended = self._no_fault if self.autoreset else self.outcome.done_reason
+        return [Phase("read state", partial(self.pack_state, ended))]
+
+    def restore_phases(self) -> list[Phase]:
+        """List the phases that restore the selected worlds from ``state``."""
+        engine_columns = self.state[:, : self.engine.state_size]
+        return [
+            Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
+            Phase("restore counters", self.unpack_state),
+            Phase("judge", partial(self._judge_state, keep_reason=True), by_world=True),
+        ]
+
+    def rehearsal(self) -> None:
+        """Launch the kernels of all phases once, so that ``compile_ahead`` can list them."""
+        self.seed_streams(0)
+        # two substeps launch all kernels; on the Warp engine, each further substep would take milliseconds
+        step = self.step_phases(min(self.task.frame_skip, 2))
+        phases = (*self.reset_phases(randomly=True), *step, *self.read_phases(), *self.restore_phases())
+        for phase in phases:
+            if self.engine.capturable or not phase.engine:
+                phase.run()
+
+    def keep_before(self) -> None:
+        """Copy the current state into ``before``."""
+        if (kernel := self.task.kernels.keep_before) is not None:
+            launch_lanes(kernel, self.nworld, [self.after, self.before], self.device)
+
+    def act(self) -> None:
+        """Copy the state before the step, and convert actions to controls."""
+        self.keep_before()
+        launch_worlds(self.task.kernels.act, self.nworld, [
+            self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
+            self._action_fault, self.engine.ctrl,
+        ], self.device)  # fmt: skip
+        if (check_model := self.task.kernels.check_model) is not None:
+            launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
+
+    def _substep(self, kernel: wp.Kernel) -> None:
+        args = [self.after, self.params]
+        launch_worlds(kernel, self.nworld, args, self.device)
+
+    def _judge_step(self) -> None:
+        self.engine.find_faults(self.everyone)
+        self.advance_memory()
+        keep_reason = not self.autoreset
+        self._judge(self.everyone, self.engine.fault, self._action_fault, transition=True, keep_reason=keep_reason)
+
+    def advance_memory(self) -> None:
+        """Advance the task's memory by a step."""
+        if (advance := self.task.kernels.advance_memory) is not None:
+            args = [self.before, self.after, self.params, self.safe_action, self.counters]
+            launch_worlds(advance, self.nworld, args, self.device)
+
+    def _tally(self, kernel: wp.Kernel) -> None:
+        reason = self.outcome.done_reason
+        args = [self.before, self.after, self.params, self.safe_action, reason, self._shares, self.sums]
+        launch_worlds(kernel, self.nworld, args, self.device)
+
+    def _judge(
+        self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False
+    ) -> None:
+        kernels = self.task.kernels
+        if kernels.check_memory is not None:
+            launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
+        launch_parts(kernels.judge, self._judging, self.nworld, [
+            mask, self.before, self.after, self.params, self.weights, self.safe_action, self.counters, transition,
+            fault, action_fault, self._found, self.metrics, self.final_obs, self._judging,
+        ], self.device)  # fmt: skip
+        launch_lanes(kernels.conclude, self.nworld, [
+            mask, self.before, self.params, self._found, self.counters.step, self.horizon, transition, keep_reason,
+            fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting,
+            self.fault_count,
+        ], self.device)  # fmt: skip
+        self._hold_success(mask, transition=transition)
+
+    def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
+        if self.success_counts.size:
+            args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
+            launch_worlds(steps.hold_success, self.nworld, args, self.device)
+
+    def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
+        self.engine.reset(mask)
+        self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
+        if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
+            kept, live = self._lasting_before, self.lasting_memory
+            launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
+        self._make_nominal(mask, self.task.reset_dynamics)
+        args = [mask, randomly, again, self.after, self.params, self.counters]
+        launch_worlds(self.task.kernels.restart, self.nworld, args, self.device)
+        self.engine.commit(mask)
+
+    def _clear(self, mask: wp.array, *names: str) -> None:
+        for name in names:
+            if (array := self._clearable[name]).size:
+                launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
+
+    def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
+        for name in names:
+            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
+
+    def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
+        wp.copy(self._rejected, mask)
+        for _ in range(self.task.task.draws - 1):
+            # on a GPU, reading the mask would wait for the device
+            if not self.engine.capturable and not self._rejected.numpy().any():
+                return
+            self.engine.refresh(self._rejected)
+            args = [self._rejected, self.after, self.params, self._rejected]
+            launch_worlds(kernel, self.nworld, args, self.device)
+            self._restart(self._rejected, randomly=True, again=True)
+            if self.task.reset_dynamics:
+                self.engine.apply_model(self._rejected)
+
+    def _event(self, kernel: wp.Kernel) -> None:
+        before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
+        live = {name: getattr(self.after, name) for name in before}
+        before |= self._model_copies
+        live |= {name: self.engine.arrays[name] for name in self._model_copies}
+        for name, copy in before.items():
+            wp.copy(copy, live[name])
+        launch_worlds(kernel, self.nworld, [
+            self.restarting, self.after, self.params, self.counters, self._continuing, self._physics_changed,
+            self._changed, self._outdated,
+        ], self.device)  # fmt: skip
+        for name, copy in before.items():
+            self._mark_changes(copy, live[name], physics=name not in MEMORIES)
+        state_fields = [name for name in before if name not in MEMORIES and name not in self._model_copies]
+        self.engine.commit(self._physics_changed, state_fields)
+
+    def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
+        """Mark worlds in which an event changed a given field. ``physics`` is False for a memory field."""
+        found = [self._physics_changed, self._changed, self._outdated]
+        args = [self._continuing, flat(before), flat(after), physics, *found]
+        launch_lanes(rows.mark_changes, self.nworld, args, self.device)
+
+    def _observe(self, mask: wp.array) -> None:
+        """Write new observations of the masked worlds after a restart or an event."""
+        kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
+        args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
+        launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
+        if parts > 1:
+            args = [mask, finite, self.final_obs, self.obs]
+            launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
+
+    def _judge_state(self, *, keep_reason: bool = False) -> None:
+        # a state that was set without a check may be invalid; its world then keeps the last valid observation
+        self.engine.find_faults(self.mask)
+        keep_reason = keep_reason and not self.autoreset
+        self._judge(self.mask, self.engine.fault, self._no_fault, transition=False, keep_reason=keep_reason)
+
+    # called by Env and OpenLoop
+
+    def judge_transition(self, action: torch.Tensor) -> None:
+        """Evaluate the transition from ``before`` to the current state, ignoring engine faults."""
+        torch_view(self.safe_action).copy_(action)
+        self._judged.zero_()
+        self._judge(self.everyone, self._judged, self._no_fault, transition=True)
+
+    def seed_streams(self, seed: int, first_world: int = 0) -> None:
+        """Restart the random streams of the selected worlds, and call the task's ``startup``."""
+        self._seed.fill_(seed)
+        args = [self.mask, self._seed, first_world, self.counters.key, self.counters.episode]
+        wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
+        self._clear(self.mask, "lasting_memory")
+        self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
+        if self.task.kernels.start_worlds is not None:
+            args = [self.mask, self.after, self.params, self.counters]
+            launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
+        if self.task.dynamics:
+            self.engine.apply_model(self.mask)
+
+    def update_shared(self) -> None:
+        """Update the shared memory from the sums, clear the sums, and observe all worlds again."""
+        if (kernel := self.task.kernels.share_memory) is not None:
+            launch_worlds(kernel, 1, [self.sums, self._shares, self.params, self.shared], self.device)
+            self._observe(self.everyone)
+
+    def update_params(self) -> None:
+        """Copy the task's parameters and weights into the kernels' arrays."""
+        parameters = self.task.parameters
+        changed = {"params": parameters.array(self.device), "weights": parameters.weights(self.device)}
+        for name, array in changed.items():
+            if array.shape == getattr(self, name).shape:
+                wp.copy(getattr(self, name), array)
+                continue
+            setattr(self, name, array)
+            for programs in self._programs.values():
+                programs.graphs.forget()

@@ -1,0 +1,1 @@
+"""Help to prepare models: walking robots, rough ground, actuators."""

@@ -1,0 +1,35 @@
+"""Load the public names of the package and of its rooms at their first use (PEP 562)."""
+
+import ast
+import importlib
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+
+def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are listed in its ``__init__.pyi``.
+
+    Type checkers read the same file. It consists of lines such as ``from package.module import name as name`` and
+    ``import package.module as name``.
+    """
+    module = sys.modules[package]
+    sources: dict[str, tuple[str, str | None]] = {}
+    for node in ast.parse(Path(str(module.__file__)).with_suffix(".pyi").read_text("utf-8")).body:
+        if isinstance(node, ast.ImportFrom) and node.module:
+            sources |= {alias.name: (node.module, alias.name) for alias in node.names}
+        elif isinstance(node, ast.Import):
+            sources |= {alias.asname: (alias.name, None) for alias in node.names if alias.asname}
+
+    def load(name: str) -> Any:
+        if name not in sources:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        source, attribute = sources[name]
+        value = importlib.import_module(source)
+        if attribute is not None:
+            value = getattr(value, attribute)
+        setattr(module, name, value)
+        return value
+
+    return load, lambda: sorted({*vars(module), *sources}), sorted(sources)

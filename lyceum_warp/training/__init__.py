@@ -1,0 +1,1 @@
+"""Train a learner, and write and read its run's folder."""

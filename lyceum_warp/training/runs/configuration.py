@@ -1,0 +1,153 @@
+"""Convert between a learner and the config.json of its run."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.npg import NPG
+from lyceum_warp.algos.npg_config import NPGConfig
+from lyceum_warp.algos.ppo import PPO
+from lyceum_warp.algos.ppo_config import PPOConfig
+from lyceum_warp.algos.sac import SAC
+from lyceum_warp.algos.sac_config import SACConfig
+from lyceum_warp.binding.registry import spelled_task
+from lyceum_warp.core.options import EnvOptions
+from lyceum_warp.engines.placement import engine_name
+from lyceum_warp.env.env import Env
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.validate import whole_number
+from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
+from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copies
+
+ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
+"""Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
+
+
+def describe(learner: Learner) -> dict[str, Any]:
+    """Make the content of config.json. ``Configuration`` makes the same learner from it."""
+    env, options = learner.env, learner.env.options
+    kept = ["horizon", "graphs", "fields", "dynamics"]
+    if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
+        kept.append("nthread")
+    others = {name: value for name, value in options.given().items() if name in kept}
+    if isinstance(options.model, str | Path):
+        others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+    seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
+    return {
+        "algorithm": learner.algorithm,
+        "task": spelled_task(env.task.task),
+        "params": {name: json_value(name, value) for name, value in env.given_params.items()},
+        "physics": options.physics.given(),
+        "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
+        "device": options.device or "cpu",
+        "options": others,
+        "nworld": env.nworld * learner.team.size,
+        "threads": torch.get_num_threads(),
+        "seed": options.seed,
+        **seed,
+        learner.algorithm: learner.settings(),
+    }
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Configuration:
+    """Configuration of a run: the task, the environment's options, and the algorithm with its hyperparameters."""
+
+    task: str | None
+    """The task's name or file. None if the task was defined in a notebook."""
+    params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    options: EnvOptions
+    """Options of the environment. ``nworld`` counts the worlds of all processes."""
+    algorithm: str
+    hyperparameters: Any
+    """The algorithm's hyperparameters. None for an algorithm that is not in ``ALGORITHMS``."""
+    seed: int | None = None
+    """Seed of the algorithm. None means the environment's seed."""
+    threads: int = 1
+    iterations: int = 100
+
+    @classmethod
+    def of(cls, run: Run) -> "Configuration":
+        """Read a run's configuration. If the file of a table is missing or has changed, use the run's copy."""
+        config = run.config
+        try:
+            # earlier releases stored --param options in "params", or wrote no "physics"
+            words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
+            words.pop("unroll", None)  # earlier releases had this option, which did not affect results
+            base = EnvOptions(
+                engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
+            )  # fmt: skip
+            options, params = EnvOptions.split(words, base)
+            params |= {param: str(copy) for param, copy in table_copies(run).items()}
+            name: str = config["algorithm"]
+            return cls(
+                task=config["task"], params=params, options=options, algorithm=name,
+                hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
+                seed=config.get(f"{name}_seed"), threads=config["threads"],
+                iterations=config.get("iterations", 100),
+            )  # fmt: skip
+        except (KeyError, TypeError, AttributeError, ValueError) as error:
+            text = f"{run.folder / 'config.json'} is not the configuration of a training run ({error})"
+            raise ValueError(text) from error
+
+    def learner(
+        self,
+        team: Team,
+        *,
+        run: Run | None = None,
+        networks: tuple[Any, Any] = (None, None),
+        task: str | None = None,
+        trust: bool = False,
+    ) -> Learner:
+        """Make the learner of one of the processes.
+
+        With a run, the learner uses the run's task, unless ``task`` names another task. Without a run, it uses the task
+        of this configuration. New networks are made if none are given. For ``trust``, see ``run_env``.
+        """
+        try:
+            # OpenMP aborts the process if it cannot create the threads
+            torch.set_num_threads(whole_number("threads", self.threads, low=1, high=1024))
+            nworld = team.share(self.options.nworld)
+            own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
+            options = self.options.changed(own)
+            engine = engine_name(options.engine, options.device)
+            if options.nthread is None and team.neighbours > 1 and engine == "mujoco":
+                options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
+            if run is None:
+                assert self.task is not None
+                env = Env(self.task, options, **self.params)
+            else:
+                # only rank 0 checks trust, because other machines may have no record of the run
+                env = run_env(run, options, self.params, task=task, trust=trust or not team.leads)
+            seed = self.options.seed if self.seed is None else self.seed
+            learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
+            return learner
+        except (ValueError, FileNotFoundError) as error:
+            if run is not None:
+                run.note_settings(error)
+            raise
+
+
+def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
+    """Load a learner's initial policy and value function from a run.
+
+    The third result is the iteration at which they were saved.
+
+    If ``which`` is None, the run is resumed. The learner then usually makes its networks from the hyperparameters, and
+    this function returns None for the policy and for the value function. It returns the networks if the policy has a
+    ``limit``, or if the run started from another run.
+    """
+    path = run.policy_file("last" if which is None else which)
+    content = read_checkpoint(path, parts=("iteration", "policy"))
+    if which is None and "from" not in run.config and "limit" not in (content["policy"].get("shape") or {}):
+        return None, None, content["iteration"]
+    value = network_of(content, path, "value") if "value" in content else None
+    return network_of(content, path, "policy"), value, content["iteration"]

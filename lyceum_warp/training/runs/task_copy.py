@@ -1,0 +1,325 @@
+"""Copy a run's task into the run's folder, and later choose between the copy and the original."""
+
+import filecmp
+import hashlib
+import io
+import logging
+import os
+import warnings
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.binding.models import find_model
+from lyceum_warp.binding.opened_files import data_files, stamps
+from lyceum_warp.binding.registry import package_task_names, source_files
+from lyceum_warp.core.model_files import ModelFile, read_spec
+from lyceum_warp.core.options import EnvOptions
+from lyceum_warp.core.task import Task
+from lyceum_warp.env.env import Env
+from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training.runs.trust import check_trust
+
+log = logging.getLogger(__name__)
+
+Files = dict[Path, Path | bytes]
+"""Maps the path of each new file to its content, or to an existing file to copy."""
+
+TABLES = "tables"
+_APART = 2
+"""If the task's file lies more than this number of levels below the folder that contains both the task and the model,
+the two are copied into separate folders."""
+_LARGEST = 512 * 2**20
+"""Maximum size of a model, and of all data files, that are copied, in bytes."""
+
+
+def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
+    """Collect the files of an environment's task for the folder of a run. Files of the package are not included.
+
+    Returns:
+        The entry ``kept`` of config.json, and the files of the folder ``task``, by their paths in this folder.
+    """
+    task, given = env.task.task, env.options.model is not None
+    loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
+    file = next(iter(loaded), None)
+    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
+    files: dict[str, Path | bytes] = {}
+    if file is not None:
+        kept["source_hash"] = _digest(loaded[file])
+    if own or given:
+        main, model = _model_files(env)
+        sources: Files = {**loaded, **_data_copies(task)[0]} if own else {}
+        # relative paths stay the same, so that the copied task finds the copied model
+        names = _names_in_copy([*sources, *model])
+        if file is not None and names.get(file, "").count("/") > _APART:
+            names = _names_in_copy(sources) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
+        files = {names[path]: content for path, content in {**sources, **model}.items()}
+        if own and file is not None:
+            kept["modules"] = {
+                path.relative_to(file.parent).as_posix(): _digest(source)
+                for path, source in sources.items()
+                if path != file
+            }
+            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
+        if main is not None:
+            kept["model"] = names[main]
+    for name, value in env.given_params.items():
+        if (table := _table(value)) is not None:
+            files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
+    return kept, files
+
+
+def _data_copies(task: type[Task]) -> tuple[Files, dict[str, list[Path]]]:
+    """Return the data files that a task reads and that a run can copy, and the others by the reason against a copy.
+
+    The copy of the task's file finds only files below its own folder.
+    """
+    loaded = source_files(task)
+    folder, data = next((file.parent for file in loaded), Path()), data_files(loaded)
+    large = sum(path.stat().st_size for path in data) > _LARGEST
+    copies: Files = {}
+    uncopied: dict[str, list[Path]] = {}
+    for path, stamp in data.items():
+        if folder not in path.parents:
+            reason = f"move it into {folder}, and read it by a path that starts with Path(__file__).parent"
+        elif stamps([path]) != {path: stamp}:
+            reason = "it has changed since it was read, so make a new environment"
+        elif large:
+            reason = f"the data files are larger than {_LARGEST // 2**20} MiB"
+        else:
+            copies[path] = path
+            continue
+        uncopied.setdefault(reason, []).append(path)
+    return copies, uncopied
+
+
+def note_uncopied_data(env: Env) -> None:
+    """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
+    for reason, (path, *others) in _data_copies(env.task.task)[1].items():
+        more = f" and of {len(others)} more files" if others else ""
+        log.warning("the run has no copy of %s%s, which the task %r reads: %s", path, more, env.task.name, reason)
+
+
+def _names_in_copy(paths: Collection[Path]) -> dict[Path, str]:
+    root = os.path.commonpath([path.parent for path in paths]) if paths else ""
+    return {path: path.relative_to(root).as_posix() for path in paths}
+
+
+def json_value(name: str, value: Any) -> Any:
+    """Convert a task parameter to a JSON value for config.json."""
+    if (table := _table(value)) is not None:
+        return str(Path(value).absolute()) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
+    if isinstance(value, bool | int | float | str):
+        return value
+    return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
+
+
+def _table(value: Any) -> Any:
+    """Get the file or the array of a table parameter. Return None for other parameters."""
+    if is_table(value):
+        return Path(value)
+    array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+    return array if array.dtype.kind in "fiu" and array.size > 64 else None
+
+
+def is_table(value: Any) -> bool:
+    """Check whether a parameter is the path of a ``.npy`` file."""
+    return isinstance(value, str | Path) and str(value).endswith(".npy")
+
+
+def table_copies(run: Run) -> dict[str, Path]:
+    """Return the run's copies of those tables whose files are missing or have changed since the run began."""
+    tables = {name: value for name, value in run.config["params"].items() if is_table(value)}
+    copies = {name: (run.task_folder / TABLES / f"{name}.npy").absolute() for name in tables}
+    return {
+        name: copy
+        for name, copy in copies.items()
+        if copy.is_file() and not (Path(tables[name]).is_file() and filecmp.cmp(tables[name], copy, shallow=False))
+    }
+
+
+def _note_tables(run: Run, params: Mapping[str, Any], text: str, *, copies: bool) -> None:
+    """Log a warning for each changed table of which the copy, or the new version, is used."""
+    for name, copy in table_copies(run).items():
+        file = run.config["params"][name]
+        if Path(file).is_file() and name in params and json_value(name, params[name]) == str(copy if copies else file):
+            log.warning("%s has changed since the run began: %s", file, text.format(copy))
+
+
+def _npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array)
+    return buffer.getvalue()
+
+
+def run_env(
+    run: Run,
+    options: EnvOptions,
+    params: Mapping[str, Any],
+    *,
+    task: str | None = None,
+    trust: bool = False,
+) -> Env:
+    """Make an environment for a run's task, or for another given task.
+
+    If a file or a model has been moved or changed since the run started, the run's copy is used, and a warning is
+    logged. Tasks of the package are used in their current version. With ``trust``, the task is executed and files are
+    read even if this user did not make the run on this machine.
+
+    Raises:
+        ValueError: The task does not fit the run, or the run is not trusted.
+        FileNotFoundError: The task or its model is missing, and the run has no copy.
+    """
+    kept, chosen = run.config.get("kept", {}), run.config["task"]
+    saved, tables = run.config["params"], (run.task_folder / TABLES).absolute()
+    read: list[str | Path] = [
+        value for name, value in params.items()
+        if is_table(value) and (value is saved.get(name) or tables in Path(value).absolute().parents)
+    ]  # fmt: skip
+    _note_tables(run, params, "the run's own copy is used, {}", copies=True)
+    read += [options.model] if isinstance(options.model, str) else []
+    if task is not None:
+        if read:
+            check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
+        return Env(task, options, **params)
+    if chosen is None or kept.get("program"):
+        where = "a notebook" if chosen is None else chosen.partition(":")[0]
+        raise ValueError(
+            f"the run in {run.folder} was started by {where}, which also defines its task {run.task_name!r}: pass a "
+            "file that only defines the task (eval --task my_task.py, train my_task.py --from), or resume the run in "
+            "that program (resume=True)"
+        )
+    path, colon, attribute = chosen.partition(":")
+    copy = run.task_folder / kept.get("file", "")
+    read += [run.task_folder / kept["model"]] if "model" in kept else []
+    if copy.is_file() or path not in package_task_names():
+        check_trust(run.folder, run.config, copy if copy.is_file() else path, runs=True, trust=trust)
+    elif read:
+        check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
+    if copy.is_file() and (changes := _source_changes(Path(path), kept)):
+        new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
+        log.warning("%s: the run's own copy is used, %s%s", changes[0], copy, new)
+        chosen = f"{copy}{colon}{attribute}"
+    copy = run.task_folder / kept.get("model", "")
+    if not copy.is_file():
+        return Env(chosen, options, **params)
+    if kept.get("model_given") and not isinstance(options.model, str):  # the run's model was made in Python
+        return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+    try:
+        env = Env(chosen, options, **params)
+        if not _model_changed(run, env):
+            return env
+        reason = "has changed since the run began"
+    except FileNotFoundError:
+        reason = "is no longer where it was"
+    log.warning("the model of the task %r %s: the run's own copy is used, %s", run.task_name, reason, copy)
+    return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+
+
+def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
+    changes = []
+    for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
+        path = file.parent / name
+        content = (loaded or {}).get(path)
+        if content is None and not path.is_file():
+            changes.append(f"{path} does not exist any more")
+        elif hashed not in (None, _digest(path if content is None else content)):
+            changes.append(f"{path} has changed since the run began")
+    return changes
+
+
+def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
+    """Log a warning if an environment's task or its compiled model differs from the run's.
+
+    The compiled model depends on the physics. Set ``model`` to False if the physics differ on purpose.
+    """
+    kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
+    file = next(iter(loaded), None)
+    # if the task's file is the training script, a change may have nothing to do with the task
+    hashed = None if kept.get("program") else kept.get("source_hash")
+    for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
+        log.warning("%s", f"{change}: the new version is used" if "changed" in change else change)
+    _note_tables(run, env.given_params, "the new version is used", copies=False)
+    if model and _model_changed(run, env):
+        log.warning("the model of the task %r has changed since the run began: the new version is used", env.task.name)
+
+
+def _model_changed(run: Run, env: Env) -> bool:
+    """Check whether the model has changed since the run started.
+
+    With another version of MuJoCo, the result is False, because a new version may compile the model differently.
+    """
+    known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
+    same_version = run.config.get("versions", {}).get("mujoco", version) == version
+    return same_version and known not in (None, _model_hash(env))
+
+
+def _digest(content: bytes | Path) -> str:
+    with io.BytesIO(content) if isinstance(content, bytes) else content.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def _model_hash(env: Env) -> str:
+    """Hash the compiled model, except for fields with paths."""
+    found = hashlib.sha256()
+    for owner in (env.task.model, env.task.model.opt):
+        for name in sorted(dir(owner)):
+            if name.startswith("_") or name.endswith("pathadr") or name in ("paths", "npaths", "nbuffer"):
+                continue
+            value = getattr(owner, name)
+            if isinstance(value, np.ndarray):
+                found.update(name.encode() + np.ascontiguousarray(value).tobytes())
+            elif isinstance(value, bytes | int | float):
+                found.update(f"{name}{value!r}".encode())
+    return found.hexdigest()[:16]
+
+
+def _model_files(env: Env) -> tuple[Path | None, Files]:
+    """Get the main file and all files of a task's model. A model made in Python is written as MJCF."""
+    task, given = env.task.task, env.options.model
+    source = given if given is not None else task.model
+    if isinstance(source, str | Path):
+        source = find_model(source, None if given is not None else task)
+    if isinstance(source, ModelFile):
+        source = source.path()
+    if isinstance(source, Path):
+        source = source.resolve()
+        files: Files = {path: path for path in (source, *_dependencies(source))}
+    else:
+        spec = env.task.spec.copy()
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # logged when the environment was made
+                spec.compile()
+                text = spec.to_xml()
+        except (ValueError, mujoco.FatalError) as error:
+            log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
+            return None, {}
+        folder = Path(spec.modelfiledir or ".").resolve()
+        source = folder / "model.xml"
+        files = {source: text.encode(), **{path: path for path in _spec_dependencies(spec, folder)}}
+        for name, content in env.task.spec.assets.items():
+            files.setdefault(folder / name, content)
+    if sum(path.stat().st_size for path in files.values() if isinstance(path, Path)) > _LARGEST:
+        log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
+        return None, {}
+    return source, files
+
+
+def _dependencies(source: Path) -> list[Path]:
+    """List the files to which a model file refers: includes, other models, meshes, textures, height fields."""
+    if source.suffix.lower() == ".urdf":  # MuJoCo lists no dependencies of URDF files
+        return _spec_dependencies(read_spec(source), source.parent)
+    return [path for name in mujoco.mju_getXMLDependencies(str(source)) if (path := Path(name)) != source]
+
+
+def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
+    parts = (*spec.meshes, *spec.hfields, *spec.skins)
+    names = [Path(spec.meshdir, part.file) for part in parts if part.file]
+    for texture in spec.textures:
+        names += [Path(spec.texturedir, name) for name in (texture.file, *texture.cubefiles) if name]
+    found = dict.fromkeys(Path(os.path.normpath(folder / name)) for name in names)
+    return [path for path in found if path.is_file()]

@@ -1,0 +1,65 @@
+import pytest
+import torch
+from conftest import SharedEnv
+
+import lyceum_warp as lw
+from lyceum_warp.algos.common.evaluation import evaluation_seed
+from lyceum_warp.controllers.batch import policy_episodes
+from lyceum_warp.core.done import Done
+
+
+def push(obs: torch.Tensor) -> torch.Tensor:
+    return torch.tanh(3 * obs[:, :3])
+
+
+@pytest.fixture(scope="module")
+def env() -> lw.Env:
+    return lw.make("hopper", nworld=3, horizon=60, autoreset=False)
+
+
+def test_policy_episodes_have_the_same_returns_as_evaluate(env: lw.Env, shared_env: SharedEnv) -> None:
+    counts: list[tuple[int, int]] = []
+    evaluated = lw.evaluate(shared_env("hopper", nworld=3, horizon=60), push, 5, seed=2)  # type: ignore[arg-type]
+    progress = lambda *count: counts.append(count)  # noqa: E731
+    episodes = list(policy_episodes(env, push, 5, seed=evaluation_seed(2), progress=progress))
+    assert [episode.steps for episode in episodes] == evaluated.lengths[:5].int().tolist()
+    returns = torch.tensor([episode.episode_return for episode in episodes])
+    torch.testing.assert_close(returns, evaluated.returns[:5], rtol=1e-5, atol=1e-5)
+    assert len(set(returns.tolist())) == 5
+    assert counts and all(done <= total == 120 for done, total in counts)
+    for episode in episodes:
+        ended = Done.TRUNCATED if episode.steps == 60 else Done.TERMINATED
+        assert episode.done_reason == ended and episode.states.shape == (episode.steps + 1, env.state_space.size)
+        assert episode.controller["name"] == "function"
+    assert [(e.controller["world"], e.controller["episode"]) for e in episodes] == [
+        (0, 0),
+        (1, 0),
+        (2, 0),
+        (0, 1),
+        (1, 1),
+    ]
+
+
+def test_an_episode_can_be_replayed_bit_for_bit(env: lw.Env) -> None:
+    episode = list(policy_episodes(env, push, 2, seed=1))[1]
+    one = lw.make("hopper", horizon=60, autoreset=False)
+    one.set_state(episode.states[:1])
+    for k, action in enumerate(episode.actions):
+        assert torch.equal(one.obs[0], episode.obs[k])
+        one.step(action[None])
+        assert torch.equal(one.get_state()[0], episode.states[k + 1])
+        assert one.reward.item() == episode.rewards[k]
+
+
+def test_episode_has_the_parameters_of_its_own_world() -> None:
+    env = lw.make("point_mass", nworld=2, horizon=3, autoreset=False, success_distance=[0.1, 0.2])
+    first, second = policy_episodes(env, lambda obs: torch.zeros(2, 2), 2)
+    assert first.params["success_distance"] == pytest.approx([0.1])
+    assert second.params["success_distance"] == pytest.approx([0.2])
+
+
+def test_environments_with_autoreset_or_without_horizon_raise_an_error(shared_env: SharedEnv) -> None:
+    with pytest.raises(ValueError, match="without automatic resets"):
+        next(policy_episodes(shared_env("hopper", nworld=3, horizon=60), push, 1))
+    with pytest.raises(ValueError, match="has no time limit"):
+        next(policy_episodes(lw.make("hopper", horizon=0, autoreset=False), push, 1))

@@ -1,0 +1,78 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from training_runs import refused
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos.common.policy_check import check_sizes
+from lyceum_warp.binding.registry import task_names
+from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.training.runs.folder import Run, load
+from lyceum_warp.training.runs.pretrained_runs import pretrained_run, pretrained_tasks, pretrained_text
+
+TASKS = pretrained_tasks()
+
+
+@pytest.mark.quick("cartpole_swingup", "go1_rough_velocity", "go1_velocity", "hopper")
+@pytest.mark.parametrize("task", TASKS)
+def test_pretrained_policy_matches_its_task_and_reaches_its_return(task: str) -> None:
+    if task.startswith("dm/"):
+        pytest.importorskip("dm_control", reason="dm_control brings the models")
+    run = Run.open(pretrained_run(task))
+    first = run.config["evaluated"]["first_steps"]
+    env = run_worlds(run, {}, {}, nworld=first["worlds"], task=None, trust=False)
+    policy = load(run)
+    check_sizes(policy, env)
+    env.rand_reset(run.config["evaluated"]["seed"])
+    total = torch.zeros(env.nworld)
+    for _ in range(first["steps"]):
+        env.action.copy_(policy.act(env.obs))
+        env.step()
+        total += env.reward
+    assert total.mean().item() == pytest.approx(first["return"], rel=0.1)
+
+
+def test_pretrained_policies_are_small_and_contain_no_code() -> None:
+    size = 0
+    for task in TASKS:
+        folder = pretrained_run(task)
+        assert {path.name for path in folder.iterdir()} == {"config.json", "policy.pt"}
+        size += sum(path.stat().st_size for path in folder.iterdir())
+        config = json.loads((folder / "config.json").read_text())
+        assert config["task"] == config["kept"]["name"] == task and task in task_names()
+        assert "file" not in config["kept"]
+        assert all(type(value) in (int, float, list) for value in config["params"].values())
+        content = torch.load(folder / "policy.pt", weights_only=True)
+        assert content.keys() == {"lyceum_warp", "iteration", "policy"}
+        assert lw.load(folder).training is False
+    assert size < 5e6
+
+
+def test_task_name_in_place_of_a_run_names_the_pretrained_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"no run in hopper: .* add --pretrained, .*pretrained_run\('hopper'\)"):
+        Run.open("hopper")
+    with pytest.raises(FileNotFoundError, match=r"config\.json$"):
+        Run.open("runs/hopper")
+
+
+def test_description_of_a_pretrained_policy_names_the_training_settings(tmp_path: Path) -> None:
+    evaluated = {"return": 123.45, "std": 6.78, "episodes": 32, "lyceum_warp": "0.2.0"}
+    config = {"algorithm": "ppo", "task": "hopper", "params": {"ctrl_cost_weight": 0.5}, "physics": {}, "options": {}}
+    assert pretrained_text(Run(tmp_path, config | {"evaluated": evaluated})) == (
+        "pretrained by ppo on hopper with ctrl_cost_weight 0.5: return 123.5 ± 6.8 in 32 episodes of lyceum_warp 0.2.0"
+    )
+
+
+def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["eval", "hopper", "--pretrained", "--episodes", "2", "--horizon", "20"]) == 0
+    assert "2 episodes of the mean policy pretrained by" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["eval", "view"])
+def test_task_without_a_pretrained_policy_prints_an_error(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([command, "reacher", "--pretrained"]) == 2
+    refused(capsys, "there is no pretrained policy of 'reacher': the tasks with a policy are ", ", hopper")

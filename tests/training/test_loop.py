@@ -1,0 +1,293 @@
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from conftest import SharedEnv
+from training_runs import CONFIG, QUIET, algorithm, mean_action, metrics, refused, six_iterations, train
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.algos.common.evaluation import evaluation_seed
+from lyceum_warp.training.runs.folder import Run
+
+
+@pytest.fixture
+def env(shared_env: SharedEnv) -> lw.Env:
+    """Tests that compare numbers must not use this environment, because other tests advance its random streams."""
+    return shared_env("point_mass", nworld=2)
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return six_iterations(tmp_path_factory.mktemp("runs") / "six")
+
+
+def test_training_in_python_and_on_the_command_line_gives_equal_metrics(six: Path, tmp_path: Path) -> None:
+    out = tmp_path / "command"
+    assert train(out, "--iterations", "6", "--keep-every", "2") == 0
+    assert metrics(out) == metrics(six)
+    one, other = ({path.name for path in folder.rglob("*")} for folder in (out, six))
+    assert one == other | {"evaluation.json"}
+    configs = [Run.open(folder).config for folder in (out, six)]
+    assert configs[0] == configs[1] | {"threads": 1}
+
+
+def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(six, tmp_path / "run"))
+    run = Run.open(folder)
+    run.amend(versions=run.config["versions"] | {"torch": "2.0"})
+    assert cli.main(["eval", str(folder), "--episodes", "2", "--which", "best"]) == 0
+    capsys.readouterr()
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "7", *QUIET]) == 0
+    assert metrics(folder)[:6] == metrics(six)
+    refused(capsys, f"numbers may differ from an uninterrupted run's: torch 2.0 then, {torch.__version__} now")
+    assert Run.open(folder).config["resumed"] == [{"torch": torch.__version__}]
+
+
+def test_run_resumed_in_python_gives_identical_metrics(six: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=2)
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2, seed=5)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six) and len(run.rows()) == 6
+
+
+def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.Env, tmp_path: Path) -> None:
+    other = Path(shutil.copytree(six, tmp_path / "other"))
+    Run.open(other).amend(engine="warp")
+    for folder, given, message in [
+        (six, lw.make("cartpole", nworld=2), "has task point_mass, not cartpole"),
+        (other, env, "has engine warp, not mujoco"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(algorithm(given), folder, iterations=9, resume=True)
+
+
+def test_run_of_a_partly_trained_learner_is_complete(six: Path, tmp_path: Path) -> None:
+    npg, folder = algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run"
+    for _ in range(3):
+        next(npg)
+    assert lw.train(npg, tmp_path / "three", iterations=3).read()["iteration"] == 3
+    assert lw.load(tmp_path / "three").nact == 2
+    begun = []
+
+    def callback(iteration: lw.Iteration) -> bool:
+        begun.append(Run.open(folder).read()["iteration"])
+        return iteration.iteration == 5
+
+    lw.train(npg, folder, iterations=9, callback=callback, save_every=100)
+    assert begun == [3, 3]
+    previous = folder / "previous.pt"  # simulate the state after kill -9 in iteration 6
+    previous.replace(folder / "checkpoint.pt")
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)[3:]
+
+
+def test_invalid_train_arguments_make_no_folder(env: lw.Env, tmp_path: Path) -> None:
+    npg = algorithm(env)
+    for words, message in [
+        ({"iterations": 0}, "iterations must be"),
+        ({"keep_every": -1}, "keep_every must be"),
+        ({"save_every": 1.5}, "save_every must be"),
+        ({"target_return": float("nan")}, "target_return must be a number"),
+        ({"entries": "note"}, "entries must be of type Mapping"),
+        ({"display": True}, "display must be of type Display"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            lw.train(npg, tmp_path / "run", **words)  # type: ignore[arg-type]
+    assert not (tmp_path / "run").exists()
+
+
+def test_policies_are_loaded_by_name_and_number(six: Path) -> None:
+    returns = [float(row["mean_return"]) for row in metrics(six) if row["mean_return"]]
+    best = 2 * (returns.index(max(returns)) + 1)
+    actions = {which: mean_action(lw.load(six, which=which)) for which in ("last", "best", 2, 4, "6")}
+    assert torch.equal(actions["best"], actions[str(best) if best == 6 else best])
+    assert torch.equal(actions["last"], actions["6"])
+    assert not torch.equal(actions[2], actions[4])
+    assert lw.load_value(six, which="best").discount == CONFIG.gamma
+    with pytest.raises(FileNotFoundError, match=r"has no policy 3: it has 'last', 'best', 2, 4, 6"):
+        lw.load(six, which=3)
+    with pytest.raises(
+        ValueError, match="no policy is named 'worst': pass 'last', 'best' or the number of an iteration"
+    ):
+        lw.load(six, which="worst")
+
+
+def test_best_policy_has_the_highest_sampled_return_if_evaluations_are_off(tmp_path: Path) -> None:
+    config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
+    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=config), tmp_path / "run", iterations=4, keep_every=1)
+    returns = [float(row["return_mean"]) for row in metrics(tmp_path / "run")]
+    iteration, score = Run.open(tmp_path / "run").best_score() or (-1, 0.0)
+    assert score == max(returns) and iteration == returns.index(score)
+    if iteration > 0:
+        best, numbered = (mean_action(lw.load(tmp_path / "run", which=which)) for which in ("best", iteration))
+        assert torch.equal(best, numbered)
+
+
+def test_run_is_complete_after_an_error_in_the_callback(six: Path, tmp_path: Path) -> None:
+    def callback(iteration: lw.Iteration) -> None:
+        if iteration.iteration == 3:
+            raise KeyError("mine")
+
+    folder = tmp_path / "run"
+    with pytest.raises(KeyError) as raised:
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=callback, save_every=100)
+    assert raised.value.__notes__ == [f"the run in {folder} is saved up to iteration 3"]
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, resume=True)
+    assert metrics(folder) == metrics(six)
+
+
+def test_training_ends_at_the_target_return(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The mean policy is evaluated after every second iteration."""
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=9, target_return=-1e6)
+    assert len(run.rows()) == 2
+    resume = ["train", "--resume", str(folder), "--iterations", "4", *QUIET]
+    assert cli.main(resume) == 2
+    refused(
+        capsys,
+        f"the run in {folder} is finished, because its return reached",
+        "in iteration 2",
+        "use a larger target return",
+    )
+    assert cli.main([*resume, "--target-return", "inf"]) == 0
+    assert len(run.rows()) == 4
+
+
+def test_training_ends_after_the_given_minutes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "run"
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=1000, minutes=1e-6)
+    assert len(run.rows()) == 1 and run.read()["iteration"] == 1
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "1000", "--minutes", "1e-6", *QUIET]) == 0
+    assert "stopped after 2 of 1000 iterations: the limit is 1e-06 minutes; continue with" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="minutes must be a positive number of minutes, not 0"):
+        lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "other", minutes=0)
+    assert not (tmp_path / "other").exists()
+
+
+def test_training_ends_before_the_iteration_that_would_exceed_the_minutes(
+    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first iteration takes 30 s, for example to compile kernels, the second 20 s, and all others 10 s."""
+    clock = [0.0]
+    monkeypatch.setattr("lyceum_warp.training.loop.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    learner, ends = algorithm(env), []
+    for minutes in (0.01, 75 / 60, 95 / 60):
+        clock[0], first = 0.0, learner.iteration
+
+        def pass_time(it: lw.Iteration, first: int = first) -> None:
+            clock[0] += {1: 30.0, 2: 20.0}.get(it.iteration - first, 10.0)
+
+        lw.train(learner, tmp_path / f"{minutes}", iterations=100, minutes=minutes, callback=pass_time)
+        ends.append((learner.iteration - first, clock[0]))
+    assert ends == [(1, 30.0), (3, 60.0), (5, 80.0)]
+
+
+def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
+    """Simulate kill -9 in iteration 5. The last save is from iteration 3, and the last row is from iteration 4."""
+    folder = tmp_path / "run"
+    states = {}
+
+    def callback(iteration: lw.Iteration) -> None:
+        states[iteration.iteration] = {path: path.read_bytes() for path in folder.rglob("*.*")}
+
+    npg = algorithm(lw.make("point_mass", nworld=2))
+    lw.train(npg, folder, iterations=6, save_every=3, keep_every=2, callback=callback)
+    for path in folder.rglob("*.*"):
+        path.unlink()
+    for path, content in states[4].items():
+        path.write_bytes(content)
+    run = Run.open(folder)
+    assert run.read()["iteration"] == 3 and len(run.rows()) == 4
+    assert torch.equal(mean_action(lw.load(folder, which=4)), mean_action(lw.load(six, which=4)))
+    assert cli.main(["train", "--resume", str(folder), "--iterations", "6", *QUIET]) == 0
+    assert metrics(folder) == metrics(six)
+    for which in ("last", "best"):
+        assert torch.equal(mean_action(lw.load(folder, which=which)), mean_action(lw.load(six, which=which)))
+
+
+def test_training_from_another_run_starts_with_its_policy(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["train", "--from", str(six), "--which", "4", "--param", "success_distance=0.5", "--iterations", "1"]
+    assert cli.main([*arguments, "--out", str(out), "--keep-every", "1", *QUIET]) == 0
+    config = Run.open(out).config
+    assert config["from"] == {"run": str(six), "which": "4", "iteration": 4}
+    assert (config["task"], config["params"], config["nworld"]) == ("point_mass", {"success_distance": 0.5}, 2)
+    assert config["npg"] == Run.open(six).config["npg"]
+    state = Run.open(out).read()["state"]
+    assert state["iteration"] == 1
+    moved = mean_action(lw.load(out)) - mean_action(lw.load(six, which=4))
+    assert 0 < moved.abs().max() < 1.0
+    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
+    capsys.readouterr()
+    for options, words in [
+        (["hopper"], ["takes 6 observations", "'hopper' has 11"]),
+        (["--hidden", "9"], ["have hidden (8,), not (9,)", "omit --hidden"]),
+        (["--value-group", "critic"], ["have value_group policy, not critic", "omit --value-group"]),
+        (["--algorithm", "sac"], [f"{six} was trained by npg", "omit --algorithm sac"]),
+        (["--which", "5"], ["has no policy '5': it has 'last', 'best', 2, 4, 6"]),
+        (["--resume", str(six)], ["--from has no effect with --resume"]),
+    ]:
+        assert cli.main(["train", *options, "--from", str(six), "--out", str(tmp_path / "no")]) == 2
+        refused(capsys, *words)
+    assert not (tmp_path / "no").exists()
+
+
+def test_flags_with_default_values_override_the_settings_of_the_source_run(
+    six: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, out = Path(shutil.copytree(six, tmp_path / "old")), tmp_path / "out"
+    run = Run.open(old)
+    npg = run.config["npg"] | {"gamma": 0.9, "whiten": False}
+    run.amend(npg=npg, seed=3, keep_every=2, options={"horizon": 32}, physics={"deterministic": True})
+    command = ["train", "--from", str(old), "--iterations", "1", *QUIET]
+    given = ["--gamma", "0.995", "--whiten", "--seed", "0", "--keep-every", "0", "--no-deterministic"]
+    assert cli.main([*command, "--out", str(out), *given]) == 0
+    config = Run.open(out).config
+    assert config["npg"] == npg | {"gamma": 0.995, "whiten": True}
+    assert (config["seed"], config["keep_every"], config["options"]) == (0, 0, {"horizon": 32})
+    assert config["physics"] == {}
+    capsys.readouterr()
+    assert cli.main([*command, "--out", str(tmp_path / "no"), "--hidden", "64", "64"]) == 2
+    refused(capsys, "have hidden (8,), not (64, 64)", "omit --hidden")
+    assert cli.main(["train", "--resume", str(old), "--iterations", "9", "--gamma", "0.995"]) == 2
+    refused(capsys, "has gamma 0.9, not 0.995")
+
+
+def test_evaluation_and_training_with_equal_seeds_have_different_initial_states(env: lw.Env) -> None:
+    env.rand_reset(1)
+    trained_on = env.obs.clone()
+    env.rand_reset(evaluation_seed(1))
+    assert not torch.isclose(env.obs, trained_on).all(1).any()
+
+
+def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
+    """PPO starts with the networks of an NPG run."""
+    options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", "--iterations", "1", *QUIET]
+    out = tmp_path / "run"
+    assert cli.main(["train", "--from", str(six), "--algorithm", "ppo", *options, "--out", str(out)]) == 0
+    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
+    config = Run.open(out).config
+    assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
+    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma
+
+
+def test_run_folder_contains_the_result_of_the_transfer_test(env: lw.Env, tmp_path: Path) -> None:
+    run = lw.train(algorithm(env), tmp_path / "exact", iterations=1)
+    assert not run.transfer.exists()
+    coarse = algorithm(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20))
+    run = lw.train(coarse, tmp_path / "coarse", iterations=1)
+    found = json.loads(run.transfer.read_text())
+    (pair,) = found["comparisons"]
+    assert (found["iteration"], found["episodes"], pair["second"]) == (1, 64, "own physics")
+    lengths = pair["differences"][1]
+    assert (lengths["first"], lengths["second"], lengths["verdict"]) == (20.0, 20.0, "same")
+    assert found["line"].startswith(f"own physics against exact physics: {pair['verdict']} (return ")
+    assert not lw.train(coarse, tmp_path / "unwanted", iterations=2, transfer=False).transfer.exists()
