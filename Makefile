@@ -26,7 +26,7 @@ test-all: $(VENV)/installed-dev
 
 # make test-room ROOM=algos: one room of the package, by the tests that mirror it
 test-room: $(VENV)/installed-dev
-	$(PYTEST) $(wildcard tests/$(ROOM) tests/test_$(ROOM).py)
+	$(PYTEST) $(or $(wildcard tests/$(ROOM) tests/test_$(ROOM).py),$(error tests/ has no room "$(ROOM)"))
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

@@ -22,9 +22,8 @@ import torch
 from experiment import Experiment, Row, Skipped, Table
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.spaces import COUNTERS
+from lyceum_warp.binding import find_task
+from lyceum_warp.core import COUNTERS, FAULTS
 from lyceum_warp.support.validate import whole_number
 
 SHOWN = (1, 10, 100)

@@ -26,9 +26,9 @@ from experiment import Experiment, Row, Table
 
 import lyceum_warp as lw
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.env.curriculum import start_episodes
+from lyceum_warp.env import start_episodes
 from lyceum_warp.tasks.velocity.g1 import LEGS
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 NEVER = 1e6
 """Seconds until the next push or command. No episode lasts this long, so neither happens."""

@@ -9,9 +9,8 @@ import torch
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 import lyceum_warp as lw
+from lyceum_warp.algos import GaussianPolicy, Rollout
 from lyceum_warp.algos.common.dense import DensePolicy
-from lyceum_warp.algos.common.policy import GaussianPolicy
-from lyceum_warp.algos.common.rollout_buffer import Rollout
 
 TASKS = {"swimmer": "Swimmer-v5", "hopper": "Hopper-v5", "walker2d": "Walker2d-v5"}
 

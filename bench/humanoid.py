@@ -20,7 +20,7 @@ import torch
 from experiment import Row, Table, choose, median_and_range
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.controllers.report import wilson
 from lyceum_warp.support.machine import cpu_cores
 

@@ -19,9 +19,9 @@ import torch
 from experiment import Row, Table, choose, installed, median_and_range
 
 import lyceum_warp as lw
-from lyceum_warp.algos.planning.arguments import task_config
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.options import EnvOptions
+from lyceum_warp.algos import task_config
+from lyceum_warp.binding import find_task
+from lyceum_warp.core import EnvOptions
 from lyceum_warp.support.machine import cpu_cores
 
 COST = {

@@ -23,8 +23,8 @@ import torch
 from experiment import STYLES, Experiment, Row, Table, choose
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.viz.style import finish_axes, new_figure
+from lyceum_warp.algos import moved
+from lyceum_warp.viz import finish_axes, new_figure
 
 TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "go1_velocity": ("ppo", 80.0, 4096, None, 0),

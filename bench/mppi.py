@@ -26,7 +26,7 @@ import torch
 from experiment import Row, Table, choose, installed, median_and_range
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.controllers.report import wilson
 
 EPISODES = {"reach": 75, "adroit_pen": 75, "herb_reach": 150, "panda_lift": 150, "aloha_lift": 150,

@@ -30,7 +30,7 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 
 import lyceum_warp as lw
 from lyceum_warp.support.intervals import mean_interval
-from lyceum_warp.viz.style import finish_axes, new_figure
+from lyceum_warp.viz import finish_axes, new_figure
 
 CONFIGS = {
     "swimmer": lw.NPGConfig(gamma=0.999, mean_every=0),

@@ -15,7 +15,7 @@ from experiment import Experiment, Row, Skipped, Table, choose
 
 import lyceum_warp as lw
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 

@@ -19,7 +19,7 @@ import tyro
 from experiment import RESULTS
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.support.intervals import mean_interval
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.ranking import Rankings

@@ -28,8 +28,8 @@ from typing import Any, Literal
 import experiment
 from experiment import Experiment, Row, Skipped, Table, choose
 
-from lyceum_warp.binding.registry import file_name, package_task_names
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.binding import file_name, package_task_names
+from lyceum_warp.training import Run
 
 WALKING = ("--algorithm", "ppo", "--mean-every", "0")
 """Command-line flags for tasks whose threshold is a mean return of training episodes."""

@@ -40,9 +40,8 @@ import warp as wp
 from experiment import Experiment, Row, Skipped, Table
 
 import lyceum_warp as lw
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import file_name, find_task
-from lyceum_warp.core.done import FAULTS, Done
+from lyceum_warp.binding import TaskSource, file_name, find_task
+from lyceum_warp.core import FAULTS, Done
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import whole_number
 

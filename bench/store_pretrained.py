@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.evaluation import ENDLESS_STEPS, evaluate
-from lyceum_warp.binding.registry import file_name
+from lyceum_warp.algos import ENDLESS_STEPS, evaluate
+from lyceum_warp.binding import file_name
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.training.runs.checkpoints import read_checkpoint, write_content
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run, read_checkpoint
+from lyceum_warp.training.runs.checkpoints import write_content
 
 FOLDER = Path(lw.__file__).parent / "pretrained"
 KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")

@@ -23,7 +23,7 @@ from experiment import STYLES, Experiment, Row, Table, choose, median_and_range
 
 import lyceum_warp as lw
 from lyceum_warp.support.machine import cpu_cores
-from lyceum_warp.viz.style import finish_axes, new_figure
+from lyceum_warp.viz import finish_axes, new_figure
 
 TASKS = (
     "cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "humanoid", "herb_reach", "humanoid_standup",

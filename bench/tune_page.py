@@ -7,7 +7,8 @@ from typing import Any
 from experiment import RESULTS, Table
 
 from lyceum_warp.support.files import replaced
-from lyceum_warp.tuning.judgement import Difference, verdict
+from lyceum_warp.tuning import Difference
+from lyceum_warp.tuning.judgement import verdict
 
 TEXT = (
     "# tune\n\nFaster physics at equal returns. Each title names the engine; the task as it is has exact physics. "

@@ -20,9 +20,10 @@ import torch
 from PIL import Image
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import file_name, find_task
-from lyceum_warp.training.runs.configuration import ALGORITHMS
-from lyceum_warp.viz.cameras import CameraChoice, FreeCamera, camera_values
+from lyceum_warp.binding import file_name, find_task
+from lyceum_warp.training import ALGORITHMS
+from lyceum_warp.viz import CameraChoice, FreeCamera
+from lyceum_warp.viz.cameras import camera_values
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
 

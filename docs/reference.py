@@ -17,8 +17,8 @@ import warp as wp
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
+from lyceum_warp.binding import file_name, find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import file_name, find_task
 from lyceum_warp.core.spaces import action_space
 from lyceum_warp.core.task import Element, FromModel
 from lyceum_warp.support.docstrings import attribute_docs, field_docs

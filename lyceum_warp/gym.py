@@ -9,10 +9,9 @@ from pathlib import Path
 
 import gymnasium
 
-from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
-from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
-from lyceum_warp.binding.registry import find_task, task_name, task_names
-from lyceum_warp.core.task import Task
+from lyceum_warp.adapters import GymnasiumEnv, GymnasiumVectorEnv
+from lyceum_warp.binding import find_task, task_name, task_names
+from lyceum_warp.core import Task
 
 __all__ = ["GymnasiumEnv", "GymnasiumVectorEnv", "register"]
 

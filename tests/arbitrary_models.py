@@ -1,9 +1,11 @@
 """Define XML models with every kind of element."""
 
-from lyceum_warp.testing import buffer_rules as buffers
-from lyceum_warp.testing import episode_rules as episodes
-from lyceum_warp.testing import fault_rules as faults
-from lyceum_warp.testing import state_rules as state
+from lyceum_warp.testing import (
+    buffer_rules as buffers,
+    episode_rules as episodes,
+    fault_rules as faults,
+    state_rules as state,
+)
 
 # the checks that depend on the model; slow engines and models run only these
 MODEL_CHECKS = (

@@ -14,7 +14,7 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.support.warp_log import start_warp
 
 # several threads would only wait for each other on a busy machine

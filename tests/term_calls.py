@@ -7,7 +7,8 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp import terms
-from lyceum_warp.binding.sources import is_row, overloads, run_source
+from lyceum_warp.binding import is_row, overloads
+from lyceum_warp.binding.sources import run_source
 
 N = 256
 MODULE = wp.Module("term_calls", None)

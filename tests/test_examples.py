@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lyceum_warp import cli
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

@@ -7,7 +7,7 @@ from conftest import TaskFile
 from full_task import Full
 from tiny_task import TINY
 
-from lyceum_warp.binding.registry import package_task_names
+from lyceum_warp.binding import package_task_names
 from lyceum_warp.gym import GymnasiumVectorEnv, register
 
 OURS = {id: spec for id, spec in gymnasium.registry.items() if id.startswith("lyceum/")}

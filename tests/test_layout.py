@@ -1,5 +1,6 @@
 import ast
 import functools
+import importlib
 import re
 import subprocess
 import sys
@@ -16,34 +17,26 @@ ROOT = Path(lw.__file__).parent
 TESTS = Path(__file__).parent
 
 LEVELS = {
-    "support": -2,
-    "mirror": -1, "model_files": -1,
-    "done": 0, "options": 0,
-    "fields": 1, "kernels": 1, "model_actuators": 1, "model_fields": 1, "task": 1, "walkers": 1,
-    "graphs": 2, "spaces": 2, "terms": 2, "terrain": 2,
-    "binding": 3, "engines": 3,
-    "world_arrays": 4,
-    "worlds": 5,
-    "env": 6,
-    "openloop": 7,
-    "curriculum": 7,
-    "algos": 8, "controllers": 8, "testing": 8,
-    "runs": 9,
-    "tuning": 10,
-    "viz": 11,
-    "training": 12,
-    "adapters": 13, "viewer": 13,
-    "cli": 14, "gym": 14,
+    "support": 0,
+    "core": 1,
+    "graphs": 2, "kernels": 2, "models": 2,
+    "engines": 3, "terms": 3,
+    "binding": 4,
+    "env": 5,
+    "algos": 6, "controllers": 6,
+    "viz": 7,
+    "training": 8,
+    "adapters": 9, "testing": 9, "tuning": 9, "viewer": 9,
+    "cli": 10, "gym": 10,
 }  # fmt: skip
-"""The level of each module or subpackage. A module imports only from lower levels and from itself."""
+"""The level of each room. A module imports only from lower levels and from its own room."""
 
-TESTED_BY = {
-    "done": "test_faults.py", "task": "binding", "testing": "conformance",
-    "world_arrays": "test_worlds.py",
-}  # fmt: skip
-"""The tests of modules whose test file or folder has another name."""
+APPS = {"adapters", "cli", "gym", "testing", "training", "tuning", "viewer", "viz"}
+"""Rooms that use the others through the names in their ``__init__.pyi`` only. All rooms may use modules of ``OPEN``."""
 
-ACROSS = {"browser", "conformance", "fuzz", "gpu", "oracles", "stories"}
+OPEN = {"kernels", "support"}
+
+ACROSS = {"browser", "fuzz", "gpu", "oracles", "stories"}
 """Folders whose tests cover several modules or subpackages."""
 
 NAMEDTUPLE = {"_fields", "_asdict", "_replace", "_make"}
@@ -67,17 +60,28 @@ def room(module: str) -> str:
     return [*module.split("."), "__init__"][1]
 
 
+@functools.cache
+def faces() -> dict[str, dict[str, str]]:
+    """The public names of each room, and the modules that define them."""
+    names: dict[str, dict[str, str]] = {}
+    for path in ROOT.rglob("__init__.pyi"):
+        nodes = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ImportFrom)]
+        names[module_name(path)] = {alias.name: str(node.module) for node in nodes for alias in node.names}
+    return names
+
+
 def imported_modules(name: str) -> set[str]:
-    found = set()
+    modules = set()
     for node in ast.walk(trees()[name]):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            modules |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name} imports relatively"
             for alias in node.names:
                 whole = f"{node.module}.{alias.name}"
-                found.add(whole if whole in MODULES else str(node.module))
-    return {module for module in found if module in MODULES}
+                source = faces().get(str(node.module), {}).get(alias.name, str(node.module))
+                modules.add(whole if whole in MODULES else source)
+    return {module for module in modules if module in MODULES}
 
 
 @functools.cache
@@ -94,9 +98,28 @@ def test_modules_import_only_from_lower_levels() -> None:
             }
             assert not upward, f"{name} imports {upward}"
         elif own == "tasks":
-            family = {other for other in imports()[name] if other.startswith(f"{name.rpartition('.')[0]}.")}
-            public = {"lyceum_warp", "lyceum_warp.terms", "lyceum_warp.models.walkers"}
-            assert imports()[name] - family <= public, f"{name} imports more than the public package and its family"
+            family = name.rpartition(".")[0]
+            nodes = [node for node in ast.walk(trees()[name]) if isinstance(node, ast.Import | ast.ImportFrom)]
+            named = {str(getattr(node, "module", node.names[0].name)) for node in nodes}
+            ours = {module for module in named if module.startswith("lyceum_warp")}
+            assert ours <= {"lyceum_warp", "lyceum_warp.terms", family} | {m for m in ours if m.startswith(f"{family}.")}
+
+
+def test_apps_import_only_public_names_of_other_rooms() -> None:
+    for name in (name for name in MODULES if room(name) in APPS):
+        for node in ast.walk(trees()[name]):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lyceum_warp."):
+                other = room(str(node.module))
+                deep = str(node.module).count(".") > 1 and other not in {room(name), "tasks", *OPEN}
+                assert not deep, f"{name}:{node.lineno} imports {node.module}: add the name to {other}/__init__.pyi"
+
+
+def test_every_public_name_exists_and_every_room_has_a_first_sentence() -> None:
+    for module, names in faces().items():
+        loaded = importlib.import_module(module)
+        assert all(hasattr(loaded, name) for name in names), module
+    for folder in {path.parent for path in MODULES.values()} - {ROOT / "pretrained"}:
+        assert ast.get_docstring(ast.parse((folder / "__init__.py").read_text())), folder
 
 
 def test_no_module_imports_itself_indirectly() -> None:
@@ -121,20 +144,14 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"torch", "warp"} & set(loaded)
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
-    assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *window}
+    faces = {"lyceum_warp.support", "lyceum_warp.support.faces"}
+    assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *faces, *window}
 
 
 def test_viewer_session_imports_nothing_from_the_window() -> None:
     session = [name for name in MODULES if name.startswith("lyceum_warp.viewer.session")]
     imported = {other for name in session for other in imports()[name]}
     assert session and not [name for name in imported if name.startswith("lyceum_warp.viewer.window")]
-
-
-def test_module_names_are_unique() -> None:
-    places = defaultdict(list)
-    for name in MODULES:
-        places[name.rpartition(".")[2]].append(name)
-    assert not {last: names for last, names in places.items() if len(names) > 1 and last != "__main__"}
 
 
 def is_private(name: str) -> bool:
@@ -203,7 +220,7 @@ def in_new_process(program: str) -> str:
 
 def test_no_submodule_has_the_name_of_a_public_function() -> None:
     """The import of a submodule would hide a function of the same name."""
-    assert not {room(name) for name in MODULES} & set(lw.__all__)
+    assert {room(name) for name in MODULES} & set(lw.__all__) == {"terms"}
 
 
 def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
@@ -226,7 +243,7 @@ def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
 
 def test_every_module_or_subpackage_has_tests_with_the_same_name() -> None:
     for own in {room(name) for name in MODULES} - {"__init__"}:
-        places = [TESTS / TESTED_BY[own]] if own in TESTED_BY else [TESTS / own, TESTS / f"test_{own}.py"]
+        places = [TESTS / own, TESTS / f"test_{own}.py"]
         assert any(place.exists() for place in places), f"no tests of {own}: none of {', '.join(map(str, places))}"
 
 
@@ -235,4 +252,4 @@ def test_every_folder_of_tests_belongs_to_a_subpackage_or_is_listed() -> None:
     rooms = {path.parent.relative_to(ROOT).as_posix() for path in MODULES.values()}
     assert folders <= rooms | ACROSS | {"bench"}
     described = (TESTS.parent / "docs" / "architecture.md").read_text()
-    assert all(f"`tests/{name}/`" in described for name in ("conformance", "fuzz", "oracles", "stories"))
+    assert all(f"`tests/{name}/`" in described for name in ("fuzz", "oracles", "stories"))

@@ -7,10 +7,9 @@ from typing import Any
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.checked_controller import CheckedController
-from lyceum_warp.controllers.episode_collector import ControlProgress, EpisodeCollector, TimedPlan
+from lyceum_warp.controllers import CheckedController, ControlProgress, Trajectory
+from lyceum_warp.controllers.episode_collector import EpisodeCollector, TimedPlan
 from lyceum_warp.controllers.real_time import run_plant
-from lyceum_warp.controllers.trajectory import Trajectory
 
 
 def towards(state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,7 @@ import warp as wp
 
 from lyceum_warp.core.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.core.model_fields import ModelField
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine
 from lyceum_warp.kernels import faults, state
 from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds
 

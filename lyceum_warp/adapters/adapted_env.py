@@ -5,8 +5,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env, make
+from lyceum_warp.core import Task
+from lyceum_warp.env import Env, make
 from lyceum_warp.support.validate import whole_number
 
 _OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}

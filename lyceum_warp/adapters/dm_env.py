@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Task
+from lyceum_warp.env import Env
 
 try:
     import dm_env

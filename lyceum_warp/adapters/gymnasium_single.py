@@ -7,8 +7,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv, check_array
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Task
+from lyceum_warp.env import Env
 
 
 class GymnasiumEnv(gymnasium.Env[Any, np.ndarray]):

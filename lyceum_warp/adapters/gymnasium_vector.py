@@ -11,13 +11,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from lyceum_warp.adapters.adapted_env import environment_of, per_world
-from lyceum_warp.core.spaces import Space
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Space, Task
+from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.validate import check_tensor, described, whole_number
-from lyceum_warp.viz.cameras import CameraChoice
-from lyceum_warp.viz.pictures import WorldPictures
+from lyceum_warp.viz import CameraChoice, WorldPictures
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):

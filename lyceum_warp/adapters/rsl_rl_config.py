@@ -3,9 +3,8 @@
 import math
 from typing import Any
 
-from lyceum_warp.algos.common.value import value_group
-from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import PPOConfig, value_group
+from lyceum_warp.env import Env
 
 _ACTIVATIONS = {"leaky_relu": "lrelu", "silu": "swish"}
 """Activations whose names in rsl_rl and torch differ."""

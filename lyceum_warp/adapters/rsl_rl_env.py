@@ -5,9 +5,8 @@ from typing import Any
 import torch
 
 from lyceum_warp.adapters.adapted_env import environment_of
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import FAULTS, Task
+from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 try:

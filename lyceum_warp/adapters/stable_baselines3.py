@@ -9,8 +9,8 @@ from gymnasium.vector import AutoresetMode
 
 from lyceum_warp.adapters.adapted_env import per_world
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Task
+from lyceum_warp.env import Env
 
 try:
     from stable_baselines3.common.monitor import Monitor

@@ -19,8 +19,7 @@ from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.core.fields import is_data_field
 from lyceum_warp.core.model_fields import NOT_NEGATIVE
 from lyceum_warp.core.task import FUNCTIONS, Row, TaskFunction
-from lyceum_warp.kernels import random, steps
-from lyceum_warp.kernels import rows as kernel_rows
+from lyceum_warp.kernels import random, rows as kernel_rows, steps
 from lyceum_warp.kernels.step_types import TaskCode
 
 _BATCH = """

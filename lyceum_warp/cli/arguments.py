@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.core.options import OPTIONS, EnvOptions, PhysicsOptions, given_values
+from lyceum_warp.core import OPTIONS, EnvOptions, PhysicsOptions, given_values
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]

@@ -13,13 +13,11 @@ from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos.common.learner import Iteration, Learner
-from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.algos import Iteration, Learner
+from lyceum_warp.controllers import ControlProgress, Trajectory
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.training import loop as training
-from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.viz.policy_videos import one_line
+from lyceum_warp.training import Display as TrainingDisplay, Run
+from lyceum_warp.viz import one_line
 
 _TABLE_ROWS = 15
 
@@ -38,7 +36,7 @@ def note(line: str) -> None:
     print(f"lyceum-warp: {line}", file=sys.stderr)
 
 
-class Display(training.Display):
+class Display(TrainingDisplay):
     """Shows the progress of training: a live bar on a terminal, otherwise one line per iteration."""
 
     def __init__(self, console: Console) -> None:

@@ -9,30 +9,42 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.common.evaluation import Episodes, evaluate, evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.common.policy import Policy, acting
-from lyceum_warp.algos.common.policy_check import check_sizes
-from lyceum_warp.algos.common.transfer import Transfer, simulation, transfer
-from lyceum_warp.binding.registry import file_name, find_task, task_name
+from lyceum_warp.algos import (
+    Episodes,
+    Policy,
+    Transfer,
+    acting,
+    check_sizes,
+    evaluate,
+    evaluation_seed,
+    evaluation_worlds,
+    simulation,
+    transfer,
+)
+from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameter, parameters
 from lyceum_warp.cli.display import console, fitting_table, note, say, tried
-from lyceum_warp.controllers.batch import policy_episodes
-from lyceum_warp.controllers.trajectory import source
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.engines.placement import options_for_few_worlds, options_on_cores
-from lyceum_warp.env.curriculum import Curriculum
-from lyceum_warp.env.env import Env
+from lyceum_warp.controllers import policy_episodes, source
+from lyceum_warp.core import EnvOptions
+from lyceum_warp.engines import options_for_few_worlds, options_on_cores
+from lyceum_warp.env import Curriculum, Env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.training.runs.choice import AUTO, EPISODES, choose_policy
-from lyceum_warp.training.runs.configuration import Configuration
-from lyceum_warp.training.runs.folder import Run, load, load_curriculum
-from lyceum_warp.training.runs.pretrained_runs import pretrained_run, pretrained_text
-from lyceum_warp.training.runs.task_copy import note_changes, run_env
-from lyceum_warp.viz.cameras import find_camera, parsed_camera
-from lyceum_warp.viz.policy_videos import policy_video
-from lyceum_warp.viz.video import check_video
+from lyceum_warp.training import (
+    AUTO,
+    EPISODES,
+    Configuration,
+    Run,
+    choose_policy,
+    load,
+    load_curriculum,
+    note_changes,
+    pretrained_run,
+    pretrained_text,
+    run_env,
+)
+from lyceum_warp.viz import check_video, find_camera, parsed_camera, policy_video
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -6,15 +6,13 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.algos.common.policy_export import check_export, export_policy
+from lyceum_warp.algos import check_export, export_policy
 from lyceum_warp.cli.arguments import Trust
 from lyceum_warp.cli.display import note, say
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
-from lyceum_warp.engines.placement import options_on_cores
-from lyceum_warp.env.curriculum import start_episodes
-from lyceum_warp.env.env import Env
-from lyceum_warp.training.runs.choice import AUTO
-from lyceum_warp.training.runs.folder import Run, load, load_curriculum
+from lyceum_warp.engines import options_on_cores
+from lyceum_warp.env import Env, start_episodes
+from lyceum_warp.training import AUTO, Run, load, load_curriculum
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -11,16 +11,19 @@ import mujoco
 import tyro
 from rich.markup import escape
 
-from lyceum_warp.binding.bound_task import obs_layouts, task_spec
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.models import compile_model, find_model
-from lyceum_warp.binding.parameters import defaults
-from lyceum_warp.binding.parts import length
-from lyceum_warp.binding.registry import find_task, task_names
+from lyceum_warp.binding import (
+    TaskSource,
+    compile_model,
+    defaults,
+    find_model,
+    find_task,
+    length,
+    obs_layouts,
+    task_names,
+    task_spec,
+)
 from lyceum_warp.cli.display import console
-from lyceum_warp.core.model_files import ModelFile
-from lyceum_warp.core.options import PhysicsOptions
-from lyceum_warp.core.task import Task
+from lyceum_warp.core import ModelFile, PhysicsOptions, Task
 
 _HEADINGS = ("task", "obs", "act", "skip", "dt", "horizon", "model")
 

@@ -11,19 +11,19 @@ from typing import Annotated, Literal
 import mujoco
 import tyro
 
-from lyceum_warp.binding.models import compile_model
-from lyceum_warp.binding.registry import find_task, package_task_names, snake_case
+from lyceum_warp.binding import compile_model, find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import say
 from lyceum_warp.cli.task_text import literal, task_text
 from lyceum_warp.cli.velocity_text import TRAINING, Walker, substeps, velocity_text
-from lyceum_warp.core.model_files import (
+from lyceum_warp.core import (
+    CONES,
     ModelFile,
+    PhysicsOptions,
     gymnasium_model,
     gymnasium_robotics_model,
     menagerie_model,
     read_spec,
 )
-from lyceum_warp.core.options import CONES, PhysicsOptions
 from lyceum_warp.support.files import replaced
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {

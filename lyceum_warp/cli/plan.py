@@ -15,10 +15,8 @@ import torch
 import tyro
 from rich.markup import escape
 
-from lyceum_warp.algos.planning.arguments import task_config
-from lyceum_warp.algos.planning.config import MPPIConfig
-from lyceum_warp.algos.planning.planner import MPPI
-from lyceum_warp.binding.registry import file_name, find_task, spelled_task, task_name
+from lyceum_warp.algos import MPPI, MPPIConfig, task_config
+from lyceum_warp.binding import file_name, find_task, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     OptionFlags,
@@ -31,21 +29,24 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import PlanDisplay, console, counted, say, tried
-from lyceum_warp.controllers.checked_controller import CheckedController
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.real_time import control_async
-from lyceum_warp.controllers.real_time_setting import RealTimeChoice, RealTimeSetting, choose_setting, planning_time
-from lyceum_warp.controllers.report import ControlReport, control_report
-from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.controllers import (
+    CheckedController,
+    ControlReport,
+    RealTimeChoice,
+    RealTimeSetting,
+    Trajectory,
+    choose_setting,
+    control,
+    control_async,
+    control_report,
+    planning_time,
+)
+from lyceum_warp.core import EnvOptions, Task
+from lyceum_warp.env import Env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.validate import positive_number, whole_number
-from lyceum_warp.training.runs.folder import Run, load_value
-from lyceum_warp.viz.cameras import find_camera, parsed_camera
-from lyceum_warp.viz.episode_plot import control_plot
-from lyceum_warp.viz.video import write_video
+from lyceum_warp.training import Run, load_value
+from lyceum_warp.viz import control_plot, find_camera, parsed_camera, write_video
 
 
 class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)"):

@@ -10,11 +10,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.algos.common.distributed import Team, join
-from lyceum_warp.algos.common.evaluation import evaluation_seed, evaluation_worlds
-from lyceum_warp.algos.common.learner import Learner
-from lyceum_warp.algos.common.squashed_policy import SquashedPolicy
-from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
+from lyceum_warp.algos import Learner, SquashedPolicy, Team, evaluation_seed, evaluation_worlds, join
+from lyceum_warp.binding import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     CameraWords,
     EnvFlags,
@@ -26,19 +23,23 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import Training
+from lyceum_warp.core import EnvOptions, Training
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.training.curve import learning_curve
-from lyceum_warp.training.loop import train
-from lyceum_warp.training.runs.checkpoints import read_checkpoint
-from lyceum_warp.training.runs.choice import EPISODES, choose_policy
-from lyceum_warp.training.runs.configuration import ALGORITHMS, Configuration, saved_networks
-from lyceum_warp.training.runs.folder import Run, load
-from lyceum_warp.training.runs.task_copy import note_changes
-from lyceum_warp.viz.cameras import parsed_camera
-from lyceum_warp.viz.policy_videos import policy_video
+from lyceum_warp.training import (
+    ALGORITHMS,
+    EPISODES,
+    Configuration,
+    Run,
+    choose_policy,
+    learning_curve,
+    load,
+    note_changes,
+    read_checkpoint,
+    saved_networks,
+    train,
+)
+from lyceum_warp.viz import parsed_camera, policy_video
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
 """Settings that --resume may change, with their default values."""

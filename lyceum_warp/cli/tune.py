@@ -10,9 +10,7 @@ import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
 from lyceum_warp.cli.display import console, fitting_table, note, say
-from lyceum_warp.tuning.judgement import Difference
-from lyceum_warp.tuning.search import Tuning, tune
-from lyceum_warp.tuning.trial import DIVERGENCE_STEPS, NUDGE
+from lyceum_warp.tuning import DIVERGENCE_STEPS, NUDGE, Difference, Tuning, tune
 
 Cell: TypeAlias = Callable[[dict[str, Any]], str]
 

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 
-from lyceum_warp import walkers
 from lyceum_warp.cli.task_text import indented, literal
+from lyceum_warp.models import walkers
 
 TRAINING = "--algorithm ppo --device cuda --iterations 800"
 """Options of lyceum-warp train that suffice to learn walking on one GPU."""
@@ -222,7 +222,7 @@ import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import walkers
+from lyceum_warp.models import walkers
 from lyceum_warp.tasks.velocity import walking
 
 {feet}

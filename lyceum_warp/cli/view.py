@@ -7,26 +7,19 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos.common.policy_check import check_sizes
-from lyceum_warp.algos.planning.arguments import task_config
-from lyceum_warp.algos.planning.planner import MPPI
-from lyceum_warp.binding.registry import task_names
+from lyceum_warp.algos import MPPI, check_sizes, task_config
+from lyceum_warp.binding import task_names
 from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
-from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.env.curriculum import start_episodes
-from lyceum_warp.env.env import Env
+from lyceum_warp.controllers import episode_env, load_episodes
+from lyceum_warp.core import EnvOptions
+from lyceum_warp.env import Env, start_episodes
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.training.runs.choice import AUTO
-from lyceum_warp.training.runs.folder import Run, load, load_curriculum, runs_in
-from lyceum_warp.training.runs.pretrained_runs import pretrained_run, pretrained_text
-from lyceum_warp.viewer.follow import Follower
-from lyceum_warp.viewer.session.clock import Watcher
-from lyceum_warp.viewer.show import view
+from lyceum_warp.training import AUTO, Run, load, load_curriculum, pretrained_run, pretrained_text, runs_in
+from lyceum_warp.viewer import Follower, Watcher, view
 
 _RUN_WORLDS = 16
 

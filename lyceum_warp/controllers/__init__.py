@@ -2,3 +2,7 @@
 
 The *plant* is the world under control.
 """
+
+from lyceum_warp.support.faces import face
+
+__getattr__, __dir__, __all__ = face(__name__)

@@ -11,16 +11,17 @@ from typing import Any
 def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are listed in its ``__init__.pyi``.
 
-    Type checkers read the same file. It consists of lines such as ``from package.module import name as name`` and
-    ``import package.module as name``.
+    Type checkers read the same file. It has lines such as ``from package.module import name as name``, and, for a
+    submodule, ``from .folder import module as module``.
     """
     module = sys.modules[package]
     sources: dict[str, tuple[str, str | None]] = {}
     for node in ast.parse(Path(str(module.__file__)).with_suffix(".pyi").read_text("utf-8")).body:
-        if isinstance(node, ast.ImportFrom) and node.module:
+        if isinstance(node, ast.ImportFrom) and node.level:
+            folder = ".".join(filter(None, (package, node.module)))
+            sources |= {alias.name: (f"{folder}.{alias.name}", None) for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
             sources |= {alias.name: (node.module, alias.name) for alias in node.names}
-        elif isinstance(node, ast.Import):
-            sources |= {alias.asname: (alias.name, None) for alias in node.names if alias.asname}
 
     def load(name: str) -> Any:
         if name not in sources:

@@ -9,18 +9,20 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from lyceum_warp.core.task import Task
-from lyceum_warp.engines.base import EngineFactory
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Task
+from lyceum_warp.engines import EngineFactory
+from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.testing import buffer_rules as buffers
-from lyceum_warp.testing import episode_rules as episodes
-from lyceum_warp.testing import fault_rules as faults
-from lyceum_warp.testing import form_rules as form
-from lyceum_warp.testing import index_rules as indices
-from lyceum_warp.testing import physics_rules as physics
-from lyceum_warp.testing import state_rules as state
+from lyceum_warp.testing import (
+    buffer_rules as buffers,
+    episode_rules as episodes,
+    fault_rules as faults,
+    form_rules as form,
+    index_rules as indices,
+    physics_rules as physics,
+    state_rules as state,
+)
 from lyceum_warp.testing.context import OUTCOMES, Context
 
 log = logging.getLogger(__name__)

@@ -2,7 +2,7 @@
 
 import torch
 
-from lyceum_warp.core.spaces import COUNTERS
+from lyceum_warp.core import COUNTERS
 from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 

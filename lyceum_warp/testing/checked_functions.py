@@ -10,8 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding import sources
-from lyceum_warp.binding.sources import FunctionSource, is_row, is_struct, name_of, overloads
+from lyceum_warp.binding import FunctionSource, is_row, is_struct, name_of, overloads, sources
 from lyceum_warp.kernels import index_checks
 
 _SHAPES = ("shape", "strides")

@@ -8,8 +8,8 @@ from typing import Any, NoReturn
 import numpy as np
 import torch
 
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import FAULTS
+from lyceum_warp.env import Env
 from lyceum_warp.kernels import step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes

@@ -6,8 +6,8 @@ import tracemalloc
 import torch
 import warp as wp
 
-from lyceum_warp.core.done import Done
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import Done
+from lyceum_warp.env import Env
 from lyceum_warp.testing.context import Context
 
 # the interpreter's caches may grow by this much; one leaked float per step is 3,200 bytes after 100 steps

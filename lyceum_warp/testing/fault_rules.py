@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lyceum_warp.core.done import Done
+from lyceum_warp.core import Done
 from lyceum_warp.testing.context import SHORT, Context
 
 

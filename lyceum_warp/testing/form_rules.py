@@ -2,7 +2,7 @@
 
 import torch
 
-from lyceum_warp.env.arrays import memory_columns
+from lyceum_warp.env import memory_columns
 from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.binding.writes import written_fields
-from lyceum_warp.core.done import FAULTS, Done
-from lyceum_warp.core.task import FUNCTIONS, MEMORIES, observer_name
-from lyceum_warp.env.worlds import Worlds
+from lyceum_warp.binding import written_fields
+from lyceum_warp.core import FAULTS, FUNCTIONS, MEMORIES, Done, observer_name
+from lyceum_warp.env import Worlds
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.testing.checked_functions import CheckedFunctions, Unchecked, checked_functions
 from lyceum_warp.testing.context import Context

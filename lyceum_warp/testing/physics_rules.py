@@ -10,9 +10,8 @@ import mujoco
 import numpy as np
 import torch
 
-from lyceum_warp.core.fields import INPUTS
-from lyceum_warp.env.arrays import memory_columns
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import INPUTS
+from lyceum_warp.env import Env, memory_columns
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 

@@ -4,9 +4,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.spaces import COUNTERS
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import COUNTERS, FAULTS
+from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.common.learner import METRIC_COLUMN
+from lyceum_warp.algos import METRIC_COLUMN
 from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
+from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_png
 
 
 def learning_curve(run: str | Path | Run) -> Path:

@@ -10,11 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.common.evaluation import evaluation_seed
-from lyceum_warp.algos.common.learner import Iteration, Learner
-from lyceum_warp.algos.common.transfer import EXACT, task_physics
-from lyceum_warp.algos.common.transfer import transfer as judge_transfer
-from lyceum_warp.engines.placement import engine_name
+from lyceum_warp.algos import EXACT, Iteration, Learner, evaluation_seed, task_physics, transfer as judge_transfer
+from lyceum_warp.engines import engine_name
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number, whole_number
@@ -25,10 +22,7 @@ from lyceum_warp.training.runs.lock import run_lock
 from lyceum_warp.training.runs.replay_files import read_replay
 from lyceum_warp.training.runs.saving import Saver
 from lyceum_warp.training.runs.task_copy import note_changes, note_uncopied_data, task_copy
-from lyceum_warp.viz.cameras import CameraChoice, find_camera
-from lyceum_warp.viz.policy_videos import Videos, one_line
-from lyceum_warp.viz.tensorboard import TensorBoard, check_tensorboard
-from lyceum_warp.viz.video import check_video
+from lyceum_warp.viz import CameraChoice, TensorBoard, Videos, check_tensorboard, check_video, find_camera, one_line
 
 log = logging.getLogger(__name__)
 

@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import CONES, INTEGRATORS, JACOBIANS
+from lyceum_warp.env import Env
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.algos.planning.planner import MPPI
-from lyceum_warp.core.options import PhysicsOptions
-from lyceum_warp.core.task import Task
+from lyceum_warp.algos import MPPI
+from lyceum_warp.core import PhysicsOptions, Task
 from lyceum_warp.support.intervals import mean_interval
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.trial import random_actions

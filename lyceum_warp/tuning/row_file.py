@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.versions import versions
-from lyceum_warp.training.runs.task_copy import json_value, task_copy
+from lyceum_warp.training import json_value, task_copy
 
 _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 

@@ -6,16 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.common.policy import acting
-from lyceum_warp.algos.common.policy_check import check_sizes
-from lyceum_warp.binding.registry import file_name, find_task, task_name
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import acting, check_sizes
+from lyceum_warp.binding import file_name, find_task, task_name
+from lyceum_warp.core import EnvOptions, Task
+from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, whole_number
-from lyceum_warp.training.runs.configuration import Configuration
-from lyceum_warp.training.runs.folder import Run, load
+from lyceum_warp.training import Configuration, Run, load
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 from lyceum_warp.tuning.judgement import TOLERANCES, verdict
 from lyceum_warp.tuning.ranking import Rankings

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.common.evaluation import ENDLESS_STEPS
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import ENDLESS_STEPS
+from lyceum_warp.core import FAULTS
+from lyceum_warp.env import Env
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import TOLERANCES, buys, difference, episodes_needed, failures
 

@@ -5,8 +5,7 @@ The viewer only reads the run's files, and may run on another machine that share
 
 import torch
 
-from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run, network_of, read_checkpoint
 
 
 class Follower:

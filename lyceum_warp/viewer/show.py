@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Scene
 from lyceum_warp.viewer.session.clock import Session, Watcher
 from lyceum_warp.viewer.session.window_process import NoWindowError, Window

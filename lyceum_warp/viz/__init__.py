@@ -3,9 +3,6 @@
 Plots and videos need the extra ``viz``.
 """
 
-EXTRA = "pip install 'lyceum-warp[viz]'"
-"""The command that installs the packages for plots and videos."""
+from lyceum_warp.support.faces import face
 
-
-class NoVideoError(RuntimeError):
-    """Raised if the machine cannot render, or if a package for videos is missing. The message says how to fix it."""
+__getattr__, __dir__, __all__ = face(__name__)

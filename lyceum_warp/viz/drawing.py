@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from lyceum_warp.support.files import replaced
-from lyceum_warp.viz import EXTRA, NoVideoError
+from lyceum_warp.viz.extra import EXTRA, NoVideoError
 from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds that a subprocess gets to end before it is killed

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.controllers import Trajectory
 from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_png
 
 

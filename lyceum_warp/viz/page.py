@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import torch
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.video import check_states

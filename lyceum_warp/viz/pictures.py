@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.drawing import DrawingProcess
 from lyceum_warp.viz.video import shots

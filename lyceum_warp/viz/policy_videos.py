@@ -9,13 +9,9 @@ from typing import TypeAlias
 
 import torch
 
-from lyceum_warp.algos.common.evaluation import evaluation_worlds
-from lyceum_warp.algos.common.learner import Iteration, Learner
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy, acting
-from lyceum_warp.controllers.batch import policy_episodes
-from lyceum_warp.env.curriculum import Curriculum
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Iteration, Learner, Policy, acting, evaluation_worlds, moved
+from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.env import Curriculum, Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.video import Progress, write_video

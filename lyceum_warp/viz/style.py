@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.viz import EXTRA
+from lyceum_warp.viz.extra import EXTRA
 
 LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 

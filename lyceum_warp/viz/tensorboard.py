@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos.common.learner import Iteration
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Iteration
+from lyceum_warp.env import Env
 
 EXTRA = "pip install 'lyceum-warp[tensorboard]'"
 """The command that installs the package for TensorBoard."""

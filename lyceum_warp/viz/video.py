@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 import mujoco
 import torch
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number
-from lyceum_warp.viz import NoVideoError
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.drawing import Drawing, check_video
+from lyceum_warp.viz.extra import NoVideoError
 from lyceum_warp.viz.render import Shot
 
 __all__ = ["NoVideoError", "Progress", "Recorder", "check_video", "write_video"]

@@ -8,8 +8,7 @@ from metered_task import Metered
 from tensordict import TensorDict
 
 import lyceum_warp as lw
-from lyceum_warp.adapters.rsl_rl_config import runner_config
-from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
+from lyceum_warp.adapters import RslRlVecEnv, runner_config
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 
 import lyceum_warp as lw
-from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
+from lyceum_warp.adapters import StableBaselines3VecEnv
 from lyceum_warp.gym import GymnasiumEnv
 from lyceum_warp.viz.video import NoVideoError
 

@@ -49,7 +49,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
         return [experiment.Table("Hopping", ["", "ratio"], cells)]
 
     def figure(rows: list[Any]) -> Any:
-        from lyceum_warp.viz.style import new_figure
+        from lyceum_warp.viz import new_figure
 
         drawn = new_figure("a toy", 2, 2)
         drawn.subplots().plot([row.result["rate"] for row in rows])

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.rollout_buffer import Rollout
+from lyceum_warp.algos import Rollout
 
 
 def case(contestant: str, **changes: Any) -> Any:

@@ -8,8 +8,7 @@ import pytest
 import soak
 
 import lyceum_warp as lw
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import TaskSource, find_task
 
 FAULTS = ("--short", "--parts", "faults", "--threads", "1", "--nworld", "16")
 

@@ -7,8 +7,8 @@ import tiny_task
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import find_task
 
 
 def bound(file: Path, **options: Any) -> BoundTask:

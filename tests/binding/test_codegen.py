@@ -3,9 +3,8 @@ from typing import Any
 
 import tiny_task
 
+from lyceum_warp.binding import TaskSource, find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import find_task
 
 EVALUATE = "def evaluate(s: World, p: Params) -> float:\n    return s.qpos[1]"
 

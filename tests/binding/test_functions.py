@@ -3,9 +3,8 @@ from pathlib import Path
 import pytest
 import tiny_task
 
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.registry import find_task, task_name
-from lyceum_warp.core.task import FUNCTIONS
+from lyceum_warp.binding import TaskSource, find_task, task_name
+from lyceum_warp.core import FUNCTIONS
 
 MEANT = {
     name: f"def {function.signature}:\n    {function.default}"

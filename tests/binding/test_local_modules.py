@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 import tiny_task
 
+from lyceum_warp.binding import find_task
 from lyceum_warp.binding.local_modules import local_modules
-from lyceum_warp.binding.registry import find_task
 
 
 def write(folder: Path, files: dict[str, str]) -> None:

@@ -5,9 +5,9 @@ import pytest
 import tiny_task
 
 import lyceum_warp as lw
-from lyceum_warp.binding.models import compile_model, load_spec
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.options import PhysicsOptions
+from lyceum_warp.binding import compile_model, find_task
+from lyceum_warp.binding.models import load_spec
+from lyceum_warp.core import PhysicsOptions
 
 BALL = (
     '<mujoco model="ball"><option {option}/><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'

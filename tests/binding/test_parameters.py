@@ -10,7 +10,7 @@ from table_task import Follow
 
 import lyceum_warp as lw
 from lyceum_warp.binding.parameters import Parameters
-from lyceum_warp.core.options import OPTIONS
+from lyceum_warp.core import OPTIONS
 
 XML = """
 <mujoco>

@@ -4,8 +4,7 @@ import pytest
 import tiny_task
 
 import lyceum_warp as lw
-from lyceum_warp.binding import registry
-from lyceum_warp.binding.registry import file_name, find_task, task_name, task_names
+from lyceum_warp.binding import file_name, find_task, registry, task_name, task_names
 
 REGISTERED = tiny_task.changed(("class Tiny", "@lw.register\nclass Tiny"))
 

@@ -5,7 +5,8 @@ import pytest
 import warp as wp
 
 from lyceum_warp import Row
-from lyceum_warp.binding.writes import check_writes, trace, written_fields
+from lyceum_warp.binding import written_fields
+from lyceum_warp.binding.writes import check_writes, trace
 
 
 @wp.struct

@@ -24,7 +24,7 @@ from lyceum_warp import Row
 from lyceum_warp.viewer.protocol import Command, Frame, Perturb, Reset, Seek, SetBackwards, SetMode, SetPaused, Status
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.window_process import Window
-from lyceum_warp.viz.cameras import FreeCamera
+from lyceum_warp.viz import FreeCamera
 from lyceum_warp.viz.page import write_page
 
 pytestmark = pytest.mark.browser

@@ -12,7 +12,7 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.train import Train
-from lyceum_warp.core.options import OPTIONS, EnvOptions, PhysicsOptions
+from lyceum_warp.core import OPTIONS, EnvOptions, PhysicsOptions
 
 
 @pytest.mark.parametrize("text, value", [

@@ -11,7 +11,7 @@ from rich.console import Console
 
 import lyceum_warp as lw
 from lyceum_warp.cli import display
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ from training_runs import interrupted, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
-from lyceum_warp.training.runs.folder import load
-from lyceum_warp.viz import policy_videos
-from lyceum_warp.viz.cameras import find_camera
+from lyceum_warp.controllers import episode_env, load_episodes
+from lyceum_warp.training import load
+from lyceum_warp.viz import find_camera, policy_videos
 
 
 @pytest.fixture(scope="module")

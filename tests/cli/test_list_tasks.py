@@ -8,7 +8,7 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.binding.registry import find_task, task_names
+from lyceum_warp.binding import find_task, task_names
 from lyceum_warp.cli import list_tasks
 
 

@@ -10,11 +10,9 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing import episode_rules as episodes
-from lyceum_warp.testing import index_rules as indices
+from lyceum_warp.testing import CHECKS, check_task, episode_rules as episodes, index_rules as indices
 
 ROOT = Path(__file__).parent.parent.parent
 RICH = text(

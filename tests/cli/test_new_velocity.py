@@ -7,7 +7,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.testing import CHECKS, check_task
 from lyceum_warp.testing.episode_rules import check_memory
 

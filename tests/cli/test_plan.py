@@ -15,11 +15,11 @@ from training_runs import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
 

@@ -13,11 +13,10 @@ from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos import Team
 from lyceum_warp.cli.arguments import given
 from lyceum_warp.cli.train import EnvFlags, Hyperparameters, Train
-from lyceum_warp.training.runs.configuration import ALGORITHMS, Configuration
-from lyceum_warp.training.runs.folder import Run, load
+from lyceum_warp.training import ALGORITHMS, Configuration, Run, load
 from lyceum_warp.viz import policy_videos
 
 

@@ -3,9 +3,9 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.evaluation import evaluation_seed
-from lyceum_warp.controllers.batch import policy_episodes
-from lyceum_warp.core.done import Done
+from lyceum_warp.algos import evaluation_seed
+from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.core import Done
 
 
 def push(obs: torch.Tensor) -> torch.Tensor:

@@ -6,9 +6,7 @@ import torch
 from toy_controllers import SamplingPlanner, StepPlanner
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.checked_controller import CheckedController
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.controllers import CheckedController, Trajectory, control
 
 
 @pytest.fixture(scope="module")

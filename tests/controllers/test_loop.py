@@ -7,10 +7,7 @@ from conftest import SharedEnv
 from toy_controllers import SamplingPlanner, StepPlanner, hundredths, towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.real_time import control_async
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.controllers import ControlProgress, Trajectory, control, control_async
 
 
 @pytest.fixture(scope="module")

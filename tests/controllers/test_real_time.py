@@ -10,9 +10,7 @@ import torch
 from toy_controllers import SamplingPlanner, StepPlanner, hundredths, simulated_run, towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.real_time import Clock, control_async
-from lyceum_warp.controllers.report import control_report
+from lyceum_warp.controllers import Clock, ControlProgress, control_async, control_report
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ import torch
 from conftest import SharedEnv
 from toy_controllers import StepPlanner
 
-from lyceum_warp.controllers.real_time_setting import RealTimeSetting, choose_setting, planning_time
+from lyceum_warp.controllers import RealTimeSetting, choose_setting, planning_time
 
 SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 

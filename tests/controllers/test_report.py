@@ -9,9 +9,7 @@ import torch
 from toy_controllers import SamplingPlanner, simulated_run, towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.report import control_report
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.controllers import Trajectory, control, control_report
 
 
 @pytest.fixture(scope="module")

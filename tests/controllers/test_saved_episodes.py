@@ -11,7 +11,7 @@ from tiny_task import TINY
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.saved_episodes import check_episode, episode_env, load_episodes
+from lyceum_warp.controllers import check_episode, episode_env, load_episodes
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ import torch
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.trajectory import Trajectory
+from lyceum_warp.controllers import Trajectory, control
 
 
 @pytest.fixture(scope="module")

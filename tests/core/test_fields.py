@@ -4,7 +4,8 @@ import pytest
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp.core.fields import describe, elements, vec10
+from lyceum_warp.core import vec10
+from lyceum_warp.core.fields import describe, elements
 from lyceum_warp.core.task import Element
 
 XML = """

@@ -2,9 +2,8 @@ import mujoco
 import pytest
 import warp as wp
 
-from lyceum_warp.core.fields import vec10
+from lyceum_warp.core import gymnasium_model, vec10
 from lyceum_warp.core.model_fields import Constants, ModelField, describe_model_field
-from lyceum_warp.core.model_files import gymnasium_model
 
 ANT = gymnasium_model("ant.xml").spec().compile()
 

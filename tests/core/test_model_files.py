@@ -7,8 +7,7 @@ import mujoco_menagerie
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.binding.bound_task import task_spec
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task, task_spec
 
 
 def write_robot(folder: Path) -> Path:

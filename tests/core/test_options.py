@@ -4,8 +4,9 @@ import inspect
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.options import OPTION_DOCS, OPTIONS, EnvOptions, PhysicsOptions, suggestion
+from lyceum_warp.binding import find_task
+from lyceum_warp.core import OPTIONS, EnvOptions, PhysicsOptions
+from lyceum_warp.core.options import OPTION_DOCS, suggestion
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,9 @@ import mujoco
 import numpy as np
 import torch
 
+from lyceum_warp.core import COUNTERS, Space
 from lyceum_warp.core.fields import describe
-from lyceum_warp.core.spaces import COUNTERS, Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.core.spaces import action_space, control_ranges, control_scale, state_space
 
 XML = """
 <mujoco>

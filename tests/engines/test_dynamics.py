@@ -9,7 +9,7 @@ from toy_engine import ToyEngine
 
 from lyceum_warp.core.fields import describe, state_columns
 from lyceum_warp.core.model_fields import describe_model_field
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.placement import bytes_per_world, open_engine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine

@@ -11,7 +11,7 @@ from toy_engine import ToyEngine
 
 import lyceum_warp as lw
 from lyceum_warp.core.fields import describe
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 from lyceum_warp.testing import check_task

@@ -8,17 +8,9 @@ import warp as wp
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
-from lyceum_warp.engines import memory, placement
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine, engine_name, memory, options_for_few_worlds, options_for_plant, placement
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.placement import (
-    engine_name,
-    find_device,
-    open_engine,
-    options_for_few_worlds,
-    options_for_plant,
-    place_samples,
-)
+from lyceum_warp.engines.placement import find_device, open_engine, place_samples
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None, "deterministic": None}

@@ -9,7 +9,7 @@ import step_table as table
 import warp as wp
 
 from lyceum_warp.core.fields import Stage, describe, early_sensor_columns, state_columns
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 

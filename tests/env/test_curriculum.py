@@ -6,9 +6,9 @@ from ladder_task import Ladder
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.common.evaluation import evaluation_seed
-from lyceum_warp.controllers.batch import policy_episodes
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.algos import evaluation_seed
+from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.training import Run
 
 CONFIG = lw.PPOConfig(num_steps=10, minibatches=1, epochs=1, hidden=(8,), value_hidden=(8,), mean_every=1,
                       mean_episodes=4)  # fmt: skip

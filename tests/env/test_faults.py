@@ -9,7 +9,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp import Done
-from lyceum_warp.core.done import FAULTS
+from lyceum_warp.core import FAULTS
 from lyceum_warp.testing import OUTCOMES
 
 ENGINES = ["mujoco", "warp"]

@@ -9,9 +9,9 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import Done, Row
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.engines.c.native_rollout import NativeRollout
-from lyceum_warp.env.openloop import OpenLoop
+from lyceum_warp.env import OpenLoop
 
 ENGINES = ["mujoco", "warp"]
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]

@@ -27,8 +27,8 @@ from minimal_cases import FILES
 import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
-from lyceum_warp.controllers.saved_episodes import episode_env, load_episodes
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.controllers import episode_env, load_episodes
+from lyceum_warp.training import Run
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)

@@ -6,7 +6,7 @@ import torch
 from full_task import Full
 from test_gpu import CUDA, nothing_waits
 
-from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv
+from lyceum_warp.adapters import StableBaselines3VecEnv
 from lyceum_warp.gym import GymnasiumVectorEnv
 
 pytestmark = pytest.mark.gpu

@@ -4,10 +4,10 @@ import pytest
 import warp as wp
 from test_gpu import nothing_waits
 
+from lyceum_warp.core import gymnasium_model
 from lyceum_warp.core.fields import describe
 from lyceum_warp.core.model_fields import describe_model_field
-from lyceum_warp.core.model_files import gymnasium_model
-from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine

@@ -14,7 +14,7 @@ from conftest import SharedEnv
 from form_tasks import Drawn, Pushed
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import package_task_names
+from lyceum_warp.binding import package_task_names
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.tasks.dm import TASKS as SUITE
 from lyceum_warp.tasks.velocity import TASKS as VELOCITY

@@ -25,7 +25,7 @@ from gymnasium.envs.mujoco import mujoco_env
 from gymnasium.envs.registration import load_env_creator
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 
 gymnasium.register_envs(gymnasium_robotics)
 

@@ -13,7 +13,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 
 STORED = dict(np.load(Path(__file__).parent.parent / "data" / "go1_mjlab.npz"))
 MODEL = [name.removeprefix("model/") for name in STORED if name.startswith("model/")]

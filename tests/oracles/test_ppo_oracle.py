@@ -9,8 +9,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 import lyceum_warp as lw
-from lyceum_warp.adapters.rsl_rl_config import runner_config
-from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv
+from lyceum_warp.adapters import RslRlVecEnv, runner_config
 
 STEPS, N = 12, 8
 

@@ -7,8 +7,7 @@ from gymnasium.vector import AutoresetMode
 
 import lyceum_warp as lw
 from lyceum_warp import Row
-from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv
-from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv
+from lyceum_warp.adapters import GymnasiumEnv, GymnasiumVectorEnv
 from lyceum_warp.testing import CHECKS, check_task
 
 N = 16

@@ -7,8 +7,7 @@ import tiny_task
 import torch
 
 import lyceum_warp as lw
-from lyceum_warp.binding import registry
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task, registry
 
 
 @pytest.fixture

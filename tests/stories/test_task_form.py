@@ -11,7 +11,7 @@ from full_task import Full
 
 import lyceum_warp as lw
 from lyceum_warp import Row
-from lyceum_warp.env.openloop import OpenLoop
+from lyceum_warp.env import OpenLoop
 
 ENGINES = ["mujoco", "warp"]
 

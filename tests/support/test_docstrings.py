@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.core.task import FUNCTIONS, Task
+from lyceum_warp.core import FUNCTIONS, Task
 from lyceum_warp.support.docstrings import attribute_docs, field_docs
 from lyceum_warp.tasks.balance import balancing
 from lyceum_warp.tasks.velocity import gait, rough, walking

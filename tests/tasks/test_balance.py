@@ -5,8 +5,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.binding.bound_task import task_spec
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task, task_spec
 from lyceum_warp.tasks.balance.humanoid_balance import JOINTS
 
 

@@ -9,8 +9,8 @@ from conftest import SharedEnv
 
 from lyceum_warp import walkers
 from lyceum_warp.algos.common.symmetry import Reflected, reflections
+from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import find_task
 from lyceum_warp.tasks.velocity import TASKS
 
 ROBOTS = [task for task in TASKS if "rough" not in task]

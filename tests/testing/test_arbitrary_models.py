@@ -10,8 +10,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import Row
-from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing import episode_rules as episodes
+from lyceum_warp.testing import CHECKS, check_task, episode_rules as episodes
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "mujoco": {

@@ -3,10 +3,8 @@ from conftest import settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing import buffer_rules as buffers
-from lyceum_warp.testing import state_rules as state
+from lyceum_warp.binding import find_task
+from lyceum_warp.testing import CHECKS, buffer_rules as buffers, check_task, state_rules as state
 from lyceum_warp.testing.episode_rules import check_memory
 from lyceum_warp.testing.fault_rules import check_not_finite
 from lyceum_warp.testing.physics_rules import check_dynamics

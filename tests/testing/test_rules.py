@@ -12,8 +12,8 @@ from full_task import Full, Settled
 import lyceum_warp as lw
 import lyceum_warp.env.env
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.env import Worlds
 from lyceum_warp.env.arrays import WorldArrays
-from lyceum_warp.env.worlds import Worlds
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.testing import CHECKS, check_task
 

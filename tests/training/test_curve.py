@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.training.curve import learning_curve
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run, learning_curve
 from lyceum_warp.viz import learning_curve as module
 
 

@@ -10,8 +10,8 @@ from training_runs import CONFIG, QUIET, algorithm, mean_action, metrics, refuse
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.common.evaluation import evaluation_seed
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.algos import evaluation_seed
+from lyceum_warp.training import Run
 
 
 @pytest.fixture

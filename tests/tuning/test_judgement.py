@@ -4,7 +4,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lyceum_warp.tuning.judgement import Difference, difference, episodes_needed, failures, verdict
+from lyceum_warp.tuning import Difference
+from lyceum_warp.tuning.judgement import difference, episodes_needed, failures, verdict
 
 
 def test_interval_covers_the_difference_of_returns_and_shrinks_with_more_episodes() -> None:

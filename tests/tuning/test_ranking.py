@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding import find_task
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import verdict
 from lyceum_warp.tuning.ranking import Rankings, rank_correlations

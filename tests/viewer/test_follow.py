@@ -4,9 +4,9 @@ import torch
 from training_runs import train
 
 import lyceum_warp as lw
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs.checkpoints import policy_content, write_content
-from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.viewer.follow import Follower
+from lyceum_warp.viewer import Follower
 
 
 def test_viewer_of_a_run_loads_the_newest_policy_and_reports_an_unreadable_one(tmp_path: Path) -> None:

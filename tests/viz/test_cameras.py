@@ -2,7 +2,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from lyceum_warp.viz.cameras import FreeCamera, camera_values, find_camera, parsed_camera
+from lyceum_warp.viz import FreeCamera, find_camera, parsed_camera
+from lyceum_warp.viz.cameras import camera_values
 
 MODEL = """
 <mujoco>

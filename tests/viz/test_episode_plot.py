@@ -5,9 +5,8 @@ import pytest
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.viz.episode_plot import control_plot
+from lyceum_warp.controllers import Trajectory, control
+from lyceum_warp.viz import control_plot
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,9 @@ import pytest
 from conftest import SharedEnv
 from headless_screen import state_of
 
+from lyceum_warp.viz import write_states
 from lyceum_warp.viz.cameras import camera_values
-from lyceum_warp.viz.page import write_page, write_states
+from lyceum_warp.viz.page import write_page
 
 SHAPES = """
 <mujoco>

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.viz import WorldPictures
 from lyceum_warp.viz.drawing import NoVideoError
-from lyceum_warp.viz.pictures import WorldPictures
 
 SIZE = (96, 64)
 

@@ -11,9 +11,9 @@ from training_runs import QUIET, train
 import lyceum_warp as lw
 from lyceum_warp.algos.ppo import PPOIteration
 from lyceum_warp.cli import main
-from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.viz import tensorboard as module
-from lyceum_warp.viz.tensorboard import TensorBoard, tag
+from lyceum_warp.training import Run
+from lyceum_warp.viz import TensorBoard, tensorboard as module
+from lyceum_warp.viz.tensorboard import tag
 
 
 @pytest.fixture(scope="module")

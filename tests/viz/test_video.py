@@ -15,9 +15,8 @@ from headless_screen import state_of
 from varied_task import ball
 
 import lyceum_warp as lw
-from lyceum_warp.viz import drawing, video
-from lyceum_warp.viz.cameras import FreeCamera, camera_values
-from lyceum_warp.viz.render import Shot
+from lyceum_warp.viz import FreeCamera, Shot, drawing, video
+from lyceum_warp.viz.cameras import camera_values
 
 SMALL = (96, 64)
 

@@ -114,8 +114,7 @@ POSITIONS = {
 
 def dm_control_env(task: str, seed: int) -> Any:
     """Make a dm_control environment. Its task is one of dm_control's suite, or uses Gymnasium's formulas."""
-    from dm_control import mujoco as dm_mujoco
-    from dm_control import suite
+    from dm_control import mujoco as dm_mujoco, suite
     from dm_control.rl import control
 
     own = "dm/cartpole_balance" if task == "cartpole" else task

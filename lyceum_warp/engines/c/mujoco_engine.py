@@ -23,8 +23,7 @@ from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.c.batch_faults import call_batch
 from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
-from lyceum_warp.engines.c.world_models import WorldModels
-from lyceum_warp.engines.c.world_models import bytes_per_world as model_bytes_per_world
+from lyceum_warp.engines.c.world_models import WorldModels, bytes_per_world as model_bytes_per_world
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import (

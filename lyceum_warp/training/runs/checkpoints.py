@@ -10,9 +10,8 @@ import torch
 from torch import nn
 
 from lyceum_warp import algos
-from lyceum_warp.algos.common.policy import GaussianPolicy
-from lyceum_warp.algos.common.value import ValueFunction
-from lyceum_warp.env.curriculum import Curriculum
+from lyceum_warp.algos import GaussianPolicy, ValueFunction
+from lyceum_warp.env import Curriculum
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.validate import first_sentence
 
@@ -86,8 +85,7 @@ def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
     kind: Any = _CLASSES[name]
     own, shape = saved.get("class"), saved["shape"]
     if own is not None:
-        # the file could name any module, and importing a module runs its code; an earlier release may have named another
-        # module of this package
+        # the file could name any module, and importing a module runs its code; earlier releases had other modules
         public = own.startswith("lyceum_warp.") and shape is not None
         kind = getattr(algos, own.rpartition(".")[2], None) if public else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):

@@ -5,9 +5,8 @@ import dataclasses
 import json
 from collections.abc import Callable
 
-from lyceum_warp.algos.common.evaluation import evaluate
-from lyceum_warp.algos.common.transfer import simulation
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import evaluate, simulation
+from lyceum_warp.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.training.runs.checkpoints import read_checkpoint
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum

@@ -7,18 +7,11 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.learner import Learner
-from lyceum_warp.algos.npg import NPG
-from lyceum_warp.algos.npg_config import NPGConfig
-from lyceum_warp.algos.ppo import PPO
-from lyceum_warp.algos.ppo_config import PPOConfig
-from lyceum_warp.algos.sac import SAC
-from lyceum_warp.algos.sac_config import SACConfig
-from lyceum_warp.binding.registry import spelled_task
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.engines.placement import engine_name
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import NPG, PPO, SAC, Learner, NPGConfig, PPOConfig, SACConfig, Team
+from lyceum_warp.binding import spelled_task
+from lyceum_warp.core import EnvOptions
+from lyceum_warp.engines import engine_name
+from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number

@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.binding.registry import file_name
-from lyceum_warp.env.curriculum import Curriculum
+from lyceum_warp.binding import file_name
+from lyceum_warp.env import Curriculum
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.suggestions import did_you_mean

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from lyceum_warp.binding.registry import file_name
+from lyceum_warp.binding import file_name
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.training.runs.folder import PRETRAINED, Run
 

@@ -8,8 +8,7 @@ therefore always contain the checkpoint's steps.
 from collections.abc import Iterator
 from pathlib import Path
 
-from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.replay import Replay
+from lyceum_warp.algos import Replay, Team
 from lyceum_warp.training.runs.checkpoints import FORMAT, read_checkpoint, write_content
 from lyceum_warp.training.runs.folder import Run
 

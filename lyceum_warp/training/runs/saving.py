@@ -4,8 +4,8 @@ import math
 import time
 from typing import Any
 
-from lyceum_warp.algos.common.learner import Iteration, Learner
-from lyceum_warp.env.curriculum import Curriculum
+from lyceum_warp.algos import Iteration, Learner
+from lyceum_warp.env import Curriculum
 from lyceum_warp.training.runs.checkpoints import policy_content, write_content
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.replay_files import clean_replay, write_replay

@@ -13,13 +13,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.binding.models import find_model
-from lyceum_warp.binding.opened_files import data_files, stamps
-from lyceum_warp.binding.registry import package_task_names, source_files
-from lyceum_warp.core.model_files import ModelFile, read_spec
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.binding import data_files, find_model, package_task_names, source_files, stamps
+from lyceum_warp.core import EnvOptions, ModelFile, Task, read_spec
+from lyceum_warp.env import Env
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.trust import check_trust
 

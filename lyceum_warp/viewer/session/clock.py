@@ -11,9 +11,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.controllers.episode_collector import ControlProgress
-from lyceum_warp.controllers.real_time import control_async
-from lyceum_warp.env.env import Env
+from lyceum_warp.controllers import ControlProgress, control_async
+from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import (
     Close,
     Command,

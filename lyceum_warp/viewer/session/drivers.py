@@ -8,11 +8,9 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy, acting
-from lyceum_warp.algos.planning.planner import Planner
-from lyceum_warp.controllers.checked_controller import CheckedController, accepts, signature_of
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Planner, Policy, acting, moved
+from lyceum_warp.controllers import CheckedController, accepts, signature_of
+from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described, memoryless_action
 
 MOST_SAMPLES = 24

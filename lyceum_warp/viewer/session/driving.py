@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Arrow
 from lyceum_warp.viewer.session.live import Live
 

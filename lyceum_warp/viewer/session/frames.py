@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 import mujoco
 import numpy as np
 
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import Frame, Ghost, SetGhosts, Status
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows

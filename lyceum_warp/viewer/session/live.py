@@ -9,8 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from lyceum_warp.core.done import FAULTS
-from lyceum_warp.env.env import Env
+from lyceum_warp.core import FAULTS
+from lyceum_warp.env import Env
 
 HISTORY_BYTES = 240 * 2**20
 """Memory for the history of all worlds, in bytes."""

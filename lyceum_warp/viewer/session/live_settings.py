@@ -3,8 +3,8 @@
 import dataclasses
 from typing import Any
 
-from lyceum_warp.algos.planning.planner import Planner
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Planner
+from lyceum_warp.env import Env
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
 _OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that a planner sets itself

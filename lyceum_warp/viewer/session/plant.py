@@ -4,8 +4,8 @@ import threading
 import time
 from collections.abc import Callable
 
-from lyceum_warp.controllers.real_time import Clock
-from lyceum_warp.engines.placement import options_for_plant
+from lyceum_warp.controllers import Clock
+from lyceum_warp.engines import options_for_plant
 from lyceum_warp.viewer.session.drivers import WorldControl
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 

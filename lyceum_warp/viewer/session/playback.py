@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.controllers.saved_episodes import check_episode
-from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.core.done import Done
-from lyceum_warp.env.env import Env
+from lyceum_warp.controllers import Trajectory, check_episode
+from lyceum_warp.core import Done
+from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described
 
 

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from lyceum_warp.algos.planning.planner import Planner
-from lyceum_warp.controllers.loop import control
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Planner
+from lyceum_warp.controllers import control
+from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
 from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.planning.planner import Planner
-from lyceum_warp.env.env import Env
+from lyceum_warp.algos import Planner
+from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
 

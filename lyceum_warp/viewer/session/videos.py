@@ -13,10 +13,7 @@ import numpy as np
 
 from lyceum_warp.support.interrupts import obeyed
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Frame
-from lyceum_warp.viz import NoVideoError
-from lyceum_warp.viz.page import write_states
-from lyceum_warp.viz.render import Shot
-from lyceum_warp.viz.video import Recorder
+from lyceum_warp.viz import NoVideoError, Recorder, Shot, write_states
 
 FPS = 30
 _PICTURE_SIZE = (1280, 960)

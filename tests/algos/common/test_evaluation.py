@@ -6,7 +6,7 @@ import torch
 from metered_task import Metered
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.evaluation import evaluation_seed
+from lyceum_warp.algos import evaluation_seed
 
 
 def test_evaluate_counts_the_same_number_of_episodes_in_every_world() -> None:

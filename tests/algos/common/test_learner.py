@@ -10,9 +10,9 @@ from metered_task import Metered
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos import Team
 from lyceum_warp.cli.display import Display, console, curve_table
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 
 class Constant(nn.Module):

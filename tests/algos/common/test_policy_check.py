@@ -9,9 +9,9 @@ from torch import nn
 
 import lyceum_warp as lw
 from lyceum_warp.algos.common.policy_check import check_policy
-from lyceum_warp.controllers.batch import policy_episodes
+from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs.checkpoints import policy_content
-from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viewer.session.drivers import PolicyControl
 
 

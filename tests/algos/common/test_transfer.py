@@ -4,7 +4,8 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.transfer import Comparison, Difference, Episodes, _compared, task_physics
+from lyceum_warp.algos import task_physics
+from lyceum_warp.algos.common.transfer import Comparison, Difference, Episodes, _compared
 from lyceum_warp.tasks import hopper
 
 

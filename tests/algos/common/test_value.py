@@ -3,8 +3,8 @@ from pathlib import Path
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs.checkpoints import policy_content
-from lyceum_warp.training.runs.folder import Run
 
 
 def test_value_function_has_the_discount_factor_of_its_training(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 import lyceum_warp as lw
+from lyceum_warp.algos import Team
 from lyceum_warp.algos.common.dense import DenseValue
-from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.value_fit import ValueFit
 
 

@@ -14,9 +14,7 @@ import warp as wp
 from form_tasks import Gifted
 from plain_mppi import Plain
 from rail_task import Picky, rail
-from varied_task import Params as VariedParams
-from varied_task import Varied
-from varied_task import World as VariedWorld
+from varied_task import Params as VariedParams, Varied, World as VariedWorld
 
 import lyceum_warp as lw
 import lyceum_warp.tasks

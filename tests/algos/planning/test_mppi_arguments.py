@@ -12,8 +12,9 @@ from rail_task import Picky, Rail, rail
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig, Planning, Row
-from lyceum_warp.algos.planning.arguments import planner_arguments, task_config
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.algos import task_config
+from lyceum_warp.algos.planning.arguments import planner_arguments
+from lyceum_warp.binding import find_task
 from lyceum_warp.engines import placement
 
 

@@ -8,8 +8,8 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, MPPIConfig
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.spaces import Space
+from lyceum_warp.binding import find_task
+from lyceum_warp.core import Space
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from lyceum_warp.algos.common.policy import GaussianPolicy
-from lyceum_warp.algos.common.value import ValueFunction
-from lyceum_warp.training.runs.checkpoints import FORMAT, policy_content, read_checkpoint
-from lyceum_warp.training.runs.folder import Run, load, load_value
+from lyceum_warp.algos import GaussianPolicy, ValueFunction
+from lyceum_warp.training import Run, load, load_value, read_checkpoint
+from lyceum_warp.training.runs.checkpoints import FORMAT, policy_content
 
 
 @pytest.fixture

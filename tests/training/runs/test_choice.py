@@ -8,8 +8,8 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.training.runs.checkpoints import policy_content, read_checkpoint, write_content
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run, read_checkpoint
+from lyceum_warp.training.runs.checkpoints import policy_content, write_content
 
 
 @pytest.fixture

@@ -7,10 +7,10 @@ import torch
 from training_runs import algorithm
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.core.options import EnvOptions, PhysicsOptions
-from lyceum_warp.training.runs.configuration import ALGORITHMS, Configuration, describe
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.algos import Team
+from lyceum_warp.core import EnvOptions, PhysicsOptions
+from lyceum_warp.training import ALGORITHMS, Configuration, Run
+from lyceum_warp.training.runs.configuration import describe
 
 BASE = {
     "algorithm": "npg", "task": "hopper", "engine": "auto", "device": "cpu", "nworld": 3, "seed": 2, "threads": 1,

@@ -11,10 +11,9 @@ from training_runs import QUIET, algorithm, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.common.policy import GaussianPolicy
-from lyceum_warp.training.runs.checkpoints import FORMAT
-from lyceum_warp.training.runs.checkpoints import policy_content as content
-from lyceum_warp.training.runs.folder import Run, load
+from lyceum_warp.algos import GaussianPolicy
+from lyceum_warp.training import Run, load
+from lyceum_warp.training.runs.checkpoints import FORMAT, policy_content as content
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from training_runs import QUIET
 
 import lyceum_warp as lw
 from lyceum_warp.cli import main
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 
 DATA = Path(__file__).parent.parent.parent / "data"
 

@@ -7,11 +7,11 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.algos.common.policy_check import check_sizes
-from lyceum_warp.binding.registry import task_names
+from lyceum_warp.algos import check_sizes
+from lyceum_warp.binding import task_names
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.training.runs.folder import Run, load
-from lyceum_warp.training.runs.pretrained_runs import pretrained_run, pretrained_tasks, pretrained_text
+from lyceum_warp.training import Run, load, pretrained_run, pretrained_text
+from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 TASKS = pretrained_tasks()
 

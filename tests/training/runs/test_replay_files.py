@@ -8,8 +8,8 @@ import pytest
 from metered_task import Metered
 
 import lyceum_warp as lw
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs import replay_files, saving
-from lyceum_warp.training.runs.folder import Run
 
 
 def made(replay: int = 80) -> lw.SAC:

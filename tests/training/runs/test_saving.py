@@ -9,7 +9,7 @@ from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training import Run
 from lyceum_warp.training.runs.saving import Saver
 
 

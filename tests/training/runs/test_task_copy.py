@@ -11,12 +11,10 @@ from training_runs import QUIET, TINY, metrics, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.binding.registry import find_task
-from lyceum_warp.env.env import Env
-from lyceum_warp.training.runs.configuration import Configuration
-from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.training.runs.task_copy import run_env, task_copy
+from lyceum_warp.env import Env
+from lyceum_warp.training import Configuration, Run, run_env, task_copy
 
 TASK = Path(__file__).parents[2] / "data" / "runs_0_1" / "task_file" / "task"
 SOURCE, SCENE, PART = ((TASK / name).read_text() for name in ("slide.py", "robot/scene.xml", "robot/parts/block.xml"))

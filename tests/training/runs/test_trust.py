@@ -11,9 +11,7 @@ from training_runs import QUIET, TINY, refused, train
 import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
-from lyceum_warp.training.runs.configuration import Configuration
-from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.training.runs.task_copy import run_env
+from lyceum_warp.training import Configuration, Run, run_env
 
 SOURCE = tiny_task.changed(
     ("@wp.struct", 'if "WITNESS" in os.environ:\n    Path(os.environ["WITNESS"]).touch()\n\n@wp.struct'),

@@ -17,8 +17,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
-from lyceum_warp.viewer.window import proxy as module
-from lyceum_warp.viewer.window import sockets as sockets_module
+from lyceum_warp.viewer.window import proxy as module, sockets as sockets_module
 from lyceum_warp.viewer.window.proxy import Proxy
 from lyceum_warp.viewer.window.sockets import private_socket
 

@@ -1,0 +1,5 @@
+from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv as GymnasiumEnv
+from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv as GymnasiumVectorEnv
+from lyceum_warp.adapters.rsl_rl_config import runner_config as runner_config
+from lyceum_warp.adapters.rsl_rl_env import RslRlVecEnv as RslRlVecEnv
+from lyceum_warp.adapters.stable_baselines3 import StableBaselines3VecEnv as StableBaselines3VecEnv

@@ -1,0 +1,63 @@
+from lyceum_warp.algos.common.distributed import (
+    Team as Team,
+    join as join,
+)
+from lyceum_warp.algos.common.evaluation import (
+    ENDLESS_STEPS as ENDLESS_STEPS,
+    Episodes as Episodes,
+    evaluate as evaluate,
+    evaluation_seed as evaluation_seed,
+    evaluation_worlds as evaluation_worlds,
+)
+from lyceum_warp.algos.common.learner import (
+    METRIC_COLUMN as METRIC_COLUMN,
+    Iteration as Iteration,
+    Learner as Learner,
+)
+from lyceum_warp.algos.common.networks import moved as moved
+from lyceum_warp.algos.common.policy import (
+    GaussianPolicy as GaussianPolicy,
+    Policy as Policy,
+    acting as acting,
+)
+from lyceum_warp.algos.common.policy_check import check_sizes as check_sizes
+from lyceum_warp.algos.common.policy_export import (
+    check_export as check_export,
+    export_policy as export_policy,
+)
+from lyceum_warp.algos.common.replay import (
+    Replay as Replay,
+    Transitions as Transitions,
+)
+from lyceum_warp.algos.common.rollout_buffer import Rollout as Rollout
+from lyceum_warp.algos.common.squashed_policy import SquashedPolicy as SquashedPolicy
+from lyceum_warp.algos.common.transfer import (
+    EXACT as EXACT,
+    Transfer as Transfer,
+    simulation as simulation,
+    task_physics as task_physics,
+    transfer as transfer,
+)
+from lyceum_warp.algos.common.twin_critic import TwinCritic as TwinCritic
+from lyceum_warp.algos.common.value import (
+    ValueFunction as ValueFunction,
+    value_group as value_group,
+)
+from lyceum_warp.algos.npg import NPG as NPG
+from lyceum_warp.algos.npg_config import NPGConfig as NPGConfig
+from lyceum_warp.algos.planning.arguments import task_config as task_config
+from lyceum_warp.algos.planning.config import MPPIConfig as MPPIConfig
+from lyceum_warp.algos.planning.planner import (
+    CEM as CEM,
+    MPPI as MPPI,
+    Planner as Planner,
+    PredictiveSampling as PredictiveSampling,
+)
+from lyceum_warp.algos.planning.updates import (
+    PlanSamples as PlanSamples,
+    PlanUpdate as PlanUpdate,
+)
+from lyceum_warp.algos.ppo import PPO as PPO
+from lyceum_warp.algos.ppo_config import PPOConfig as PPOConfig
+from lyceum_warp.algos.sac import SAC as SAC
+from lyceum_warp.algos.sac_config import SACConfig as SACConfig

@@ -1,0 +1,34 @@
+from lyceum_warp.binding.bound_task import (
+    obs_layouts as obs_layouts,
+    task_spec as task_spec,
+)
+from lyceum_warp.binding.functions import TaskSource as TaskSource
+from lyceum_warp.binding.models import (
+    compile_model as compile_model,
+    find_model as find_model,
+)
+from lyceum_warp.binding.opened_files import (
+    data_files as data_files,
+    stamps as stamps,
+)
+from lyceum_warp.binding.parameters import defaults as defaults
+from lyceum_warp.binding.parts import length as length
+from lyceum_warp.binding.registry import (
+    file_name as file_name,
+    find_task as find_task,
+    package_task_names as package_task_names,
+    register as register,
+    snake_case as snake_case,
+    source_files as source_files,
+    spelled_task as spelled_task,
+    task_name as task_name,
+    task_names as task_names,
+)
+from lyceum_warp.binding.sources import (
+    FunctionSource as FunctionSource,
+    is_row as is_row,
+    is_struct as is_struct,
+    name_of as name_of,
+    overloads as overloads,
+)
+from lyceum_warp.binding.writes import written_fields as written_fields

@@ -1,0 +1,10 @@
+from lyceum_warp.engines.base import (
+    Engine as Engine,
+    EngineFactory as EngineFactory,
+)
+from lyceum_warp.engines.placement import (
+    engine_name as engine_name,
+    options_for_few_worlds as options_for_few_worlds,
+    options_for_plant as options_for_plant,
+    options_on_cores as options_on_cores,
+)

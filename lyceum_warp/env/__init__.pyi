@@ -1,0 +1,11 @@
+from lyceum_warp.env.arrays import memory_columns as memory_columns
+from lyceum_warp.env.curriculum import (
+    Curriculum as Curriculum,
+    start_episodes as start_episodes,
+)
+from lyceum_warp.env.env import (
+    Env as Env,
+    make as make,
+)
+from lyceum_warp.env.openloop import OpenLoop as OpenLoop
+from lyceum_warp.env.worlds import Worlds as Worlds

@@ -1,0 +1,6 @@
+from lyceum_warp.models.actuators import follow_velocity as follow_velocity
+from lyceum_warp.models.terrain import (
+    Terrain as Terrain,
+    height_field as height_field,
+    scan_grid as scan_grid,
+)

@@ -1,0 +1,33 @@
+from lyceum_warp.training.curve import learning_curve as learning_curve
+from lyceum_warp.training.loop import Display as Display, train as train
+from lyceum_warp.training.runs.checkpoints import (
+    network_of as network_of,
+    read_checkpoint as read_checkpoint,
+)
+from lyceum_warp.training.runs.choice import (
+    AUTO as AUTO,
+    EPISODES as EPISODES,
+    choose_policy as choose_policy,
+)
+from lyceum_warp.training.runs.configuration import (
+    ALGORITHMS as ALGORITHMS,
+    Configuration as Configuration,
+    saved_networks as saved_networks,
+)
+from lyceum_warp.training.runs.folder import (
+    Run as Run,
+    load as load,
+    load_curriculum as load_curriculum,
+    load_value as load_value,
+    runs_in as runs_in,
+)
+from lyceum_warp.training.runs.pretrained_runs import (
+    pretrained_run as pretrained_run,
+    pretrained_text as pretrained_text,
+)
+from lyceum_warp.training.runs.task_copy import (
+    json_value as json_value,
+    note_changes as note_changes,
+    run_env as run_env,
+    task_copy as task_copy,
+)

@@ -1,0 +1,32 @@
+from lyceum_warp.viz.cameras import (
+    CameraChoice as CameraChoice,
+    FreeCamera as FreeCamera,
+    find_camera as find_camera,
+    parsed_camera as parsed_camera,
+)
+from lyceum_warp.viz.episode_plot import control_plot as control_plot
+from lyceum_warp.viz.extra import NoVideoError as NoVideoError
+from lyceum_warp.viz.page import write_states as write_states
+from lyceum_warp.viz.pictures import WorldPictures as WorldPictures
+from lyceum_warp.viz.policy_videos import (
+    Videos as Videos,
+    one_line as one_line,
+    policy_video as policy_video,
+)
+from lyceum_warp.viz.render import Shot as Shot
+from lyceum_warp.viz.style import (
+    ACCENT as ACCENT,
+    LINE as LINE,
+    finish_axes as finish_axes,
+    new_figure as new_figure,
+    save_png as save_png,
+)
+from lyceum_warp.viz.tensorboard import (
+    TensorBoard as TensorBoard,
+    check_tensorboard as check_tensorboard,
+)
+from lyceum_warp.viz.video import (
+    Recorder as Recorder,
+    check_video as check_video,
+    write_video as write_video,
+)
