@@ -23,7 +23,7 @@ from lyceum_warp.training.runs.trust import remember
 
 _CONFIG, _TASK = "config.json", "task"
 
-PRETRAINED = Path(__file__).resolve().parents[1] / "pretrained"
+PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
 """The folder of the package's pretrained runs."""
 
 _UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
