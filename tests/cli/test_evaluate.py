@@ -120,7 +120,7 @@ def test_video_is_made_with_the_named_camera(
 
 
 def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["eval", str(trained), "--episodes", "48", "--horizon", "20", "--transfer"]
+    arguments = ["eval", str(trained), "--episodes", "64", "--horizon", "20", "--transfer"]
     assert cli.main(arguments) == 0
     shown = capsys.readouterr().out
     assert "Warp engine on cpu against C engine: same" in shown

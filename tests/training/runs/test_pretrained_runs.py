@@ -55,7 +55,7 @@ def test_task_name_in_place_of_a_run_names_the_pretrained_run(tmp_path: Path, mo
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileNotFoundError, match=r"no run in hopper: .* add --pretrained, .*pretrained_run\('hopper'\)"):
         Run.open("hopper")
-    with pytest.raises(FileNotFoundError, match=r"config\.json$"):
+    with pytest.raises(FileNotFoundError, match="no run in runs/hopper, which does not exist"):
         Run.open("runs/hopper")
 
 
