@@ -52,13 +52,13 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 def tables(rows: Sequence[Row]) -> list[Table]:
     lines = []
-    for row in rows:
+    for row in sorted(rows, key=lambda row: (row.case["task"], row.case["episodes"])):
         for found in row.result["comparisons"]:
             returns, _, failures = found["differences"]
             half = (returns["high"] - returns["low"]) / 2
             lines.append([
                 row.case["task"], f"{row.case['episodes']}", found["second"], found["first"],
-                f"{returns['second']:,.4g}", f"{returns['first']:,.4g}",
+                f"{returns['second']:,.5g}", f"{returns['first']:,.5g}",
                 f"{(returns['high'] + returns['low']) / 2:+.3g} ± {half:.2g}",
                 f"{failures['second']:.1%}, {failures['first']:.1%} {failures['quantity']}",
                 f"{sum(found['faults'])}", found["verdict"],
