@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from lyceum_warp.training import Run, learning_curve
-from lyceum_warp.viz import learning_curve as module
+from lyceum_warp.training import Run, curve as module, learning_curve
 
 
 def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Path) -> None:

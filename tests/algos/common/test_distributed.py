@@ -11,7 +11,8 @@ import torch
 from training_runs import QUIET, metrics
 
 from lyceum_warp import cli
-from lyceum_warp.algos import Team, distributed
+from lyceum_warp.algos import Team
+from lyceum_warp.algos.common import distributed
 from lyceum_warp.training import Run
 
 OPTIONS = ["--samples", "600", "--nworld", "12", "--hidden", "8", "--value-hidden", "8", "--mean-every", "1",

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos import policy_export
+from lyceum_warp.algos.common import policy_export
 
 Run = Callable[[Path, np.ndarray], np.ndarray]
 

@@ -287,7 +287,7 @@ READING = (
         SOURCE.replace(
             "import warp as wp\n",
             "import os\nfrom pathlib import Path\n\nimport numpy as np\nimport slide_data\nimport warp as wp\n\n"
-            "HERE = Path(__file__).parent.parent\nSCALE = os.environ.get('SCALE', HERE / 'clips/scale.npy')\n",
+            "HERE = Path(__file__).parent\nSCALE = os.environ.get('SCALE', HERE / 'clips/scale.npy')\n",
             1,
         )
         .replace("    dt: float\n", "    scale: float = float(np.load(SCALE))\n", 1)
