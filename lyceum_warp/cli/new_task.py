@@ -4,6 +4,7 @@ import dataclasses
 import importlib.util
 import keyword
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,8 +14,7 @@ import tyro
 
 from lyceum_warp.binding import compile_model, find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import say
-from lyceum_warp.cli.task_text import literal, task_text
-from lyceum_warp.cli.velocity_text import TRAINING, Walker, substeps, velocity_text
+from lyceum_warp.cli.task_text import TRAINING, literal, plain_text, velocity_text
 from lyceum_warp.core import (
     CONES,
     ModelFile,
@@ -24,6 +24,7 @@ from lyceum_warp.core import (
     menagerie_model,
     read_spec,
 )
+from lyceum_warp.models import Legs
 from lyceum_warp.support.files import replaced
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {
@@ -77,52 +78,42 @@ class New:
         class_name = _class_name(path)
         if path.exists():
             raise ValueError(f"{path} exists: choose another name, or remove it")
-        if not path.absolute().parent.is_dir():
-            raise ValueError(f"there is no folder {path.parent} for the task file: create it first")
         source, spec = _model(self.model, path)
+        names = {"file": path.name, "class_name": class_name, "source": source}
         try:
             model = compile_model(spec, ("sensordata",), PhysicsOptions())
-            walker = Walker(spec, self.feet, self.joints) if self.template == "velocity" else None
+            if model.nu == 0:
+                raise ValueError("the model has no actuators, so actions would have no effect: add actuators")
+            if model.nv == 0:
+                raise ValueError("the model has no joints, so its bodies cannot move: add joints")
+            if self.template == "plain":
+                text = plain_text(model, **names)
+            else:
+                legs = Legs(model, self.feet, self.joints)
+                text = velocity_text(legs, **names)
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
-        if model.nu == 0:
-            raise ValueError(f"the model {self.model} has no actuators, so actions would have no effect: add actuators")
-        if model.nv == 0:
-            raise ValueError(f"the model {self.model} has no joints, so its bodies cannot move: add joints")
-        if walker is not None:
-            text = velocity_text(path.name, class_name, source, walker)
+        with replaced(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        task = find_task(path)
+        if self.template == "plain":
+            step_ms = 1000 * task.frame_skip * model.opt.timestep
+            sizes = f"{sum(task.obs.values())} observations, {model.nu} actions, {step_ms:.3g} ms in a step"
         else:
-            text = task_text(path.name, class_name, source, model)
-        try:
-            with replaced(path) as temporary:
-                temporary.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise ValueError(f"can't write {path}: {error.strerror}") from error
-        if walker is not None:
-            sizes = f"feet {', '.join(foot.name for foot in walker.feet)}; joints {', '.join(walker.joints)}"
-        else:
-            task = find_task(path)
-            sizes = (
-                f"{sum(task.obs.values())} observations, {model.nu} actions, "
-                f"{1000 * task.frame_skip * model.opt.timestep:.3g} ms in a step"
-            )
-        training = "" if walker is None else f" {TRAINING}"
+            sizes = f"feet {', '.join(foot.site for foot in legs.feet)}; joints {', '.join(legs.joints)}"
+        training = "" if self.template == "plain" else f" {TRAINING}"
         say(f"{path}: {sizes}; check and train it with")
         say(f"  lyceum-warp check {path}\n  lyceum-warp train {path}{training}")
-        if walker is not None:
+        if self.template == "velocity":
             cone = next(name for name, kind in CONES.items() if kind == model.opt.cone)
-            physics = f"{substeps(model)} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
+            physics = f"{task.frame_skip} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
             say(f"a step has {physics}; lyceum-warp tune {path} finds faster physics")
 
 
 def _class_name(path: Path) -> str:
     name = path.stem
     class_name = "".join(part[:1].upper() + part[1:] for part in name.split("_"))
-    if (
-        not (name.isidentifier() and class_name.isidentifier() and name.isascii())
-        or keyword.iskeyword(name)
-        or keyword.iskeyword(class_name)
-    ):
+    if not re.fullmatch("[A-Za-z]+[A-Za-z0-9_]*", name) or keyword.iskeyword(name) or keyword.iskeyword(class_name):
         raise ValueError(f"a task can't be named {name!r}: use letters, digits and _, as in my_robot")
     if snake_case(class_name) != name:  # the class name determines the task's name
         raise ValueError(f"a task can't be named {name!r}: use {snake_case(class_name)!r}, for the class {class_name}")
@@ -144,5 +135,5 @@ def _model(text: str, path: Path) -> tuple[str, mujoco.MjSpec]:
     model = Path(os.path.expanduser(text))
     if not model.is_file():
         raise FileNotFoundError(f"there is no model file {text!r}")
-    given = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))
-    return literal(given.as_posix()), read_spec(model)
+    place = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))
+    return literal(place.as_posix()), read_spec(model)

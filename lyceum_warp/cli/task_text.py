@@ -1,11 +1,18 @@
-"""Generate the text of a task file for a model, for lyceum-warp new."""
+"""Fill the templates of task files in ruff's format, for lyceum-warp new."""
 
 import json
+import string
 import textwrap
 from collections.abc import Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
+
+from lyceum_warp.models import Legs
+
+TRAINING = "--algorithm ppo --device cuda --iterations 800"
+"""Options of lyceum-warp train that suffice to learn walking on one GPU."""
 
 _STEP = 0.02
 """Desired duration of a step, in seconds."""
@@ -16,119 +23,15 @@ _EPISODE = 10.0
 _WIDTH = 116
 """Width of a list of names in a comment, in characters."""
 
-_ELEMENTS = {
-    "bodies": (mujoco.mjtObj.mjOBJ_BODY, "nbody"),
-    "joints": (mujoco.mjtObj.mjOBJ_JOINT, "njnt"),
-    "sites": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
-    "sensors": (mujoco.mjtObj.mjOBJ_SENSOR, "nsensor"),
-    "actuators": (mujoco.mjtObj.mjOBJ_ACTUATOR, "nactuator"),
-    "keyframes": (mujoco.mjtObj.mjOBJ_KEY, "nkey"),
-}
-
 _Sensor = mujoco.mjtSensor
 
 _UNOBSERVED = (_Sensor.mjSENS_USER, _Sensor.mjSENS_PLUGIN, _Sensor.mjSENS_CLOCK)
 """Types of sensors that do not measure the robot's state, or that need custom code."""
 
 
-def task_text(file: str, class_name: str, source: str, model: mujoco.MjModel) -> str:
-    """Generate the text of a task file, in ruff's format.
-
-    ``source`` is the model as a Python expression, such as ``"robot.xml"`` with its quotes.
-    """
-    fields, parts, put = _observation(model)
-    sizes = ", ".join(f'"{name}": {size}' for name, size in parts.items())
-    settings = [f"model = {source}", *_lengths(model), f"obs = {{{sizes}}}"]
-    if _has_other_ranges(model):
-        settings.append("action_range = (-1.0, 1.0)  # scaled to the controls' ranges; without it: the controls")
-    if "home" in _names(model, "keyframes"):
-        settings.append('keyframe = "home"  # where episodes start')
-    return _TEXT.format(
-        file=file, class_name=class_name, elements=_elements(model), fields=indented(fields),
-        put=indented(put), settings=indented(settings),
-    )  # fmt: skip
-
-
-def _lengths(model: mujoco.MjModel) -> list[str]:
-    substep = model.opt.timestep
-    frame_skip = max(1, round(_STEP / substep))
-    horizon = max(1, round(_EPISODE / (frame_skip * substep)))
-    return [
-        f"frame_skip = {frame_skip}  # substeps of {1000 * substep:g} ms in a step",
-        f"horizon = {horizon}  # steps in an episode, {horizon * frame_skip * substep:.3g} s; 0 for no limit",
-    ]
-
-
-def _has_other_ranges(model: mujoco.MjModel) -> bool:
-    """Return True if every control has a range and some range differs from -1 to 1."""
-    limited, ranges = model.actuator_ctrllimited.astype(bool), model.actuator_ctrlrange
-    return bool(limited.all() and (ranges[:, 0] < ranges[:, 1]).all() and (ranges != (-1.0, 1.0)).any())
-
-
-def _observation(model: mujoco.MjModel) -> tuple[list[str], dict[str, int], list[str]]:
-    """Generate the fields of World, the sizes of the observation's parts, and the lines that write the observation."""
-    fields, rows = ["qpos: Row[float]", "qvel: Row[float]"], ["s.qpos", "s.qvel"]
-    parts = {"position": model.nq, "velocity": model.nv}
-    if model.na:
-        fields.append("act: Row[float]")
-        parts["activation"] = model.na
-        rows.append("s.act")
-    if sensed := _sensor_places(model):
-        fields.append("sensordata: Row[float]")
-        parts["sensors"] = sum(last - first for first, last in sensed)
-        whole = sensed == [(0, model.nsensordata)]
-        rows += ["s.sensordata"] if whole else [f"s.sensordata, {first}, {last}" for first, last in sensed]
-    put = [f"k = lw.put(obs, {'k' if i else 0}, {row})" for i, row in enumerate(rows)]
-    put[-1] = put[-1].removeprefix("k = ")
-    return fields, parts, put
-
-
-def _sensor_places(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    places: list[tuple[int, int]] = []
-    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
-        return places
-    for kind, start, size in np.stack([model.sensor_type, model.sensor_adr, model.sensor_dim], axis=1).tolist():
-        if kind in _UNOBSERVED or not size:
-            continue
-        if places and places[-1][1] == start:
-            places[-1] = places[-1][0], start + size
-        else:
-            places.append((start, start + size))
-    return places
-
-
-def _elements(model: mujoco.MjModel) -> str:
-    names = {kind: [name for name in _names(model, kind) if name.isprintable() and name] for kind in _ELEMENTS}
-    names["bodies"] = [name for name in names["bodies"] if name != "world"]
-    mocap = {name for i, name in enumerate(_names(model, "bodies")) if model.body_mocapid[i] >= 0}
-    names["mocap bodies"] = [name for name in names["bodies"] if name in mocap]
-    lines = [
-        textwrap.shorten(f"{kind}: {', '.join(found)}", _WIDTH, placeholder=" ...")
-        for kind, found in names.items()
-        if found
-    ]
-    if not lines:
-        return ""
-    element, field = ("site", "site_xpos") if names["sites"] else ("body", "xpos")
-    name = next(iter(names["sites"] or names["bodies"]), "tip")
-    example = f"tip: int = lw.{element}({literal(name)})"
-    comment = [
-        "Names in the model. A default in Params turns one into an index, as in",
-        f"    {example}",
-        f"with {field} in World, s.{field}[p.tip] is then a position; lw.joint, lw.sensor, ... find other kinds",
-        *(f"  {line}" for line in lines),
-    ]
-    return "".join(f"# {line}\n" for line in comment) + "\n\n"
-
-
-def _names(model: mujoco.MjModel, kind: str) -> list[str]:
-    objtype, count = _ELEMENTS[kind]
-    return [mujoco.mj_id2name(model, objtype, i) or "" for i in range(getattr(model, count))]
-
-
-def indented(lines: Sequence[str], indent: int = 4) -> str:
-    """Indent lines and join them."""
-    return "\n".join(f"{' ' * indent}{line}" for line in lines)
+def substeps(model: mujoco.MjModel) -> int:
+    """Return the number of substeps in a step of the task."""
+    return max(1, round(_STEP / model.opt.timestep))
 
 
 def literal(text: str) -> str:
@@ -136,63 +39,142 @@ def literal(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-_TEXT = '''"""{class_name}: a task whose reward is still to be written.
+def plain_text(model: mujoco.MjModel, **names: str) -> str:
+    """Write a task file whose reward is zero. The arguments are those of ``velocity_text``."""
+    elements = _elements(model)
+    kind, field = ("site", "site_xpos") if "sites" in elements else ("body", "xpos")
+    example = next(iter(elements.get("sites") or elements.get("bodies", ["tip"])))
+    lists = [textwrap.shorten(f"{kind}: {', '.join(elements[kind])}", _WIDTH, placeholder=" ...") for kind in elements]
+    fields = ["qpos: Row[float]", "qvel: Row[float]"]
+    rows = ["s.qpos", "s.qvel"]
+    parts = {"position": model.nq, "velocity": model.nv}
+    if model.na:
+        fields.append("act: Row[float]")
+        rows.append("s.act")
+        parts["activation"] = model.na
+    if ranges := _sensor_ranges(model):
+        fields.append("sensordata: Row[float]")
+        is_complete = ranges == [[0, model.nsensordata]]
+        rows += ["s.sensordata"] if is_complete else [f"s.sensordata, {first}, {last}" for first, last in ranges]
+        parts["sensors"] = sum(last - first for first, last in ranges)
+    observe = [f"k = lw.put(obs, {'k' if i else 0}, {row})" for i, row in enumerate(rows)]
 
-``lyceum-warp check {file}`` checks this task, and ``lyceum-warp train {file}`` trains it.
-``help(lw.Task)`` describes every function of a task.
-"""
-
-import warp as wp
-
-import lyceum_warp as lw
-from lyceum_warp import Row
-
-{elements}@wp.struct
-class World:  # the fields that the functions read, by MuJoCo's names: add xpos, site_xpos, cvel, ctrl, ... as needed
-{fields}
-
-
-@wp.struct
-class Params:  # parameters that users can set, as in --param reset_noise=0.1
-    dt: float  # filled in: seconds in a step
-    reset_noise: float = 0.01
-
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-{put}
-
-
-@wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    # reward of the step from s0 to s1, for example: return s1.qvel[0] - 0.001 * lw.sum_squares(action)
-    return 0.0
-
-
-@wp.func
-def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(s.qvel.shape[0]):
-        s.qvel[i] += lw.uniform(rng, -p.reset_noise, p.reset_noise)
-
-
-# Three more functions that most tasks have:
-#
-# @wp.func
-# def evaluate(s: World, p: Params) -> float:
-#     return s.qpos[0]  # a metric in physical units, separate from the reward
-#
-#
-# @wp.func
-# def terminated(s: World, p: Params) -> bool:
-#     return s.qpos[0] < -10.0  # a state that ends the episode, such as a fall
-#
-#
-# @wp.func
-# def success(s: World, p: Params) -> bool:
-#     return s.qpos[0] > 10.0  # the goal
+    settings = []
+    controls = model.actuator_ctrlrange
+    if model.actuator_ctrllimited.all() and (controls[:, 0] < controls[:, 1]).all() and (abs(controls) != 1.0).any():
+        settings.append("action_range = (-1.0, 1.0)  # scaled to the controls' ranges; without it: the controls")
+    if "home" in elements.get("keyframes", []):
+        settings.append('keyframe = "home"  # where episodes start')
+    step = substeps(model) * model.opt.timestep
+    horizon = max(1, round(_EPISODE / step))
+    return _filled(
+        "plain",
+        model,
+        element=f"{kind}({literal(example)})",
+        element_field=field,
+        names="".join(f"#   {line}\n" for line in lists),
+        fields=_indented(fields),
+        observe=_indented(observe),
+        parts=", ".join(f'"{name}": {size}' for name, size in parts.items()),
+        settings=_added(settings),
+        horizon=horizon,
+        seconds=f"{horizon * step:.3g}",
+        **names,
+    )
 
 
-@lw.register
-class {class_name}(lw.Task):
-{settings}
-'''
+def velocity_text(legs: Legs, **names: str) -> str:
+    """Write a task file for a walking robot.
+
+    Args:
+        legs: The robot.
+        **names: ``file``, ``class_name``, and ``source``, which is the model as a Python expression.
+    """
+    is_biped = len(legs.feet) == 2
+    fastest = round(0.4 * float(np.sqrt(9.81 * legs.height)), 1)
+    swing = max(foot.height for foot in legs.feet) - legs.ground + float(np.clip(0.1 * legs.height, 0.03, 0.1))
+    feet = [f"FEET = [{', '.join(literal(foot.site) for foot in legs.feet)}]"]
+    edits = ["walkers.prepare_walker(spec, FEET)"]
+    if legs.has_motors:
+        edits.insert(0, "walkers.use_servos(spec, JOINTS)")
+    if new := [foot for foot in legs.feet if foot.element]:
+        feet += ["NEW_SITES = {  # a body, or a joint or geom in it, and a position there"]
+        feet += [f"    {literal(foot.site)}: ({literal(foot.element)}, {foot.position})," for foot in new]
+        feet += ["}"]
+        edits.insert(0, "walkers.add_feet(spec, NEW_SITES)")
+    params = []
+    if is_biped:
+        params.append(f"least_height: float = {0.45 * legs.height:.2f}  # of the base; an episode ends below it")
+    if not legs.has_home:
+        params.append(f"start_height: float = {legs.height:.3f}")
+        params.append(_list("default_pose: wp.array[float]", [f"{angle:.4g}" for angle in legs.pose], 4))
+    return _filled(
+        "velocity",
+        legs.model,
+        training=TRAINING,
+        feet="\n".join(feet),
+        joints=_list("JOINTS", list(map(literal, legs.joints))),
+        family="Biped" if is_biped else "Velocity",
+        params_family="BipedParams" if is_biped else "Params",
+        njoint=len(legs.joints),
+        swing_target=f"{swing:.3g}",
+        fastest=f"{fastest:g}",
+        lateral=f"{fastest / 2:g}",
+        params=_added(params),
+        keyframe='"home"' if legs.has_home else None,
+        edits=_indented(edits, 8),
+        **names,
+    )
+
+
+def _filled(template: str, model: mujoco.MjModel, **values: object) -> str:
+    text = Path(__file__).with_name("templates").joinpath(f"{template}.txt").read_text("utf-8")
+    substep = f"{1000 * model.opt.timestep:g}"
+    return string.Template(text).substitute(values, frame_skip=substeps(model), substep_ms=substep)
+
+
+def _sensor_ranges(model: mujoco.MjModel) -> list[list[int]]:
+    """Return the ranges of ``sensordata`` that measure the state."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_SENSOR:
+        return []
+    is_observed = np.repeat(~np.isin(model.sensor_type, _UNOBSERVED), model.sensor_dim)
+    edges = np.flatnonzero(np.diff(is_observed, prepend=False, append=False))
+    ranges: list[list[int]] = edges.reshape(-1, 2).tolist()
+    return ranges
+
+
+def _elements(model: mujoco.MjModel) -> dict[str, list[str]]:
+    """Return the printable names of the model's elements by their kinds."""
+    mocap = np.flatnonzero(model.body_mocapid >= 0)
+    elements = {
+        "bodies": map(model.body, range(1, model.nbody)),
+        "joints": map(model.joint, range(model.njnt)),
+        "sites": map(model.site, range(model.nsite)),
+        "sensors": map(model.sensor, range(model.nsensor)),
+        "actuators": map(model.actuator, range(model.nactuator)),
+        "keyframes": map(model.key, range(model.nkey)),
+        "mocap bodies": map(model.body, mocap),
+    }
+    names = {
+        kind: [one.name for one in group if one.name.isprintable() and one.name] for kind, group in elements.items()
+    }
+    return {kind: group for kind, group in names.items() if group}
+
+
+def _list(name: str, literals: Sequence[str], indent: int = 0) -> str:
+    """Write the assignment of a list, in several lines if necessary."""
+    text = ", ".join(literals)
+    if indent + len(f"{name} = [{text}]") <= 120:
+        return f"{name} = [{text}]"
+    margin = (indent + 4) * " "
+    lines = textwrap.fill(f"{text},", 120, initial_indent=margin, subsequent_indent=margin, break_long_words=False)
+    return f"{name} = [\n{lines}\n{indent * ' '}]  # fmt: skip"
+
+
+def _indented(lines: Sequence[str], indent: int = 4) -> str:
+    return textwrap.indent("\n".join(lines), indent * " ")
+
+
+def _added(lines: Sequence[str]) -> str:
+    """Write lines that follow another line of a class."""
+    return "".join(f"\n    {line}" for line in lines)

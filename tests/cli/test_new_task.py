@@ -14,7 +14,6 @@ from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.testing import CHECKS, check_task, episode_rules as episodes, index_rules as indices
 
-ROOT = Path(__file__).parent.parent.parent
 RICH = text(
     ARM
     + BALL.format(z=0.1)
@@ -61,8 +60,8 @@ def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
     state = [env.field(name)[0].float() for name in ("qpos", "qvel", "act")]
     # gyro (3 numbers), clock, touch sensor, user sensor (2 numbers)
     measured = env.field("sensordata")[0]
-    wanted = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
-    assert env.obs[0].tolist() == pytest.approx(wanted)
+    expected = [*(value for field in state for value in field.tolist()), *measured[:3].tolist(), measured[4].item()]
+    assert env.obs[0].tolist() == pytest.approx(expected)
     assert env.obs[0, 13:24].abs().max() > 0  # worlds start with different velocities
     env.step()
     assert env.reward.tolist() == [0.0, 0.0]
@@ -72,21 +71,21 @@ def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
 def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
-    found = dict(task.obs_layouts["policy"])
-    assert found.pop("sensors", 0) <= task.model.nsensordata
-    assert all(sizes[part] == size for part, size in found.items())
+    layout = dict(task.obs_layouts["policy"])
+    assert layout.pop("sensors", 0) <= task.model.nsensordata
+    assert all(sizes[part] == size for part, size in layout.items())
     assert task.timestep == pytest.approx(0.02)
 
 
 def package_models() -> list[Path]:
     """Return the model files of gymnasium, dm_control and MuJoCo Warp that contain actuators."""
     folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
-    found: list[Path] = []
+    files: list[Path] = []
     for package, within in folders.items():
         spec = importlib.util.find_spec(package)
         if spec is not None and spec.submodule_search_locations:
-            found += sorted(Path(spec.submodule_search_locations[0], within).rglob("*.xml"))
-    return [path for path in found if path.parent.name != "common" and "<actuator" in path.read_text()]
+            files += sorted(Path(spec.submodule_search_locations[0], within).rglob("*.xml"))
+    return [path for path in files if path.parent.name != "common" and "<actuator" in path.read_text()]
 
 
 @pytest.mark.long
@@ -126,16 +125,18 @@ def test_new_files_are_formatted(folder: Path) -> None:
 
 
 def test_model_path_is_written_relative_to_the_task_file(folder: Path) -> None:
-    for made in ("models", "tasks"):
-        Path(made).mkdir()
-    model = Path("models", "robot.xml")
-    model.write_text(text(ARM))
-    assert cli.main(["new", "tasks/walk.py", "--model", str(model)]) == 0
-    assert find_task("tasks/walk.py").model == "../models/robot.xml"
-    assert cli.main(["new", "stand", "--model", str(model.absolute())]) == 0
-    assert find_task("stand.py").model == str(model.absolute())
-    for file in ("tasks/walk.py", "stand.py"):
-        assert BoundTask(find_task(file)).model.nu == 1
+    for name in ("models", "tasks"):
+        Path(name).mkdir()
+    model = Path("models", 'my "$robot".xml')
+    xml = text(ARM.replace('name="tip"', 'name="a &quot;tip&quot;"'))
+    model.write_text(xml.replace('<site name="here" pos="0 0 2"/>', ""))
+    for file, argument, source in (
+        ("tasks/walk.py", str(model), '../models/my "$robot".xml'),
+        ("stand.py", str(model.absolute()), str(model.absolute())),
+    ):
+        assert cli.main(["new", file, "--model", argument]) == 0
+        assert find_task(file).model == source and BoundTask(find_task(file)).model.nu == 1
+        assert r'lw.site("a \"tip\"")' in Path(file).read_text()
 
 
 def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
@@ -147,40 +148,25 @@ def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
     monkeypatch.setenv("MENAGERIE_ROOT", "checkout")
     assert cli.main(["new", "leg_walk", "--model", "menagerie:leg/scene.xml"]) == 0
     assert cli.main(["new", "hop", "--model", "gymnasium:hopper.xml"]) == 0
-    assert capsys.readouterr().out.splitlines() == [
-        "leg_walk.py: 4 observations, 1 actions, 20 ms in a step; check and train it with",
-        "  lyceum-warp check leg_walk.py",
-        "  lyceum-warp train leg_walk.py",
-        "hop.py: 12 observations, 3 actions, 20 ms in a step; check and train it with",
-        "  lyceum-warp check hop.py",
-        "  lyceum-warp train hop.py",
-    ]
+    assert "leg_walk.py: 4 observations, 1 actions, 20 ms in a step" in capsys.readouterr().out
     assert find_task("leg_walk.py").model == lw.menagerie_model("leg/scene.xml")
     assert find_task("hop.py").model == lw.gymnasium_model("hopper.xml")
-    monkeypatch.setenv("MENAGERIE_ROOT", "elsewhere")
-    assert cli.main(["new", "other", "--model", "menagerie:leg/scene.xml"]) == 2
-    refused(capsys, "MENAGERIE_ROOT is 'elsewhere'", "is not a folder")
-    assert not Path("other.py").exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("hopper", ["'hopper' is taken by a task of the package"]),
-        ("2walk", ["can't be named '2walk'", "letters, digits and _"]),
-        ("class", ["can't be named 'class'"]),
-        ("true", ["can't be named 'true'"]),
-        ("größe", ["can't be named 'größe'"]),
-        ("MyWalk", ["can't be named 'MyWalk'", "use 'my_walk'"]),
-        ("walk_2", ["can't be named 'walk_2'", "use 'walk2'"]),
-        ("world", ["can't be named 'world'", "defines World"]),
-        ("torch", ["can't be named 'torch'", "hide the Python module"]),
-        ("", ["can't be named '.py'"]),
-        ("old", ["old.py exists"]),
-        ("nowhere/walk", ["no folder nowhere"]),
-        ("/proc/walk", ["can't write /proc/walk.py"]),
-    ],
-)
+@pytest.mark.parametrize(("name", "words"), [
+    ("hopper", ["'hopper'", "choose another"]),
+    ("2walk", ["'2walk'", "letters, digits and _"]),
+    ("class", ["'class'"]),
+    ("true", ["'true'"]),
+    ("größe", ["'größe'"]),
+    ("MyWalk", ["'MyWalk'", "use 'my_walk'"]),
+    ("walk_2", ["'walk_2'", "use 'walk2'"]),
+    ("world", ["'world'", "defines World"]),
+    ("torch", ["'torch'", "hide the Python module"]),
+    ("", ["'.py'"]),
+    ("old", ["old.py exists"]),
+    ("nowhere/walk", ["nowhere/walk.py"]),
+])  # fmt: skip
 def test_an_invalid_name_raises_a_one_line_error(
     name: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,25 +178,20 @@ def test_an_invalid_name_raises_a_one_line_error(
     assert Path("old.py").read_text() == "mine"
 
 
-@pytest.mark.parametrize(
-    ("model", "words"),
-    [
-        ("absent.xml", ["there is no model file 'absent.xml'"]),
-        ("folder", ["there is no model file 'folder'"]),
-        ("gymnasium:hoper.xml", ["no model file 'hoper.xml'", "hopper.xml"]),
-        ("broken.xml", ["can't read the model", "broken.xml"]),
-        ("meshless.xml", ["meshless.xml: MuJoCo refuses the model", "absent.stl"]),
-        ("still.xml", ["still.xml has no actuators, so actions would have no effect"]),
-        ("stuck.xml", ["stuck.xml has no joints"]),
-    ],
-)
+@pytest.mark.parametrize(("model", "words"), [
+    ("absent.xml", ["absent.xml"]),
+    ("gymnasium:hoper.xml", ["'hoper.xml'", "hopper.xml"]),
+    ("broken.xml", ["broken.xml"]),
+    ("meshless.xml", ["meshless.xml", "absent.stl"]),
+    ("still.xml", ["still.xml", "no actuators"]),
+    ("stuck.xml", ["stuck.xml", "no joints"]),
+])  # fmt: skip
 def test_an_invalid_model_raises_a_one_line_error(
     model: str, words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mesh = (
         '<asset><mesh name="absent" file="absent.stl"/></asset><worldbody><geom type="mesh" mesh="absent"/></worldbody>'
     )
-    Path("folder").mkdir()
     Path("broken.xml").write_text("<mujoco>")
     Path("meshless.xml").write_text(f"<mujoco>{mesh}</mujoco>")
     Path("still.xml").write_text(text(ARM, ""))
@@ -218,11 +199,3 @@ def test_an_invalid_model_raises_a_one_line_error(
     assert cli.main(["new", "walk", "--model", model]) == 2
     refused(capsys, *words)
     assert not Path("walk.py").exists()
-
-
-def test_model_names_with_special_characters_are_quoted(folder: Path) -> None:
-    xml = text(ARM.replace('name="tip"', 'name="a &quot;tip&quot;"'), actuated('<motor joint="hinge"/>'))
-    Path('my "{robot}".xml').write_text(xml.replace('<site name="here" pos="0 0 2"/>', ""))
-    assert cli.main(["new", "walk", "--model", 'my "{robot}".xml']) == 0
-    assert find_task("walk.py").model == 'my "{robot}".xml'
-    assert r'lw.site("a \"tip\"")' in Path("walk.py").read_text()
