@@ -1,16 +1,13 @@
 """Run programs in bench/: lyceum-warp bench."""
 
-import contextlib
 import dataclasses
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.suggestions import did_you_mean
 
 FOLDER = Path(__file__).resolve().parents[2] / "bench"
@@ -31,23 +28,14 @@ class Bench:
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")] = "overview"
     """The name of a program in bench/, without .py."""
 
-    def run(self, *arguments: str) -> int:
+    def run(self, *arguments: str) -> None:
         if not (FOLDER / "experiment.py").exists():
             raise FileNotFoundError(f"the experiments need a checkout of the repository, and {FOLDER} does not exist")
         programs = [path.stem for path in sorted(FOLDER.glob("*.py")) if "__main__" in path.read_text()]
         if self.name not in programs:
             hint = did_you_mean(self.name, programs, "lyceum-warp bench lists the experiments")
             raise ValueError(f"there is no program {self.name!r} in bench/: {hint}")
-        # the subprocess must import the package from this checkout, not an installed one
+        # the program must import the package from this checkout, not an installed one
         path = os.pathsep.join([str(FOLDER.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
-        command = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
-        child = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path})
-        try:
-            code = child.wait()
-        except Interrupted:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(3.0)  # in a terminal, Ctrl-C also reaches the subprocess
-            child.terminate()
-            child.wait()
-            raise
-        return code if code >= 0 else 128 - code
+        program = [sys.executable, str(FOLDER / f"{self.name}.py"), *arguments]
+        os.execve(sys.executable, program, os.environ | {"PYTHONPATH": path})

@@ -1,24 +1,25 @@
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from training_runs import refused
 
-from lyceum_warp.cli import main
+from lyceum_warp import cli
 
 
 @pytest.mark.long
-def test_bench_forwards_options_and_returns_the_exit_code_of_the_program(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "plot", "no_experiment"]) == 2
-    assert capfd.readouterr().err.startswith("plot: there is no experiment 'no_experiment': ")
+def test_bench_forwards_options_and_returns_the_exit_code_of_the_program() -> None:
+    command = [sys.executable, "-m", "lyceum_warp.cli", "bench", "plot", "no_experiment"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and "'no_experiment'" in done.stderr
 
 
-def test_bench_refuses_unknown_programs(capfd: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "throughputs"]) == 2
-    assert "there is no program 'throughputs' in bench/: did you mean throughput?" in capfd.readouterr().err
-
-
-def test_bench_without_a_checkout_prints_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+def test_bench_refuses_unknown_programs_and_needs_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    assert cli.main(["bench", "throughputs"]) == 2
+    refused(capsys, "'throughputs'", "throughput?")
     monkeypatch.setattr("lyceum_warp.cli.bench.FOLDER", tmp_path / "bench")
-    assert main(["bench"]) == 2
-    assert "the experiments need a checkout of the repository" in capfd.readouterr().err
+    assert cli.main(["bench"]) == 2
+    refused(capsys, str(tmp_path / "bench"))
