@@ -6,6 +6,7 @@ import os
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 import tyro
@@ -55,49 +56,44 @@ TaskWord = Annotated[
 class OptionFlags:
     """Base class for groups of flags. Each field of the ``options`` dataclasses becomes a flag.
 
-    The field's docstring becomes the flag's help text. If a flag needs another type, default or help text than its
-    field, the subclass declares this flag. Values are validated later, because the parser would print errors in a
-    multi-line box.
+    The field's docstring becomes the flag's help text. If a flag needs another type or help text than its field, the
+    subclass declares this flag. Flags default to None or (). Values are validated later, because the parser would print
+    errors in a multi-line box.
 
     Args:
         options: The dataclasses. If several have the same field, the first one is used.
         omit: Names of fields without a flag.
-        default: The text that the help shows as the default value. A string applies to all flags; a mapping contains
-            a string for each field. The flags themselves default to None.
+        defaults: The texts that the help shows as default values, by the names of the flags.
     """
 
     def __init_subclass__(
-        cls, *, options: Sequence[type] = (), omit: Collection[str] = (), default: str | Mapping[str, str] | None = None
+        cls, *, options: Sequence[type], omit: Collection[str] = (), defaults: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        if not options:  # this subclass only omits flags from the help
-            return
-        own = dict(vars(cls).get("__annotations__", {}))
-        flags: dict[str, Any] = {}
+        own: dict[str, Any] = vars(cls).get("__annotations__", {})
+        types: dict[str, Any] = {}
+        docs = attribute_docs(cls)
         for kind in options:
-            hints, docs = typing.get_type_hints(kind), attribute_docs(kind) | attribute_docs(cls)
-            for field in dataclasses.fields(kind):
-                name = field.name
-                if name in omit or name in flags:
-                    continue
-                if name not in vars(cls):
-                    setattr(cls, name, field.default if default is None else None)
-                value = getattr(cls, name)
-                flag = own.pop(name, None) or hints[name]
-                if value is None and flag is hints[name]:  # the user may omit the flag, but cannot pass None
-                    flag = Annotated[flag | None, tyro.conf.DisallowNone]
-                text = default[name] if isinstance(default, Mapping) else default or ""
-                help_text, hint = " ".join(docs.get(name, "").split()), text if value is None else None
-                flags[name] = Annotated[flag, tyro.conf.arg(help=help_text, help_behavior_hint=hint)]
-        cls.__annotations__ = flags | own
+            types |= {name: hint for name, hint in typing.get_type_hints(kind).items() if name not in types}
+            docs = attribute_docs(kind) | docs
+        cls.__annotations__ = {}
+        for name, hint in (types | own).items():
+            if name in omit:
+                continue
+            default = vars(cls).get(name)
+            setattr(cls, name, default)
+            flag = hint if name in own else hint | None
+            shown = defaults.get(name, "") if default is None else None
+            text = tyro.conf.arg(help=" ".join(docs.get(name, "").split()), help_behavior_hint=shown)
+            cls.__annotations__[name] = Annotated[flag, text]
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
 
 def given(flags: Any) -> dict[str, Any]:
     """Return the values that differ from the defaults, by the names of their flags."""
-    found = given_values(flags)
-    if "solver" in found:
-        found["solver"] = dict(map(parameter, found["solver"]))
-    return found
+    values = given_values(flags)
+    if "solver" in values:
+        values["solver"] = dict(map(parameter, values["solver"]))
+    return values
 
 
 NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
@@ -111,26 +107,21 @@ options can be set only in Python.
 class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     """Where the worlds run."""
 
-    engine: str = "auto"
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
-    device: str = "cpu"
-    """cpu, or a CUDA device such as cuda:0."""
+    engine: str | None = None
+    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
+    device: str | None = None
+    """cpu (the default), or a CUDA device such as cuda:0. The commands eval and view use the CPU by default if a run's
+    engine is auto, because the CPU is faster for a few worlds."""
 
 
-class EnvFlags(OptionFlags, options=[EnvOptions], omit=NO_FLAGS, default=""):
+class EnvFlags(Placement, options=[EnvOptions], omit=(*NO_FLAGS, "engine", "device", "nthread")):
     """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto (the default): warp on a CUDA device and mujoco on the CPU."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu (the default), or a CUDA device such as cuda:0. If the run's engine is auto, the default is the CPU,
-    which is faster than a GPU for a few worlds."""
 
-
-class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
+class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"]):
     """Physics options of the worlds. The defaults come from the run, the task or its model."""
 
-    physics: Annotated[str | None, tyro.conf.arg(metavar="NAME", help_behavior_hint="")] = None
+    physics: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     """The name of a set of physics options that the task defines (see lyceum-warp tasks), or exact for the task's
     default physics. A flag for a single option, such as --integrator, overrides this option of the set.
     """
@@ -139,25 +130,13 @@ class Physics(OptionFlags, options=[PhysicsOptions], omit=["base"], default=""):
     The default limits come from the model."""
 
 
-def parameters(texts: Iterable[str], command: Any, *, instead: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Parse a task's parameters. Each text has the form NAME=VALUE.
-
-    If NAME is an option, the error names its flag. ``instead`` maps an option to its flag if their names differ.
-    """
-    found: dict[str, Any] = {}
-    for text in texts:
-        name = text.partition("=")[0].strip()
-        if name in OPTIONS:
-            flags = {flag: f"--{flag.replace('_', '-')}" for flag in _flag_names(command)} | dict(instead or {})
-            way = f"use {flags[name]}" if name in flags else "this command has no flag for it"
-            raise ValueError(f"{name} is an option, not a parameter of the task: {way}")
-        found.update([parameter(text)])
-    return found
-
-
-def _flag_names(command: Any) -> list[str]:
-    nested = ([name] if not dataclasses.is_dataclass(v) else _flag_names(v) for name, v in vars(command).items())
-    return [name for names in nested for name in names]
+def parameters(texts: Iterable[str]) -> dict[str, Any]:
+    """Parse a task's parameters. Each text has the form NAME=VALUE."""
+    values = dict(map(parameter, texts))
+    if options := values.keys() & set(OPTIONS):
+        name = min(options)
+        raise ValueError(f"{name} is an option, not a parameter of the task: --help-all describes the options' flags")
+    return values
 
 
 def parameter(text: str) -> tuple[str, Any]:

@@ -36,23 +36,24 @@ class Check:
     """The name of a rule to check, as the report prints it. The flag may be repeated. By default, all rules are
     checked."""
     param: ParamWords = ()
-    env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
-        default_factory=Placement
-    )
-    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
+    env: Annotated[Placement, tyro.conf.arg(name="world")] = Placement()
+    physics_options: Annotated[Physics, tyro.conf.arg(name="physics")] = Physics()
 
     def run(self) -> int:
-        words = vars(self.env) | given(self.physics) | parameters(self.param, self)
-        known = {check.__name__.removeprefix("check_"): check for check in CHECKS}
+        rules = {check.__name__.removeprefix("check_"): check for check in CHECKS}
         for rule in self.rule:
-            if rule not in known:
-                hint = did_you_mean(rule, known, f"there are {', '.join(known)}")
+            if rule not in rules:
+                hint = did_you_mean(rule, rules, f"there are {', '.join(rules)}")
                 raise ValueError(f"there is no rule {rule!r}: {hint}")
-        checks = [known[rule] for rule in self.rule] or CHECKS
+        checks = [rules[rule] for rule in self.rule] or CHECKS
+        kwargs = given(self.env) | given(self.physics_options) | parameters(self.param)
         try:
-            report = check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **words)
+            say(
+                str(
+                    check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **kwargs)
+                )
+            )
         except AssertionError as error:
             say(str(error))
             return 1
-        say(str(report))
         return 0

@@ -9,7 +9,6 @@ from typing import Any
 import rich.box
 from rich.console import Console
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -116,7 +115,7 @@ def counted(number: int, what: str) -> str:
 
 
 _COLUMNS = [
-    ("iter", "iteration", "d"), ("samples", "samples", ",d"), ("reward\na step", "reward_mean", ".3g"),
+    ("iter", "iteration", ".0f"), ("samples", "samples", ",.0f"), ("reward\na step", "reward_mean", ".3g"),
     ("return", "return_mean", ".1f"), ("std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
     ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
@@ -124,67 +123,51 @@ _COLUMNS = [
 """Columns of the table: heading, name in metrics.csv, and format."""
 
 
-def fitting_table(console: Console, columns: Mapping[str, Sequence[str]], *, omit: Sequence[str] = ()) -> Table:
-    """Make a table that fits the console's width, from a mapping of headings to columns.
-
-    The first column's text wraps; all others contain numbers. If necessary, columns in ``omit`` are left out, in this
-    order.
-    """
-    table = Table()
-    for count in range(len(omit) + 1):
-        table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)
-        for i, (heading, cells) in enumerate(columns.items()):
-            if heading in omit[:count]:
-                continue
-            width = max(map(len, [*cells, *heading.split()]))
-            words: dict[str, Any] = {"min_width": width} if i else {"overflow": "fold"}
-            table.add_column(escape(heading), justify="right" if i or cells[0].isdecimal() else "left", **words)
-        for row in zip(*(cells for heading, cells in columns.items() if heading not in omit[:count]), strict=True):
-            table.add_row(*map(escape, row))
-        if Measurement.get(console, console.options.update_width(10_000), table).minimum <= console.width:
-            break
+def table(columns: Mapping[str, Sequence[str]]) -> Table:
+    """Make a table from a mapping of headings to columns. If the table is too wide for the console, cells wrap."""
+    table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)
+    for i, (heading, cells) in enumerate(columns.items()):
+        table.add_column(escape(heading), justify="right" if i or cells[0].isdecimal() else "left", overflow="fold")
+    for row in zip(*columns.values(), strict=True):
+        table.add_row(*map(escape, row))
     return table
 
 
-def curve_table(rows: list[dict[str, float | None]], console: Console) -> Table:
+def curve_table(rows: Sequence[Mapping[str, float | None]]) -> Table:
     """Make a table of at most 15 iterations of a run, without empty columns.
 
-    Columns that do not fit the console are omitted. Iterations that did not evaluate the mean policy are omitted if
-    enough others remain.
+    Iterations that did not evaluate the mean policy are omitted if enough others remain.
     """
     known = [_known(row) for row in rows]
-    between = [row for row in known[1:-1] if "mean_return" in row]
-    shown = [known[0], *between, known[-1]] if len(between) >= 4 else known
+    evaluated = [row for row in known[1:-1] if "mean_return" in row]
+    shown = [known[0], *evaluated, known[-1]] if len(evaluated) >= 4 else known
     if len(shown) > _TABLE_ROWS:
         shown = [shown[round(i * (len(shown) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
     columns = {}
     for heading, name, form in _COLUMNS:
-        cells = []
-        for row in shown:
-            value = row.get(name, 0.0)
-            cells.append(format(int(value) if form.endswith("d") else value, form) if name in row else "")
+        cells = [format(row[name], form) if name in row else "" for row in shown]
         if name == "reward_mean" and all("return_mean" in row for row in known):
             continue  # show rewards only if an iteration has no return
         if any(cells):
             columns[heading] = cells
-    table = fitting_table(console, columns, omit=("samples", "std", "KL", "samples/s", "length", "eval", "success"))
-    sums = {what: round(sum(row.get(column) or 0.0 for row in rows)) for column, what in _COUNTED.items()}
+    curve = table(columns)
+    sums = {what: round(sum(row.get(column, 0.0) for row in known)) for column, what in _COUNTED.items()}
     if bad := [counted(number, what) for what, number in sums.items() if number]:
-        table.caption = f"{' and '.join(bad)} in all {len(rows)} iterations"
-    return table
+        curve.caption = f"{' and '.join(bad)} in all {len(rows)} iterations"
+    return curve
 
 
 def _known(row: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in row.items() if value is not None and not math.isnan(value)}
 
 
-def tried(make: Callable[..., object], *args: Any, **words: Any) -> str:
+def tried(make: Callable[..., object], *args: Any, **kwargs: Any) -> str:
     """Call a function that writes a file, and return the path. If the function fails, return "none" and the reason.
 
     Plots and videos are made from saved results, so the command succeeds even if one of them fails.
     """
     try:
-        return str(make(*args, **words))
+        return str(make(*args, **kwargs))
     except Exception as error:
         return f"none: {one_line(error)}"
 
@@ -199,10 +182,10 @@ class PlanDisplay(Progress):
     action.
     """
 
-    def __init__(
-        self, console: Console, episode: int, episodes: int, steps: int, timestep: float, *, real_time: bool = False
-    ) -> None:
-        self.title, self.timestep, self.real_time = f"episode {episode + 1}/{episodes}", timestep, real_time
+    def __init__(self, console: Console, title: str, steps: int, timestep: float, *, real_time: bool = False) -> None:
+        self.title = title
+        self.timestep = timestep
+        self.real_time = real_time
         super().__init__(
             TextColumn(self.title), BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
             console=console, disable=not console.is_terminal, transient=True,

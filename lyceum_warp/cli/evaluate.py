@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import signal
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,12 +22,11 @@ from lyceum_warp.algos import (
 )
 from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameter, parameters
-from lyceum_warp.cli.display import console, fitting_table, note, say, tried
+from lyceum_warp.cli.display import console, say, table, tried
 from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import options_for_few_worlds, options_on_cores
 from lyceum_warp.env import Curriculum, Env
-from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training import (
@@ -101,10 +99,8 @@ class Eval:
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes. Each episode is one file, such as episode-000.npz."""
     trust: Trust = False
-    env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
-        default_factory=EnvFlags
-    )
-    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
+    env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
+    physics: Physics = Physics()
 
     def run(self) -> None:
         whole_number("episodes", self.episodes, low=1)
@@ -119,8 +115,8 @@ class Eval:
             Run.check_free(self.episodes_to)
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
-        words, params = given(self.env) | given(self.physics), parameters(self.param, self)
-        env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
+        options = given(self.env) | given(self.physics)
+        env = run_worlds(run, options, parameters(self.param), nworld=nworld, task=self.task, trust=self.trust)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -131,27 +127,20 @@ class Eval:
         curricula, origin_of_memory = self._curricula(run, which, env)
         if len(curricula) > 1 and (self.transfer or self.episodes_to):
             raise ValueError("--transfer and --episodes-to play at one level: give --memory one value")
-        try:
-            with LongWork("evaluating the policy", "steps", console) as work:
-                played = [
-                    evaluate(
-                        env, policy, self.episodes, seed=self.seed, curriculum=curriculum, progress=work
-                    ).first(self.episodes)
-                    for curriculum in curricula
-                ]  # fmt: skip
-        except Interrupted as signalled:
-            name = signal.Signals(signalled.number).name
-            note(f"interrupted by {name} before the episodes were complete: there are no statistics")
-            raise
-        where = pretrained_text(run) if self.pretrained else f"in {self.folder}"
+        results = []
+        with LongWork("evaluating the policy", "steps", console) as work:
+            for curriculum in curricula:
+                episodes = evaluate(env, policy, self.episodes, seed=self.seed, curriculum=curriculum, progress=work)
+                results.append(episodes.first(self.episodes))
+        folder = pretrained_text(run) if self.pretrained else f"in {self.folder}"
         policy_text = "the mean policy" if which == "last" else f"the mean policy {which!r}"
-        say(f"{env.task.name}: {self.episodes} episodes of {policy_text} {where}, on the {simulation(env)}")
-        if len(played) > 1:
-            _print_levels(played)
+        say(f"{env.task.name}: {self.episodes} episodes of {policy_text} {folder}, on the {simulation(env)}")
+        if len(results) > 1:
+            _print_levels(results)
         else:
-            if text := played[0].curriculum.text:
+            if text := results[0].curriculum.text:
                 say(f"memory at the start ({origin_of_memory}): {text}")
-            _print_statistics(env, played[0])
+            _print_statistics(env, results[0])
         if self.transfer:
             with LongWork("judging the policy's transfer", "steps", console) as work:
                 verdict = transfer(
@@ -163,34 +152,31 @@ class Eval:
             say(f"episodes: {_save_episodes(env, policy, self, run, which, curricula[0], origin)}")
         if self.video:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
-            video = tried(
-                policy_video, env, policy, path, evaluation_seed(self.seed), curriculum=curricula[0], camera=camera
-            )
-            say(f"video: {video}")
+            seed = evaluation_seed(self.seed)
+            say(f"video: {tried(policy_video, env, policy, path, seed, curriculum=curricula[0], camera=camera)}")
 
     def _curricula(self, run: Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
         """Return the curricula at which to play, one for each value of --memory, and where they come from."""
         if self.memory and self.fresh_memory:
             raise ValueError("--memory sets the memory that --fresh-memory leaves at its start: omit one of them")
-        if self.memory:
-            curricula = [Curriculum()]
-            for name, value in map(parameter, self.memory):
-                values = torch.tensor(value, dtype=torch.float32).reshape(-1)
-                if name in env.shared:
-                    curricula = [dataclasses.replace(one, shared={**one.shared, name: values}) for one in curricula]
-                    continue
-                size = env.lasting[name].shape[1] if name in env.lasting else 1
-                rows = values.reshape(-1, size) if len(values) % size == 0 else values[None]
+        if not self.memory:
+            saved = None if self.fresh_memory or self.task else load_curriculum(run, which=which)
+            if saved is not None:
+                return [saved], "the run's"
+            return [Curriculum(shared={name: memory * 0.0 for name, memory in env.shared.items()})], "new"
+        curricula = [Curriculum()]
+        for name, value in map(parameter, self.memory):
+            values = torch.tensor(value, dtype=torch.float32).reshape(-1)
+            if name in env.shared:
+                curricula = [dataclasses.replace(one, shared={**one.shared, name: values}) for one in curricula]
+            else:
+                rows = values.split(env.lasting[name].shape[1] if name in env.lasting else 1)
                 curricula = [
                     dataclasses.replace(one, lasting={**one.lasting, name: row[None]})
                     for one in curricula
                     for row in rows
                 ]
-            return curricula, "as given"
-        saved = None if self.fresh_memory or self.task else load_curriculum(run, which=which)
-        if saved is None:
-            return [Curriculum(shared={name: memory * 0.0 for name, memory in env.shared.items()})], "new"
-        return [saved], "the run's"
+        return curricula, "as given"
 
 
 def better_policy(run: Run, which: str, *, task: str | None = None, trust: bool = False) -> str:
@@ -210,52 +196,53 @@ def better_policy(run: Run, which: str, *, task: str | None = None, trust: bool 
     return choice.which
 
 
-def _print_levels(played: list[Episodes]) -> None:
-    columns: dict[str, list[str]] = {"memory at the start": [episodes.curriculum.text for episodes in played]}
+def _print_levels(results: list[Episodes]) -> None:
+    columns = {"memory at the start": [episodes.curriculum.text for episodes in results]}
     for heading, name in (("return", "returns"), ("length", "lengths"), ("evaluation", "evals"), ("success", "success"),
                           ("terminated", "terminated")):  # fmt: skip
-        columns[heading] = [f"{getattr(episodes, name).mean().item():.4g}" for episodes in played]
-    columns["std of return"] = [f"{episodes.returns.std(correction=0).item():.3g}" for episodes in played]
-    console.print(fitting_table(console, columns))
+        columns[heading] = [f"{getattr(episodes, name).mean().item():.4g}" for episodes in results]
+    columns["std of return"] = [f"{episodes.returns.std(correction=0).item():.3g}" for episodes in results]
+    console.print(table(columns))
 
 
 def _print_statistics(env: Env, episodes: Episodes) -> None:
     # terms, ends and what measure writes add up over an episode; other metrics, such as a level, do not
-    quantities = env.task.task.metrics if env.task.functions["measure"] is None else ()
-    means = {f"{name}, a step": episodes.step_metrics[name] for name in quantities}
-    sums = {name: values for name, values in episodes.metrics.items() if name not in quantities}
+    averaged = env.task.task.metrics if env.task.functions["measure"] is None else ()
     numbers = {
         "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
-        "length": episodes.lengths, **sums, **means,
+        "length": episodes.lengths,
     }  # fmt: skip
-    columns, deviation = {"": list(numbers)}, functools.partial(torch.std, correction=0)
+    numbers |= {name: sums for name, sums in episodes.metrics.items() if name not in averaged}
+    numbers |= {f"{name}, a step": episodes.step_metrics[name] for name in averaged}
+    columns = {"": list(numbers)}
+    deviation = functools.partial(torch.std, correction=0)
     for heading, statistic in (("mean", torch.mean), ("std", deviation), ("min", torch.min), ("max", torch.max)):
         columns[heading] = [f"{statistic(values).item():.6g}" for values in numbers.values()]
-    console.print(fitting_table(console, columns, omit=("std",)))
+    console.print(table(columns))
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
 
 
 def _print_transfer(verdict: Transfer) -> None:
     for comparison in verdict.comparisons:
-        found = comparison.differences
+        differences = comparison.differences
         columns = {
-            "": [one.quantity for one in found],
-            comparison.first: [f"{one.first:.6g}" for one in found],
-            comparison.second: [f"{one.second:.6g}" for one in found],
-            "difference": [f"{one.second - one.first:+.3g}" for one in found],
-            "95 % interval": [f"{one.low:+.3g} to {one.high:+.3g}" for one in found],
-            "margin": [f"{one.margin:.3g}" for one in found],
-            "verdict": [one.verdict for one in found],
+            "": [one.quantity for one in differences],
+            comparison.first: [f"{one.first:.6g}" for one in differences],
+            comparison.second: [f"{one.second:.6g}" for one in differences],
+            "difference": [f"{one.second - one.first:+.3g}" for one in differences],
+            "95 % interval": [f"{one.low:+.3g} to {one.high:+.3g}" for one in differences],
+            "margin": [f"{one.margin:.3g}" for one in differences],
+            "verdict": [one.verdict for one in differences],
         }
         console.print(f"{comparison.second} against {comparison.first}: {comparison.verdict}", soft_wrap=True)
-        console.print(fitting_table(console, columns, omit=("difference", "margin", comparison.first)))
+        console.print(table(columns))
         if any(comparison.faults):
             console.print(f"faults: {comparison.faults[0]} and {comparison.faults[1]}")
 
 
 def run_worlds(
-    run: Run, words: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None, trust: bool
+    run: Run, options: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None, trust: bool
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
@@ -263,14 +250,16 @@ def run_worlds(
     see ``run_env``.
     """
     saved = Configuration.of(run)
-    known, own = saved.options.changed({"seed": 0}), dict(saved.params)
-    if task is not None and task_name(find_task(task)) != run.task_name:
-        known, own = EnvOptions(engine=known.engine, device=known.device, nthread=known.nthread), {}
-    known = known.changed({"nworld": nworld} | words)
-    if "device" not in words:
-        known = known.changed(options_for_few_worlds(known.engine, known.device))
+    defaults = saved.options.changed({"seed": 0})
+    if task is None or task_name(find_task(task)) == run.task_name:
+        params = {**saved.params, **params}
+    else:
+        defaults = EnvOptions(engine=defaults.engine, device=defaults.device, nthread=defaults.nthread)
+    merged = defaults.changed({"nworld": nworld} | options)
+    if "device" not in options:
+        merged = merged.changed(options_for_few_worlds(merged.engine, merged.device))
     try:
-        env = run_env(run, known, own | params, task=task, trust=trust)
+        env = run_env(run, merged, params, task=task, trust=trust)
     except (ValueError, FileNotFoundError) as error:
         run.note_settings(error)
         raise
@@ -284,11 +273,11 @@ def _save_episodes(
 ) -> str:
     """Run the same episodes again, write one file per episode, and return a glob pattern of the files."""
     assert options.episodes_to is not None
-    whose = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
+    controller = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
     with LongWork("running the episodes that are saved", "steps", console) as work:
         episodes = policy_episodes(
             env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
-            curriculum=curriculum, controller=whose, progress=work,
+            curriculum=curriculum, controller=controller, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):
             path = options.episodes_to / f"episode-{number:03d}.npz"
@@ -298,7 +287,8 @@ def _save_episodes(
 
 def _source(env: Env, run: Run) -> dict[str, Any]:
     """Return the ``Trajectory.source`` of saved episodes, with the path of the model's copy if it was used."""
-    made, copy = source(env), run.config.get("kept", {}).get("model")
-    if copy is not None and env.options.model is not None and "model" not in made["options"]:
-        made["options"]["model"] = str((run.task_folder / copy).resolve())
-    return made
+    content = source(env)
+    copy = run.config.get("kept", {}).get("model")
+    if copy is not None and env.options.model is not None and "model" not in content["options"]:
+        content["options"]["model"] = str((run.task_folder / copy).resolve())
+    return content

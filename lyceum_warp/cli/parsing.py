@@ -8,8 +8,8 @@ import re
 import shutil
 import textwrap
 import typing
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any
 
 import tyro
 
@@ -28,7 +28,7 @@ _ERRORS = (
 )
 """Patterns of tyro's errors, each with a message in one line."""
 
-_CONFIG = (tyro.conf.DisallowNone,)  # refuse the word None as an option's value
+_CONFIG = (tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)  # the word None is no value of an option
 
 
 def parse(command: type, prog: str, words: Sequence[str]) -> Any:
@@ -40,18 +40,17 @@ def parse(command: type, prog: str, words: Sequence[str]) -> Any:
         _print_help(command, prog)
     if "--help-all" in words:
         words = ["--help"]
-    options: Any = dict(prog=prog, config=_CONFIG, return_unknown_args=True)
+    options: Any
     with contextlib.redirect_stderr(io.StringIO()) as printed:
         try:
-            found, unknown = tyro.cli(command, args=words, **options)
+            options, unknown = tyro.cli(command, prog=prog, args=words, config=_CONFIG, return_unknown_args=True)
         except SystemExit as error:
             if error.code:
                 raise ValueError(f"{_in_one_line(printed.getvalue())} ({prog} --help)") from None
             raise
     if unknown:
-        flags = [flag for group in _options(command).values() for flag in group]
-        raise ValueError(_unknown(unknown[0], flags, prog))
-    return found
+        raise ValueError(_unknown(unknown[0], [option.flag for option in _options(command)], prog))
+    return options
 
 
 def _in_one_line(box: str) -> str:
@@ -64,63 +63,56 @@ def _in_one_line(box: str) -> str:
     return text
 
 
-def _print_help(command: type, prog: str) -> None:
-    usual = getattr(command, "USUAL", None)
-    shown = command if usual is None else _with_only(command, usual)
-    try:
-        tyro.cli(shown, prog=prog, args=["--help"], config=_CONFIG)
-    finally:
-        if usual is not None:
-            print(f"{prog} --help-all also describes")
-            width = min(shutil.get_terminal_size().columns, 80)
-            for group, flags in _options(command).items():
-                if others := [flag for flag, name in flags.items() if name not in usual]:
-                    text = f"{group}: {' '.join(others)}"
-                    indent: dict[str, Any] = {"initial_indent": "  ", "subsequent_indent": "    "}
-                    print(textwrap.fill(text, width, break_on_hyphens=False, **indent))
-
-
-def _unknown(word: str, options: Sequence[str], prog: str) -> str:
+def _unknown(word: str, flags: Sequence[str], prog: str) -> str:
     flag = word.partition("=")[0].replace("_", "-")
     if not flag.startswith("-"):
         return f"{prog} does not take the argument {word!r}: see {prog} --help"
-    names = {option.strip("-").replace("-", "_"): option for option in options}
+    names = {flag.strip("-").replace("-", "_"): flag for flag in flags}
     close = closest(flag.strip("-").replace("-", "_"), names, 1)
     hint = f"did you mean {names[close[0]]}?" if close else f"{prog} --help-all lists the options"
     return f"{prog} has no option {flag}: {hint}"
 
 
-def _nested(hint: Any) -> Any:
-    """Return the dataclass of a group of options, or None for a single option."""
-    inner = next(iter(typing.get_args(hint)), None)
-    return inner if dataclasses.is_dataclass(inner) else None
+@dataclasses.dataclass(frozen=True)
+class _Option:
+    field: str
+    flag: str
+    group: str
+    hint: Any
 
 
-def _options(command: Any, group: str = "options") -> dict[str, dict[str, str]]:
-    """Return the flags of a command by group, each with the name of its field."""
-    found: dict[str, dict[str, str]] = {group: {}}
+def _options(command: Any, group: str = "") -> Iterator[_Option]:
+    """Iterate over the options of a command, including those in its groups."""
     for name, hint in typing.get_type_hints(command, include_extras=True).items():
-        own = next(filter(None, (getattr(marker, "name", None) for marker in _markers(hint))), name)
-        if (inner := _nested(hint)) is not None:
-            found |= _options(inner, f"{own.replace('_', ' ')} options")
-        elif name in command.__dataclass_fields__ and tyro.conf.Positional not in _markers(hint):
-            found[group]["--" + own.replace("_", "-")] = name
-    return found
+        markers = _markers(hint)
+        kind = typing.get_args(hint)[0] if markers else hint
+        title = next((marker.name for marker in markers if getattr(marker, "name", None)), name)
+        if dataclasses.is_dataclass(kind):
+            yield from _options(kind, f"{title.replace('_', ' ')} ")
+        elif tyro.conf.Positional not in markers:
+            yield _Option(name, f"--{title.replace('_', '-')}", f"{group}options", hint)
+
+
+def _print_help(command: Any, prog: str) -> None:
+    if not hasattr(command, "USUAL"):
+        tyro.cli(command, prog=prog, args=["--help"], config=_CONFIG)
+    usual: Sequence[str] = command.USUAL
+    hints = typing.get_type_hints(command, include_extras=True)
+    hidden = [name for name, hint in hints.items() if name not in usual and tyro.conf.Positional not in _markers(hint)]
+    from_groups = {option.field: option.hint for option in _options(command) if option.field in {*usual} - {*hints}}
+    annotations = {name: Annotated[hints[name], tyro.conf.Suppress] for name in hidden} | from_groups
+    body = {"__doc__": command.__doc__, "__annotations__": annotations, **dict.fromkeys(from_groups)}
+    short: Any = dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
+    try:
+        tyro.cli(short, prog=prog, args=["--help"], config=_CONFIG)
+    finally:
+        print(f"{prog} --help-all also describes")
+        width = min(shutil.get_terminal_size().columns, 80)
+        unusual = [option for option in _options(command) if option.field not in usual]
+        for group, options in itertools.groupby(unusual, lambda option: option.group):
+            text = f"  {group}: {' '.join(option.flag for option in options)}"
+            print(textwrap.fill(text, width, break_on_hyphens=False, subsequent_indent="    "))
 
 
 def _markers(hint: Any) -> tuple[Any, ...]:
     return getattr(hint, "__metadata__", ())
-
-
-def _with_only(command: Any, usual: Sequence[str]) -> type:
-    """Make a subclass whose help shows only the usual options. ``command`` is a command or a group of its options."""
-    own = _options(command)["options"].values()
-    body: dict[str, Any] = {"__annotations__": {}, "__doc__": command.__doc__}
-    for name, hint in typing.get_type_hints(command, include_extras=True).items():
-        if (group := _nested(hint)) is not None:
-            group = _with_only(group, usual)
-            body["__annotations__"][name] = typing.Annotated[group, tyro.conf.OmitArgPrefixes]
-            body[name] = dataclasses.field(default_factory=group)
-        elif name in own and name not in usual:
-            body["__annotations__"][name] = typing.Annotated[hint, tyro.conf.Suppress]
-    return dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))

@@ -49,7 +49,7 @@ from lyceum_warp.training import Run, load_value
 from lyceum_warp.viz import control_plot, find_camera, parsed_camera, write_video
 
 
-class Settings(OptionFlags, options=[MPPIConfig], default="(default: the task's)"):
+class Settings(OptionFlags, options=[MPPIConfig]):
     """Settings of the planner. The defaults come from the task."""
 
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
@@ -106,9 +106,9 @@ class Plan:
     task: TaskWord
     episodes: int = 1
     """Number of episodes."""
-    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    minutes: float | None = None
     """The time limit in minutes, after which no episode begins."""
-    steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    steps: int | None = None
     """Number of steps in an episode; by default the task's horizon."""
     replan_every: int = 1
     """The number of steps from one plan to the next. Steps between two plans apply further actions of the last plan."""
@@ -134,19 +134,19 @@ class Plan:
     camera: CameraWords = ()
     plot: bool = True
     """Whether to plot rewards, planning times and ages of actions."""
-    planner: tyro.conf.OmitArgPrefixes[Placement] = dataclasses.field(default_factory=Placement)
+    planner: Placement = Placement()
     """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
     engine."""
-    mppi: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
-    planner_physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
+    mppi: Settings = Settings()
+    planner_physics: Physics = Physics()
 
     def run(self) -> None:
+        # check all options before the folder is created
         whole_number("episodes", self.episodes, low=1)
+        whole_number("seed", self.seed, low=0)
+        every = whole_number("replan_every", self.replan_every, low=1)
         if self.minutes is not None:
             positive_number("minutes", self.minutes, "minutes")
-        whole_number("seed", self.seed, low=0)
-        whole_number("seed of the last episode", self.seed + self.episodes - 1, low=0)
-        every = whole_number("replan_every", self.replan_every, low=1)
         if self.predict and not self.real_time:
             raise ValueError("without --real-time, the world waits for each plan, so --predict has no effect: omit it")
         if every > 1 and self.real_time:
@@ -154,27 +154,22 @@ class Plan:
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
                 "break: omit one of them"
             )
-        task = task_name(find_task(self.task))
-        if self.value is not None:
-            run = Run.open(self.value)
-            if run.task_name != task:
-                raise ValueError(
-                    f"--value {self.value} is a run of the task {run.task_name!r}, not of {task!r}: use a run of {task}"
-                )
-            if run.config.get("algorithm") == "sac":
-                raise ValueError(
-                    f"--value {self.value} is a run of SAC, whose critics need an action: use a run of NPG or PPO"
-                )
-        out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-        Run.check_free(out)
-        # check all options before the folder is created
         camera = parsed_camera(self.camera)
         if camera is not None and not self.video:
             raise ValueError("--camera has no effect with --no-video: omit one of them")
+        task = task_name(find_task(self.task))
+        if self.value is not None:
+            run = Run.open(self.value)
+            if run.task_name != task or run.config.get("algorithm") == "sac":
+                raise ValueError(
+                    f"--value {self.value} is a run of {run.config['algorithm']} and the task {run.task_name!r}: use a "
+                    f"run of npg or ppo and the task {task!r}"
+                )
+        out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+        Run.check_free(out)
         torch.set_num_threads(1)
-        instead = {"model": "--planner-model"}
-        params = parameters(self.param, self, instead=instead | {"horizon": "--steps"})
-        planner_params = parameters(self.planner_param, self, instead=instead | {"nworld": "--samples"})
+        params = parameters(self.param)
+        planner_params = parameters(self.planner_param)
         plant, make_planner = _worlds(self, params, planner_params)
         find_camera(plant.model, camera)
         choice = _choice(self, plant, make_planner) if self.real_time else None
@@ -188,7 +183,8 @@ class Plan:
             "planner": planner.settings, "planner_params": planner_params,
             "planner_model": self.planner_model and str(Path(os.path.expanduser(self.planner_model)).resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
-            "engine": planner.env.engine.name, "episodes": self.episodes, "steps": self.steps,
+            "engine": planner.env.engine.name, "device": self.planner.device or "cpu",
+            "episodes": self.episodes, "steps": self.steps,
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
         }  # fmt: skip
         run = Run.create(out, config)
@@ -202,26 +198,28 @@ def _worlds(
 
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
-    steps: dict[str, Any] = {} if options.steps is None else {"horizon": whole_number("steps", options.steps, low=1)}
+    steps: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.task
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    words = vars(options.planner) | given(options.planner_physics)
+    planner_options = given(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
-        words["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
+        planner_options["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 
     def make(setting: RealTimeSetting | None) -> MPPI:
-        chosen, physics = config, {}
+        changes: dict[str, Any] = {}
+        physics: dict[str, Any] = {}
         if setting is not None:
             # scale the knots with the horizon, so that the time between knots stays the same
             knots = config.knots and max(1, config.knots * setting.horizon // config.horizon)
-            chosen = config.changed({"samples": setting.samples, "horizon": setting.horizon, "knots": knots})
+            changes = {"samples": setting.samples, "horizon": setting.horizon, "knots": knots}
             if setting.physics not in (None, _suggested_physics(task)):
                 physics = {"physics": setting.physics}
-        return MPPI(task, chosen, value=value, params=params | planner_params, **words | physics)
+        final = config.changed(changes)
+        return MPPI(task, final, value=value, params=params | planner_params, **planner_options | physics)
 
     return plant, make
 
@@ -282,43 +280,45 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
         f"{'real time' if options.real_time else 'the world waits'}; files in {escape(str(run.folder))}",
         soft_wrap=True,
     )  # fmt: skip
-    done: list[Trajectory] = []
+    complete: list[Trajectory] = []
     aborted: list[Trajectory] = []
     method: Any = functools.partial(control, replan_every=options.replan_every)
     if options.real_time:
         method = functools.partial(control_async, predict=options.predict)
-    shown: dict[str, Any] = dict(steps=plant.horizon, timestep=plant.timestep, real_time=options.real_time)
     end = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
-            if done and time.monotonic() >= end:
+            if complete and time.monotonic() >= end:
                 limit = f"the limit is {options.minutes:g} minutes"
-                say(f"stopped after {len(done)} of {options.episodes} episodes: {limit}")
+                say(f"stopped after {len(complete)} of {options.episodes} episodes: {limit}")
                 break
-            with PlanDisplay(console, episode, options.episodes, **shown) as display:
+            title = f"episode {episode + 1}/{options.episodes}"
+            with PlanDisplay(console, title, plant.horizon, plant.timestep, real_time=options.real_time) as display:
                 seed = options.seed + episode
                 trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
-            done.append(trajectory)
+            complete.append(trajectory)
             display.done(trajectory)
-            report = _save(run, done, options)
+            report = _save(run, complete, options)
     except BaseException as error:  # ignore further signals until the files are written
-        if done:
-            _save(run, done, options)
+        if complete:
+            _save(run, complete, options)
         for part in aborted:
-            part.save(_file(run, len(done)))
+            part.save(_file(run, len(complete)))
         if isinstance(error, Interrupted):
-            whole, rest = counted(len(done), "episode"), counted(sum(part.steps for part in aborted), "step")
-            say(f"interrupted by {signal.Signals(error.number).name} after {whole} and {rest}; files in {run.folder}")
+            episodes = counted(len(complete), "episode")
+            steps = counted(sum(part.steps for part in aborted), "step")
+            name = signal.Signals(error.number).name
+            say(f"interrupted by {name} after {episodes} and {steps}; files in {run.folder}")
         raise
     for label, text in report.rows():
         if label != "success" or plant.task.functions["success"] is not None:
             say(f"  {label:<30}{text}")
     paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
     if options.plot:
-        paths["plot"] = tried(control_plot, done, run.folder / "plan.png")
+        paths["plot"] = tried(control_plot, complete, run.folder / "plan.png")
     if options.video:
         camera = parsed_camera(options.camera)
-        paths["video"] = tried(write_video, plant, done[0].states, run.folder / "video.mp4", camera=camera)
+        paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
     for name, path in paths.items():
         say(f"{name + ':':<12}{path}")
 
@@ -327,9 +327,9 @@ def _file(run: Run, episode: int) -> Path:
     return run.folder / f"episode-{episode:03d}.npz"
 
 
-def _save(run: Run, done: list[Trajectory], options: Plan) -> ControlReport:
-    done[-1].save(_file(run, len(done) - 1))
+def _save(run: Run, episodes: list[Trajectory], options: Plan) -> ControlReport:
+    episodes[-1].save(_file(run, len(episodes) - 1))
     # the deadline of a plan is the time from one plan to the next
-    report = control_report(done, rate=1 / (options.replan_every * done[0].period))
+    report = control_report(episodes, rate=1 / (options.replan_every * episodes[0].period))
     report.write(run.folder / "report.json")
     return report

@@ -49,35 +49,36 @@ _KEPT = {
     "out": "--out",
 }  # fmt: skip
 
-_DEFAULTS: dict[str, list[str]] = {}
-for _algorithm, (_, _config) in ALGORITHMS.items():
-    for _name in _config.__dataclass_fields__:
-        _value = getattr(_config, _name)
-        _words = " ".join(map(str, _value)) if isinstance(_value, tuple) else "" if _value is None else str(_value)
-        _DEFAULTS.setdefault(_name, []).append(f"{_algorithm} {_words}".strip())
+
+def _default_texts() -> dict[str, str]:
+    """List the algorithms that have a hyperparameter, with their defaults."""
+    texts: dict[str, list[str]] = {}
+    for algorithm, (_, config) in ALGORITHMS.items():
+        for field in dataclasses.fields(config):
+            default = getattr(config, field.name)
+            shown = " ".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else default
+            texts.setdefault(field.name, []).append(f"{algorithm} {shown}".strip())
+    return {name: f"({', '.join(each)})" for name, each in texts.items()}
 
 
-class Hyperparameters(
-    OptionFlags,
-    options=[config for _, config in ALGORITHMS.values()],
-    default={name: f"({', '.join(words)})" for name, words in _DEFAULTS.items()},
-):
+class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.values()], defaults=_default_texts()):
     """Hyperparameters. For each flag, the help lists the algorithms that have the flag, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""
         if algorithm not in ALGORITHMS:
             raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
-        values, (_, kind) = given(self), ALGORITHMS[algorithm]
-        for name in values.keys() - kind.__dataclass_fields__.keys():
-            fitting = " or ".join(
-                other for other, (_, config) in ALGORITHMS.items() if name in config.__dataclass_fields__
-            )
-            raise ValueError(
-                f"--{name.replace('_', '-')} is a setting of {fitting}, not of {algorithm}: omit it, or give "
-                f"--algorithm {fitting}"
-            )
-        return kind(**values) if config is None else dataclasses.replace(config, **values)
+        flags = given(self)
+        owners = {
+            name: [key for key, (_, kind) in ALGORITHMS.items() if name in kind.__dataclass_fields__] for name in flags
+        }
+        for name, algorithms in owners.items():
+            if algorithm not in algorithms:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} is a setting of {' or '.join(algorithms)}, not of {algorithm}: "
+                    f"omit it, or give --algorithm {' or '.join(algorithms)}"
+                )
+        return dataclasses.replace(config or ALGORITHMS[algorithm][1](), **flags)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ class Train:
     """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). The default is the
     algorithm that the task suggests: ppo for walking robots, npg for others.
     """
-    iterations: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
     suggests, or 100.
     """
@@ -129,11 +130,11 @@ class Train:
     """
     which: str = "last"
     """The policy to start from with --from: last, best, or the number of a saved iteration."""
-    target_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    target_return: float | None = None
     """End the run once the return of the mean policy reaches this number. With --mean-every 0, the return of the
     sampled episodes is used instead.
     """
-    minutes: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    minutes: float | None = None
     """Time limit in minutes. Training ends before an iteration that would probably exceed the limit, judged by the
     longest iteration so far. The first iteration always runs. --resume continues the run."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -142,9 +143,9 @@ class Train:
     """Save the policy and the complete state every INT iterations, to resume after a crash. 0 saves every 30 s. If
     a save takes less than 0.3 s, the run saves more often, but spends at most 1 % of the time on saves.
     """
-    tensorboard: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
+    tensorboard: Annotated[bool | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
-    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    nworld: int | None = None
     """Total number of worlds in all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
     samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment of it.
     """
@@ -160,7 +161,7 @@ class Train:
     """Number of iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0
     writes no videos."""
     camera: CameraWords = ()
-    transfer: Annotated[tyro.conf.DisallowNone[bool | None], tyro.conf.arg(help_behavior_hint="")] = None
+    transfer: Annotated[bool | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
     cheap comparisons are made. A policy that was trained on a GPU is tested on the C engine. A policy that was trained
     under other physics is tested under the task's default physics. --transfer adds a test under each set of physics
@@ -172,15 +173,11 @@ class Train:
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
-    require_return: Annotated[float | None, tyro.conf.arg(metavar="FLOAT")] = None
+    require_return: float | None = None
     """Exit with code 1 unless the return of the trained mean policy exceeds this number."""
-    env: Annotated[EnvFlags, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
-        default_factory=EnvFlags
-    )
-    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    hyperparameters: Annotated[Hyperparameters, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="hyperparameter")] = (
-        dataclasses.field(default_factory=Hyperparameters)
-    )
+    env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
+    physics: Physics = Physics()
+    hyperparameters: Annotated[Hyperparameters, tyro.conf.arg(name="hyperparameter")] = Hyperparameters()
 
     def run(self) -> int:
         if self.resume is not None:
@@ -239,34 +236,7 @@ class Train:
 
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
-        words = given(self.env) | given(self.physics)
-        for name, value in (("nworld", self.nworld), ("seed", self.seed)):
-            if value is not None:
-                words[name] = value
-        if source is None:
-            assert self.task is not None
-            suggestion = find_task(self.task).training
-            if self.algorithm not in (None, suggestion.algorithm):
-                suggestion = Training(algorithm=self.algorithm)
-            few = 8 if suggestion.algorithm == "sac" else 64  # SAC makes an update for each step of each world
-            nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
-            options = EnvOptions(nworld=nworld, device="cpu")
-            suggested = None
-            if suggestion.settings:
-                try:
-                    suggested = ALGORITHMS[suggestion.algorithm][1](**suggestion.settings)
-                except (KeyError, TypeError, ValueError) as error:
-                    raise ValueError(f"the task {self.task} has an invalid attribute 'training': {error}") from error
-            base = Configuration(
-                task=self.task, options=options, algorithm=suggestion.algorithm, hyperparameters=suggested,
-                iterations=suggestion.iterations,
-            )  # fmt: skip
-        else:
-            base = Configuration.of(source)
-        solver = base.options.physics.solver
-        if "solver" in words and solver:
-            words["solver"] = {**solver, **words["solver"]}
-        other = source is not None and self.task is not None and task_name(find_task(self.task)) != source.task_name
+        base = self._suggestion(team) if source is None else Configuration.of(source)
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
@@ -274,15 +244,45 @@ class Train:
                 "it in Python by lw.train(..., resume=True), or begin a new run from its policy by --from and "
                 "--algorithm"
             )
-        known = base.hyperparameters if algorithm == base.algorithm else None
+        options = self._given("nworld", "seed") | given(self.env) | given(self.physics)
+        if "solver" in options:
+            options["solver"] = {**(base.options.physics.solver or {}), **options["solver"]}
+        params = parameters(self.param)
+        if source is None or self.task is None or task_name(find_task(self.task)) == source.task_name:
+            params = {**base.params, **params}
+        hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(
-            base, task=self.task or base.task, options=base.options.changed(words), algorithm=algorithm,
-            params={**({} if other else base.params), **parameters(self.param, self)},
-            hyperparameters=self.hyperparameters.on_top_of(known, algorithm),
+            base,
+            **self._given("task", "threads", "iterations"),
+            options=base.options.changed(options),
+            params=params,
+            algorithm=algorithm,
+            hyperparameters=self.hyperparameters.on_top_of(hyperparameters, algorithm),
             seed=base.seed if self.seed is None else None,
-            threads=base.threads if self.threads is None else self.threads,
-            iterations=base.iterations if self.iterations is None else self.iterations,
-        )  # fmt: skip
+        )
+
+    def _suggestion(self, team: Team) -> Configuration:
+        """Return the configuration that the task suggests."""
+        assert self.task is not None
+        training = find_task(self.task).training
+        if self.algorithm not in (None, training.algorithm):
+            training = Training(algorithm=self.algorithm)
+        try:
+            hyperparameters = ALGORITHMS[training.algorithm][1](**training.settings) if training.settings else None
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"the task {self.task} has an invalid attribute 'training': {error}") from error
+        few = 8 if training.algorithm == "sac" else 64  # SAC makes an update for each step of each world
+        nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
+        return Configuration(
+            task=self.task,
+            options=EnvOptions(nworld=nworld, device="cpu"),
+            algorithm=training.algorithm,
+            hyperparameters=hyperparameters,
+            iterations=training.iterations,
+        )
+
+    def _given(self, *names: str) -> dict[str, Any]:
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def _learner(
         self, configuration: Configuration, source: Run | None, team: Team
@@ -318,7 +318,7 @@ class Train:
 
     def _report(self, run: Run, learner: Learner) -> int:
         env = learner.env
-        console.print(curve_table(run.rows(), console))
+        console.print(curve_table(run.rows()))
         with LongWork("evaluating the mean policy", "steps", console) as work:
             choice = choose_policy(run, lambda: evaluation_worlds(env, EPISODES), progress=work)
         score = choice.score

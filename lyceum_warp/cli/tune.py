@@ -1,18 +1,15 @@
 """Find the fastest physics options that do not change a task's returns: lyceum-warp tune."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
 import torch
 import tyro
 
-from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, parameters
-from lyceum_warp.cli.display import console, fitting_table, note, say
+from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, given, parameters
+from lyceum_warp.cli.display import console, note, say, table
 from lyceum_warp.tuning import DIVERGENCE_STEPS, NUDGE, Difference, Tuning, tune
-
-Cell: TypeAlias = Callable[[dict[str, Any]], str]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -43,7 +40,7 @@ class Tune:
     """
     short: bool = False
     """Compare the first 100 steps of episodes, for a few seconds per setting."""
-    episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    episodes: int | None = None
     """Number of episodes for each setting. The default is enough episodes for a narrow confidence interval. These
     episodes take at most a minute (5 s with --short).
     """
@@ -52,7 +49,7 @@ class Tune:
     samples in the same order. --nworld is then the number of samples. The planner plans from three kinds of states:
     standing, moving and fallen. --episodes is the number of states of each kind.
     """
-    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    nworld: int | None = None
     """Number of worlds. By default 256, or 4096 on a GPU. With --planning, the number of samples, by default 64."""
     seed: int = 0
     """Seed of initial states and actions."""
@@ -60,18 +57,17 @@ class Tune:
     """File of the results, by default tune/TASK.jsonl or tune/TASK-planning.jsonl. Settings in the file are not
     measured again."""
     param: ParamWords = ()
-    env: Annotated[Placement, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
-        default_factory=Placement
-    )
+    env: Annotated[Placement, tyro.conf.arg(name="world")] = Placement()
 
     def run(self) -> None:
         torch.set_num_threads(1)
-        words: dict[str, Any] = vars(self.env) | parameters(self.param, self)
+        options = given(self.env)
         if self.nworld is not None:
-            words["nworld"] = self.nworld
+            options["nworld"] = self.nworld
         tuning = tune(
             self.task, run=self.run_folder, which=self.which, tolerance=self.tolerance, short=self.short,
-            episodes=self.episodes, planning=self.planning, out=self.out, seed=self.seed, progress=_progress, **words,
+            episodes=self.episodes, planning=self.planning, out=self.out, seed=self.seed, progress=_progress,
+            **options, **parameters(self.param),
         )  # fmt: skip
         _report(tuning, self)
 
@@ -85,17 +81,13 @@ def _progress(row: dict[str, Any]) -> None:
 
 def _report(tuning: Tuning, options: Tune) -> None:
     reference = tuning.reference
-    who = reference["identity"]
-    say(f"{who['task']}: {who['nworld']} worlds, {who['engine']} engine on {who['device']}")
-    columns = _planning_columns(reference) if options.planning else _columns(reference)
+    identity = reference["identity"]
+    say(f"{identity['task']}: {identity['nworld']} worlds, {identity['engine']} engine on {identity['device']}")
     rows = [*(row for row in tuning.rows if not row["refused"]), reference]
-    cells = {
-        "setting": [row["name"] or "the task as it is" for row in rows],
-        **{heading: list(map(cell, rows)) for heading, cell in columns.items()},
-        "verdict": [row["verdict"] for row in rows],
-    }
-    rest = [heading for heading in columns if heading != "speed"]
-    console.print(fitting_table(console, cells, omit=[name for name in rest if not name.startswith("return")]))
+    columns = {"setting": [row["name"] or "the task as it is" for row in rows]}
+    columns |= _planning_columns(rows, reference) if options.planning else _columns(rows, reference)
+    columns["verdict"] = [row["verdict"] for row in rows]
+    console.print(table(columns))
     if not options.planning:
         nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
         say(
@@ -123,39 +115,31 @@ def _report(tuning: Tuning, options: Tune) -> None:
     say(f"results: {tuning.path}")
 
 
-def _columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    def divergence(i: int) -> Cell:
-        return lambda row: _short(row["divergence"][i] / max(reference["nudged_divergence"][i], 1e-300))
-
-    def interval(name: str, source: str) -> Cell:
-        return lambda row: str(Difference(**row[name][source])) if source in row[name] else ""
-
-    judged = {"returns": "return, %", "clearly_worse": "clearly worse, %"}
-
-    return {
-        "steps/s": lambda row: f"{row['steps_per_second']:,.0f}",
-        "speed": lambda row: f"{row['speedup']:.2f}",
-        "kB/\nworld": lambda row: f"{row['bytes_per_world'] / 1e3:.1f}",
-        "faults/\nmillion": lambda row: f"{row['faults_per_million']:.3g}" if row["returns"] else "",
-        **{f"diverg.\n{steps}": divergence(i) for i, steps in enumerate(DIVERGENCE_STEPS)},
-        **{
-            f"{heading},\n{source}": interval(name, source)
-            for name, heading in judged.items()
-            if name in reference
-            for source in reference[name]
-        },
+def _columns(rows: list[dict[str, Any]], reference: dict[str, Any]) -> dict[str, list[str]]:
+    columns = {
+        "steps/s": [f"{row['steps_per_second']:,.0f}" for row in rows],
+        "speed": [f"{row['speedup']:.2f}" for row in rows],
+        "kB/\nworld": [f"{row['bytes_per_world'] / 1e3:.1f}" for row in rows],
+        "faults/\nmillion": [f"{row['faults_per_million']:.3g}" if row["returns"] else "" for row in rows],
     }
+    for i, steps in enumerate(DIVERGENCE_STEPS):
+        unit = max(reference["nudged_divergence"][i], 1e-300)
+        columns[f"diverg.\n{steps}"] = [_short(row["divergence"][i] / unit) for row in rows]
+    for name, heading in (("returns", "return, %"), ("clearly_worse", "clearly worse, %")):
+        for source in reference.get(name, ()):
+            intervals = [Difference(**row[name][source]) if source in row[name] else "" for row in rows]
+            columns[f"{heading},\n{source}"] = list(map(str, intervals))
+    return columns
 
 
-def _planning_columns(reference: dict[str, Any]) -> dict[str, Cell]:
-    def ranks(kind: str) -> Cell:
-        return lambda row: "{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind])
-
-    return {
-        "plan, ms": lambda row: f"{row['plan_ms']:.1f}",
-        "speed": lambda row: f"{row['speedup']:.2f}",
-        **{f"ranks,\n{kind}": ranks(kind) for kind in reference["ranks"]},
+def _planning_columns(rows: list[dict[str, Any]], reference: dict[str, Any]) -> dict[str, list[str]]:
+    columns = {
+        "plan, ms": [f"{row['plan_ms']:.1f}" for row in rows],
+        "speed": [f"{row['speedup']:.2f}" for row in rows],
     }
+    for kind in reference["ranks"]:
+        columns[f"ranks,\n{kind}"] = ["{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind]) for row in rows]
+    return columns
 
 
 def _short(ratio: float) -> str:

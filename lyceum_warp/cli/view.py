@@ -9,30 +9,15 @@ import tyro
 
 from lyceum_warp.algos import MPPI, check_sizes, task_config
 from lyceum_warp.binding import task_names
-from lyceum_warp.cli.arguments import NO_FLAGS, OptionFlags, ParamWords, Physics, Trust, given, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, Trust, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers import episode_env, load_episodes
-from lyceum_warp.core import EnvOptions
 from lyceum_warp.env import Env, start_episodes
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training import AUTO, Run, load, load_curriculum, pretrained_run, pretrained_text, runs_in
 from lyceum_warp.viewer import Follower, Watcher, view
-
-_RUN_WORLDS = 16
-
-
-class Place(
-    OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon"), default="(default: the run's, or on the cpu)"
-):
-    """Engine and device of the displayed worlds. With --mppi, the planner's worlds use them instead."""
-
-    engine: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """mujoco (the C engine, on CPU cores), warp, or auto: warp on a CUDA device and mujoco on the CPU."""
-    device: Annotated[str | None, tyro.conf.arg(metavar="STR")] = None
-    """cpu, or a CUDA device such as cuda:0. If a run's engine is auto, the default is the CPU."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,7 +54,7 @@ class View:
     the number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
     """The task's name or file, if the task of the run or of the episodes cannot be found."""
-    nworld: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    nworld: int | None = None
     """Number of worlds: by default 16 for a run, and 1 for anything else."""
     seed: int = 0
     """Seed of the initial states."""
@@ -77,19 +62,22 @@ class View:
     """Whether to start paused."""
     host: str = "127.0.0.1"
     """Address on which to serve the page. Other machines cannot reach the default address."""
-    port: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    port: int | None = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
     trust: Trust = False
-    place: Annotated[Place, tyro.conf.OmitArgPrefixes, tyro.conf.arg(name="world")] = dataclasses.field(
-        default_factory=Place
-    )
-    physics: tyro.conf.OmitArgPrefixes[Physics] = dataclasses.field(default_factory=Physics)
-    planner: tyro.conf.OmitArgPrefixes[Settings] = dataclasses.field(default_factory=Settings)
+    place: Annotated[Placement, tyro.conf.arg(name="world")] = Placement()
+    """Engine and device of the displayed worlds. With --mppi, the planner's worlds use them instead."""
+    physics: Physics = Physics()
+    planner: Settings = Settings()
 
     def run(self) -> int:
         """Run the command until the viewer is closed, and return the exit code."""
-        _check(self)
+        if not self.what:
+            raise ValueError("view needs a task, a run, or files of episodes")
+        settings = given(self.planner)
+        if settings and not self.mppi:
+            raise ValueError(f"--{next(iter(settings)).replace('_', '-')} is a setting of the planner: add --mppi")
         if self.pretrained:
             folder = pretrained_run(" ".join(self.what))
             note(pretrained_text(Run.open(folder)))
@@ -101,23 +89,24 @@ class View:
                 raise ValueError(
                     f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: omit the flag"
                 )
-        shown: dict[str, Any] = {name: getattr(self, name) for name in ("paused", "host", "port")}
-        params, words = parameters(self.param, self), given(self.place) | given(self.physics)
+        page: dict[str, Any] = {"paused": self.paused, "host": self.host, "port": self.port}
+        params = parameters(self.param)
         if kind == "episodes":
-            if self.nworld is not None and self.nworld > 1:
-                raise ValueError(f"--nworld {self.nworld} has no effect for episodes: omit it")
-            episodes = load_episodes(self.what)
-            unique = len({file.name for file in episodes}) == len(episodes)
-            named = {file.name if unique else str(file): episode for file, episode in episodes.items()}
-            view(episode_env(episodes, task=self.task, **params), episodes=named, **shown)
+            files = load_episodes(self.what)
+            names = [file.name for file in files]
+            unique = len(set(names)) == len(names)
+            episodes = dict(zip(names if unique else map(str, files), files.values(), strict=True))
+            view(episode_env(files, task=self.task, **params), episodes=episodes, **page)
             return 0
+        options = given(self.place) | given(self.physics)
         controllers: dict[str, Any] = {}
         watchers: list[Watcher] = []
         if kind == "run":
             if self.follow and self.which not in (AUTO, "last"):
                 raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
-            run, nworld = Run.open(self.what[0]), self.nworld or _RUN_WORLDS
-            env = run_worlds(run, words, params, nworld=nworld, task=self.task, trust=self.trust)
+            run = Run.open(self.what[0])
+            nworld = 16 if self.nworld is None else self.nworld
+            env = run_worlds(run, options, params, nworld=nworld, task=self.task, trust=self.trust)
             which = "last" if self.follow else better_policy(run, self.which, task=self.task, trust=self.trust)
             policy = load(run, which=which, device=env.obs.device)
             check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
@@ -128,25 +117,13 @@ class View:
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
             env = Env(self.what[0], autoreset=False, nthread=1, **params)
         else:
-            env = Env(self.what[0], nworld=self.nworld or 1, **words, **params)
+            env = Env(self.what[0], nworld=1 if self.nworld is None else self.nworld, **options, **params)
         if self.mppi:
             config = self.planner.on_top_of(task_config(env.task.task))
-            words |= {} if env.options.model is None else {"model": env.options.model}
-            controllers["mppi"] = MPPI(env.task.task, config, seed=self.seed, params=env.given_params, **words)
-        view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **shown)
+            options |= {} if env.options.model is None else {"model": env.options.model}
+            controllers["mppi"] = MPPI(env.task.task, config, seed=self.seed, params=env.given_params, **options)
+        view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **page)
         return 0
-
-
-def _check(options: View) -> None:
-    """Refuse numbers out of range and flags that have no effect, before worlds are made."""
-    whole_number("seed", options.seed, low=0)
-    if options.nworld is not None:
-        whole_number("nworld", options.nworld, low=1)
-    if not options.what:
-        raise ValueError("view needs a task, a run, or files of episodes")
-    settings = given(options.planner)
-    if settings and not options.mppi:
-        raise ValueError(f"--{next(iter(settings)).replace('_', '-')} is a setting of the planner: add --mppi")
 
 
 def _kind(what: tuple[str, ...]) -> str:

@@ -1,13 +1,12 @@
 import json
 import shutil
-import signal
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import pytest
 import torch
-from training_runs import interrupted, refused, train
+from training_runs import refused, train
 
 import lyceum_warp as lw
 from lyceum_warp import cli
@@ -52,31 +51,10 @@ def test_eval_with_equal_seeds_prints_equal_statistics(trained: Path, capsys: py
     assert "success:" in lines
 
 
-def test_interrupted_evaluation_prints_that_it_was_interrupted(
-    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(lw.Env, "step", lambda env: signal.raise_signal(signal.SIGINT))
-    assert interrupted(["eval", str(trained), "--episodes", "2"]) == 130
-    assert "interrupted by SIGINT before the episodes were complete" in capsys.readouterr().err
-
-
-def test_eval_with_other_physics_prints_no_warning_about_a_changed_model(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert cli.main(["eval", str(trained), "--episodes", "2", "--integrator", "implicitfast"]) == 0
-    assert "has changed" not in "".join(capsys.readouterr())
-
-
-def test_eval_with_zero_episodes_prints_an_error(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["eval", str(trained), "--episodes", "0"]) == 2
-    refused(capsys, "episodes must be a whole number from 1")
-
-
 def test_eval_saves_the_evaluated_episodes(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, options = tmp_path / "episodes", ["--episodes", "3", "--nworld", "2", "--seed", "7"]
     assert cli.main(["eval", str(trained), *options, "--episodes-to", str(out)]) == 0
     shown = capsys.readouterr().out
-    assert f"episodes: {out / 'episode-*.npz'}" in shown
     lines = {line.split()[0]: line.split() for line in shown.splitlines() if line.split()}
     episodes = list(load_episodes(out).values())
     assert [file.name for file in sorted(out.iterdir())] == [f"episode-00{i}.npz" for i in range(3)]
@@ -102,21 +80,12 @@ def test_video_is_made_with_the_named_camera(
         return path
 
     monkeypatch.setattr(policy_videos, "write_video", write_video)
-    for words in (["0"], ["free"], ["azimuth=30", "track=agent"]):
+    for words in (["0"], ["azimuth=30", "track=agent"]):
         flags = [flag for word in words for flag in ("--camera", word)]
         assert cli.main(["eval", str(trained), "--episodes", "1", "--horizon", "9", "--video", *flags]) == 0
-    fixed, free, tracking = cameras
-    assert fixed.fixedcamid == 0 and free.type == mujoco.mjtCamera.mjCAMERA_FREE
+    fixed, tracking = cameras
+    assert fixed.fixedcamid == 0
     assert (tracking.azimuth, tracking.type) == (30, mujoco.mjtCamera.mjCAMERA_TRACKING)
-    capsys.readouterr()
-    for flags, message in (
-        (["--video", "--camera", "side"], "there is no camera 'side': the model has "),
-        (["--video", "--camera", "side", "--camera", "top"], "a camera is a name, an index, or a pose of lookat="),
-        (["--camera", "0"], "--camera has no effect without --video"),
-    ):
-        assert cli.main(["eval", str(trained), "--episodes", "1", *flags]) == 2
-        refused(capsys, message)
-    assert len(cameras) == 3
 
 
 def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -126,5 +95,18 @@ def test_eval_compares_both_engines(trained: Path, capsys: pytest.CaptureFixture
     assert "Warp engine on cpu against C engine: same" in shown
     rows = [line.split() for line in shown.splitlines() if line.split()[:1] == ["length"]]
     assert rows[-1] == ["length", "20", "20", "+0", "+0", "to", "+0", "1", "same"]
-    assert cli.main([*arguments, "--engine", "warp"]) == 2
-    refused(capsys, "--transfer plays episodes on both engines: omit --engine")
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (["--episodes", "0"], ["episodes", "0"]),
+    (["--transfer", "--engine", "warp"], ["--transfer", "--engine"]),
+    (["--video", "--camera", "side"], ["'side'"]),
+    (["--camera", "0"], ["--camera", "--video"]),
+    (["--memory", "level=1", "--fresh-memory"], ["--memory", "--fresh-memory"]),
+])  # fmt: skip
+def test_invalid_eval_options_print_one_line(
+    options: list[str], words: list[str], trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    assert cli.main(["eval", str(trained), "--episodes", "1", *options]) == 2
+    refused(capsys, *words)

@@ -58,18 +58,20 @@ def test_openmp_threads_of_a_command_do_not_spin() -> None:
 
 
 @pytest.mark.parametrize("words, message", [
-    ("trian hopper", "there is no command 'trian': did you mean train?"),
+    ("trian hopper", "did you mean train?"),
     ("train hopper --iteration 5", "train has no option --iteration: did you mean --iterations?"),
-    ("train hopper --task-param x=1", "train has no option --task-param: did you mean --param?"),
-    ("train hopper --num-envs 8", "train has no option --num-envs: did you mean --nworld?"),
     ("train hopper --lr=1e-3", "train has no option --lr: did you mean --learning-rate?"),
-    ("plan reach --realtime", "plan has no option --realtime: did you mean --real-time?"),
-    ("view hopper --zzz=1", "view has no option --zzz: lyceum-warp view --help-all lists the options"),
-    ("train hopper walker2d", "train does not take the argument 'walker2d': see lyceum-warp train --help"),
+    ("view hopper --zzz=1", "view has no option --zzz: lyceum-warp view --help-all"),
+    ("train hopper walker2d", "'walker2d': see lyceum-warp train --help"),
+    ("train hopper --samples many", "--samples takes a whole number, not 'many'"),
+    ("train hopper --gamma high", "--gamma takes a number, not 'high'"),
+    ("train hopper --hidden 64,64", "--hidden takes numbers separated by spaces, not '64,64'"),
+    ("train hopper --seed None", "--seed takes a whole number, not 'None'"),
+    ("train hopper --iterations", "--iterations needs a value"),
+    ("new robot --model robot.xml --template walk", "--template takes 'plain', 'velocity', not 'walk'"),
+    ("new robot", "--model is missing"),
 ])  # fmt: skip
-def test_misspelt_command_or_option_prints_one_line_with_a_suggestion(
-    words: str, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_invalid_command_line_prints_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(words.split()) == 2
     refused(capsys, message)
 
@@ -89,19 +91,6 @@ print(*sys.modules, file=sys.stderr)
     assert shown in done.stdout
     loaded = set(done.stderr.split())
     assert "lyceum_warp.cli" in loaded and not {"torch", "warp", "mujoco"} & loaded
-
-
-@pytest.mark.parametrize("words, message", [
-    ("train hopper --samples many", "--samples takes a whole number, not 'many'"),
-    ("train hopper --gamma high", "--gamma takes a number, not 'high'"),
-    ("train hopper --hidden 64,64", "--hidden takes numbers separated by spaces, not '64,64'"),
-    ("train hopper --iterations", "--iterations needs a value"),
-    ("new robot --model robot.xml --template walk", "--template takes 'plain', 'velocity', not 'walk'"),
-    ("new robot", "--model is missing"),
-])  # fmt: skip
-def test_invalid_flag_value_prints_one_line(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(words.split()) == 2
-    refused(capsys, message)
 
 
 def test_keyboard_interrupt_of_a_task_file_prints_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

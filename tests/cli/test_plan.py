@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
-import numpy as np
 import pytest
 import tiny_task
 import torch
@@ -33,7 +32,7 @@ def test_command_plan_starts_no_episode_after_the_time_limit(
 ) -> None:
     out = tmp_path / "run"
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
-    assert "stopped after 1 of 3 episodes: the limit is 1e-09 minutes" in capsys.readouterr().out
+    assert "stopped after 1 of 3 episodes" in capsys.readouterr().out
     assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
 
 
@@ -41,9 +40,7 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     out = tmp_path / "[" / "bold]x"  # rich must not parse this name as markup
     assert plan(out, "--episodes", "2", "--seed", "3", "--no-video") == 0
     shown = capsys.readouterr().out
-    assert f"files in {out}" in shown
-    assert "episode 1/2" in shown and "episode 2/2" in shown
-    assert "planning time p50" in shown and "real-time factor" in shown
+    assert str(out) in shown and "episode 2/2" in shown and "planning time p50" in shown
     assert sorted(path.name for path in out.iterdir()) == [
         "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json",
     ]  # fmt: skip
@@ -51,8 +48,6 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
     report = json.loads((out / "report.json").read_text())
     assert report["episodes"] == 2 and report["steps"] == 80
-    with np.load(out / "episode-001.npz", allow_pickle=False) as file:
-        assert file["actions"].shape == (40, 2) and file["rewards"].shape == (40,)
     # calling the same controller from Python gives the same episode
     env = lw.make("point_mass", autoreset=False, horizon=40)
     planner = lw.MPPI("point_mass", horizon=10, samples=8, temperature=0.01, noise=0.3)
@@ -65,19 +60,9 @@ def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: p
         small = ["--steps", "2", "--horizon", "2", *QUIET, *flags]
         assert plan(tmp_path / name, *small, task="humanoid") == 0
         assert json.loads((tmp_path / name / "config.json").read_text())["planner"].get("timestep") == timestep
-        assert ("(frame_skip 1, timestep 0.015, integrator implicitfast)" in capsys.readouterr().out) == (
-            name == "fast"
-        )
-    held = ["--frame-skip", "2", "--between", "linear", *QUIET]
-    assert plan(tmp_path / "held", *held) == 0
-    config = json.loads((tmp_path / "held" / "config.json").read_text())["planner"]
-    assert config["frame_skip"] == 2 and config["between"] == "linear"
-    capsys.readouterr()
+        assert ("timestep 0.015" in capsys.readouterr().out) == (name == "fast")
     assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
-    refused(
-        capsys,
-        "the controller's step is 0.013 s and the plant's step is 0.02 s, but one must be a multiple of the other",
-    )
+    refused(capsys, "0.013 s", "0.02 s")
     assert not (tmp_path / "other").exists()
 
 
@@ -113,15 +98,9 @@ def test_flag_real_time_leaves_given_settings_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
-    for name, flags, line, samples in (
-        ("all", ["--horizon", "10"], "32 samples, horizon 10: 9.6 ms of 20 ms; 64 would take 19.2 ms\n", 32),
-        ("samples", ["--samples", "8", "--horizon", "10"], "", 8),
-    ):
-        out = tmp_path / name
-        argv = ["plan", "point_mass", "--out", str(out), "--steps", "3", "--real-time", *QUIET, *flags]
-        assert cli.main(argv) == 0
-        shown = capsys.readouterr().out
-        assert shown.startswith(line or "point_mass: MPPI")
+    for flags, samples in ((["--horizon", "10"], 32), (["--samples", "8", "--horizon", "10"], 8)):
+        out = tmp_path / str(samples)
+        assert cli.main(["plan", "point_mass", "--out", str(out), "--steps", "3", "--real-time", *QUIET, *flags]) == 0
         config = json.loads((out / "config.json").read_text())
         assert (config["planner"]["samples"], config["planner"]["horizon"]) == (samples, 10)
         assert json.loads((out / "report.json").read_text())["deadline_ms"] == pytest.approx(20.0)
@@ -134,24 +113,16 @@ def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
     out = tmp_path / "run"
     argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", *QUIET]
     assert cli.main(argv) == 0
-    assert capsys.readouterr().out.startswith(
-        "no setting meets the deadline; 16 samples, horizon 16: 64 ms of 20 ms, so there is a plan every 80 ms\n"
-    )
+    assert "16 samples, horizon 16: 64 ms of 20 ms, so there is a plan every 80 ms" in capsys.readouterr().out
     config, report = (json.loads((out / name).read_text()) for name in ("config.json", "report.json"))
     assert config["replan_every"] == 4 and report["deadline_ms"] == pytest.approx(80.0)
-    held = ["--out", str(tmp_path / "held"), "--steps", "3", "--frame-skip", "4", "--horizon", "16", "--real-time"]
-    monkeypatch.setattr(plan_command, "planning_time", measured_by(100.0))
-    assert cli.main(["plan", "reach", *held, *QUIET]) == 0
-    assert "16 samples, horizon 16: 25.6 ms of 40 ms; 30 would take 48 ms" in capsys.readouterr().out
-    assert json.loads((tmp_path / "held" / "config.json").read_text())["replan_every"] == 2
     settings = find_task("humanoid_stand").planning.settings
     half = settings["horizon"] // 2
     argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", *QUIET]
     monkeypatch.setattr(plan_command, "planning_time", measured_by(9000 / (16 * half)))
     assert cli.main(argv) == 0
-    assert f"16 samples, horizon {half}, physics fast: 9 ms of 15 ms; " in capsys.readouterr().out
     planner = json.loads((tmp_path / "knots" / "config.json").read_text())["planner"]
-    assert (planner["knots"], planner["timestep"]) == (settings["knots"] // 2, 0.015)
+    assert (planner["horizon"], planner["knots"], planner["timestep"]) == (half, settings["knots"] // 2, 0.015)
 
 
 def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -166,12 +137,12 @@ def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytes
     capsys.readouterr()
     assert plan(tmp_path / "none", "--value", str(tmp_path / "nowhere")) == 2
     refused(capsys, "nowhere")
-    assert not (tmp_path / "none").exists()
     assert plan(tmp_path / "none", "--value", str(run), task="reach") == 2
-    refused(capsys, f"--value {run} is a run of the task 'point_mass', not of 'reach'")
+    refused(capsys, f"--value {run}", "'point_mass'", "'reach'")
     Run.open(run).amend(algorithm="sac")
     assert plan(tmp_path / "none", "--value", str(run)) == 2
-    refused(capsys, f"--value {run} is a run of SAC, whose critics need an action")
+    refused(capsys, f"--value {run}", "sac", "npg or ppo")
+    assert not (tmp_path / "none").exists()
 
 
 def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_envs: list[lw.Env]) -> None:
@@ -188,41 +159,36 @@ def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_env
     assert (settings["integrator"], settings["deterministic"]) == ("euler", True)
 
 
-def test_chosen_plan_update_is_saved_and_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flags = ["--knots", "4", "--spline", "linear", "--include-plan", "--replan-every", "3", "--steps", "9"]
-    shown = {
-        ("cem", "--elites", "3", "--min-noise", "0.02"): "CEM, 8 samples",
-        ("predictive_sampling",): "predictive sampling, 8 samples",
-    }
-    for (update, *more), text in shown.items():
-        assert plan(tmp_path / update, *QUIET, *flags, "--update", update, *more) == 0
-        assert text in capsys.readouterr().out
-        config = json.loads((tmp_path / update / "config.json").read_text())
-        planner = config["planner"]
-        assert (config["algorithm"], config["replan_every"], planner["update"]) == (update, 3, update)
-        assert (planner["knots"], planner["spline"], planner["include_plan"]) == (4, "linear", True)
-        assert Trajectory.load(tmp_path / update / "episode-000.npz").plan_steps.tolist() == [0, 3, 6]
-        assert json.loads((tmp_path / update / "report.json").read_text())["deadline_ms"] == pytest.approx(60.0)
-    assert (planner["elites"], planner["min_noise"]) == (None, None)
+@pytest.mark.parametrize(("update", "flags", "title"), [
+    ("cem", ["--elites", "3", "--min-noise", "0.02"], "CEM, 8 samples"),
+    ("predictive_sampling", [], "predictive sampling, 8 samples"),
+])  # fmt: skip
+def test_chosen_plan_update_is_saved_and_printed(
+    update: str, flags: list[str], title: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shared = ["--update", update, "--knots", "4", "--include-plan", "--replan-every", "3", "--steps", "9"]
+    assert plan(tmp_path / "run", *QUIET, *shared, *flags) == 0
+    assert title in capsys.readouterr().out
+    config = json.loads((tmp_path / "run" / "config.json").read_text())
+    planner = config["planner"]
+    assert (config["algorithm"], config["replan_every"], planner["update"]) == (update, 3, update)
+    assert (planner["knots"], planner["include_plan"]) == (4, True)
+    assert Trajectory.load(tmp_path / "run" / "episode-000.npz").plan_steps.tolist() == [0, 3, 6]
+    assert json.loads((tmp_path / "run" / "report.json").read_text())["deadline_ms"] == pytest.approx(60.0)
 
 
 @pytest.mark.parametrize("options, words", [
     (["--horizon", "0"], ["horizon", "0"]),
-    (["--replan-every", "0"], ["replan_every", "0"]),
-    (["--replan-every", "11"], ["replan_every=11", "a plan of 10 actions"]),
+    (["--replan-every", "11"], ["replan_every=11", "10"]),
     (["--replan-every", "2", "--real-time"], ["--replan-every 2", "--real-time"]),
     (["--predict"], ["--predict", "--real-time"]),
     (["--episodes", "0"], ["episodes", "0"]),
-    (["--steps", "0"], ["steps", "0"]),
-    (["--param", "horizon=9"], ["horizon is an option", "use --steps"]),
-    (["--planner-param", "horizon=9"], ["horizon is an option", "use --horizon"]),
-    (["--planner-param", "nworld=9"], ["nworld is an option", "use --samples"]),
-    (["--planner-model", "nowhere.xml"], ["no model file", str(Path("nowhere.xml").resolve())]),
+    (["--steps", "0"], ["--steps"]),
+    (["--planner-model", "nowhere.xml"], [str(Path("nowhere.xml").resolve())]),
     (["--fill", "1", "zero"], ["fill", "1 zero"]),
-    (["--seed", "2147483647", "--episodes", "2"], ["seed of the last episode", "2147483648"]),
     (["--device", "cuda:7"], ["cuda:7"]),
-    (["--camera", "track=elbow"], ["the camera cannot track the body 'elbow'"]),
-    (["--no-video", "--camera", "0"], ["--camera has no effect with --no-video"]),
+    (["--camera", "track=elbow"], ["'elbow'"]),
+    (["--no-video", "--camera", "0"], ["--camera", "--no-video"]),
 ])  # fmt: skip
 def test_option_out_of_range_prints_one_line_and_makes_no_folder(
     options: list[str], words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -297,7 +263,7 @@ def test_flag_nthread_sets_the_number_of_planner_threads(tmp_path: Path, made_en
 def test_live_display_shows_the_real_time_factor_or_the_age_of_actions(capsys: pytest.CaptureFixture[str]) -> None:
     now = lw.ControlProgress(10, 0.5, 1.0, 2.0, True, 0.01, 0.03, plans=6)
     for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
-        with PlanDisplay(Console(force_terminal=True, width=120), 0, 1, 20, 0.02, real_time=real_time) as display:
+        with PlanDisplay(Console(force_terminal=True, width=120), "", 20, 0.02, real_time=real_time) as display:
             display(now)
             display.refresh()
         assert f"10/20 reward 1 eval 2 {words}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().out)

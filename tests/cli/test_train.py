@@ -16,7 +16,7 @@ from lyceum_warp import cli
 from lyceum_warp.algos import Team
 from lyceum_warp.cli.arguments import given
 from lyceum_warp.cli.train import EnvFlags, Hyperparameters, Train
-from lyceum_warp.training import ALGORITHMS, Configuration, Run, load
+from lyceum_warp.training import ALGORITHMS, Run, load
 from lyceum_warp.viz import policy_videos
 
 
@@ -40,20 +40,13 @@ def test_task_metrics_are_columns_before_and_after_resuming(tmp_path: Path, caps
     assert " forward " in printed and " effort " in printed
 
 
-def test_train_and_eval_accept_a_task_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_train_and_eval_accept_a_task_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tiny_task.changed(("dt: float", "dt: float\n    gain: float = 1.0"), ("class Tiny", "class Mine"))
     mine = tiny_task.write(tmp_path, f"{source}    horizon = 20\n", "mine.py")
     monkeypatch.chdir(tmp_path)
     options = ["--iterations", "2", "--param", "gain=0.1", "--seed", "5"]
     assert cli.main(["train", "mine.py", "--out", "deep/run", *TINY, *options]) == 0
-    output = capsys.readouterr().out
     out = Path("deep/run")
-    assert "iteration    2/2" in output
-    assert f"checkpoint: {out / 'checkpoint.pt'}" in output
-    for name, file in (("curve", out / "curve.png"), ("video", out / "video.mp4")):
-        assert f"{name}:      {file if file.exists() else 'none: '}" in output
     config = Run.open(out).config
     assert (config["task"], config["seed"]) == (f"{mine.resolve()}:Mine", 5)
     assert config["params"] == {"gain": 0.1}
@@ -61,6 +54,7 @@ def test_train_and_eval_accept_a_task_file(
     rows = metrics(out)
     assert [row["iteration"] for row in rows] == ["1", "2"]
     assert [bool(row["mean_return"]) for row in rows] == [False, True]
+    assert (out / "curve.png").stat().st_size > 1000
     monkeypatch.chdir("/")
     assert cli.main(["eval", str(tmp_path / out), "--episodes", "2"]) == 0
 
@@ -134,13 +128,8 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     options += ["--horizon", "32", "--nthread", "2"]
     assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0
-    solver = {"iterations": 7, "ls_iterations": 9}
-    given = {"integrator": "euler", "solver": solver, "deterministic": True}
-    config = Run.open(out).config
-    assert (config["physics"], config["options"]) == (given, {"horizon": 32, "nthread": 2})
     resume = ["train", "--resume", str(out), *QUIET, "--no-transfer", "--iterations"]
-    assert cli.main([*resume, "2"]) == 0
-    assert cli.main([*resume, "3", "--solver", "iterations=7", "--integrator", "euler"]) == 0
+    assert cli.main([*resume, "2", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
     assert {env.nworld for env in made_envs} == {1, 2, 32}
@@ -154,7 +143,7 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
         (["--solver", "iterations=8"], "has solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
     ]:
         assert cli.main([*resume, "4", *other]) == 2
-        refused(capsys, words, "a run keeps its settings")
+        refused(capsys, words)
 
 
 def test_named_physics_are_saved_as_options_and_eval_can_replace_them(
@@ -193,31 +182,15 @@ def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
 
 
 @pytest.mark.parametrize("change, words", [
-    (lambda config: config["npg"].update(fisher_fraction=0.0), "fisher_fraction must be greater than 0"),
-    (lambda config: config["npg"].update(momentum=0.9), "momentum"),
-    (lambda config: config.pop("params"), "'params'"),
+    (lambda config: config["npg"].update(momentum=0.9), ["config.json is ", "momentum"]),
+    (lambda config: config.update(nworld=3), ["does not fit the run's configuration"]),
 ])  # fmt: skip
 def test_invalid_configuration_prints_one_line(
-    change: Any, words: str, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    change: Any, words: list[str], trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(changed_config(trained, tmp_path / "run", change)) == 2
-    refused(capsys, "config.json is ", words)
-
-
-def test_resume_with_only_damaged_checkpoints_prints_an_error(
-    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    resume = changed_config(trained, tmp_path / "run", lambda config: None)
-    checkpoint = tmp_path / "run" / "checkpoint.pt"
-    for path in (checkpoint, checkpoint.with_name("previous.pt")):
-        path.write_bytes(path.read_bytes()[:-1000])
-    assert cli.main(resume) == 2
-    refused(capsys, str(checkpoint), "is damaged", "restore the file from a copy")
-    other = changed_config(trained, tmp_path / "other", lambda config: config.update(nworld=3))
-    assert cli.main(other) == 2
-    refused(capsys, "does not fit the run's configuration")
-    for folder in ("run", "other"):
-        assert (tmp_path / folder / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
+    refused(capsys, *words)
+    assert (tmp_path / "run" / "metrics.csv").read_bytes() == (trained / "metrics.csv").read_bytes()
 
 
 def test_damaged_best_policy_is_replaced_with_a_message(
@@ -226,32 +199,24 @@ def test_damaged_best_policy_is_replaced_with_a_message(
     resume = changed_config(trained, tmp_path / "run", lambda config: None)
     best = tmp_path / "run" / "best.pt"
     best.write_bytes(best.read_bytes()[:-1000])
-    capsys.readouterr()
-    assert cli.main(["eval", str(tmp_path / "run"), "--which", "best"]) == 2
-    refused(capsys, str(best), "is damaged")
     assert cli.main(resume) == 0
-    error = capsys.readouterr().err
-    assert f"{best} is damaged" in error and "the next evaluated policy replaces this file" in error
+    assert f"{best} is damaged" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     "task, options, words",
     [
         ("", [], ["train needs a task", "hopper"]),
-        ("point_mas", [], ["no task 'point_mas'", "did you mean point_mass"]),
-        ("nowhere.py", [], ["no task file 'nowhere.py'"]),
-        ("point_mass", ["--device", "cuda:77"], ["no device 'cuda:77'"]),
-        ("point_mass", ["--threads", "0"], ["threads", "not 0"]),
-        ("point_mass", ["--iterations", "0"], ["iterations", "not 0"]),
-        ("point_mass", ["--algorithm", "rsl-rl"], ["no algorithm 'rsl-rl'", "npg or ppo"]),
-        ("point_mass", ["--gamma", "1.5"], ["gamma must be", "from 0 to 1, not 1.5"]),
-        ("point_mass", ["--param", "horizon=5"], ["horizon is an option", "use --horizon"]),
-        ("point_mass", ["--param", "success_distance"], ["NAME=VALUE", "'success_distance'"]),
+        ("point_mas", [], ["'point_mas'", "did you mean point_mass"]),
+        ("point_mass", ["--device", "cuda:77"], ["'cuda:77'"]),
+        ("point_mass", ["--threads", "0"], ["threads", "0"]),
+        ("point_mass", ["--iterations", "0"], ["iterations", "0"]),
+        ("point_mass", ["--algorithm", "rsl-rl"], ["'rsl-rl'", "npg or ppo"]),
+        ("point_mass", ["--gamma", "1.5"], ["gamma", "1.5"]),
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
-        ("point_mass", ["--learning-rate", "3"], ["--learning-rate is a setting of ppo or sac, not of npg: omit it"]),
-        ("point_mass", ["--algorithm", "ppo"], ["--samples is a setting of npg, not of ppo"]),
-        ("point_mass", ["--video-every", "1", "--camera", "side"], ["there is no camera 'side': the model has "]),
-        ("point_mass", ["--camera", "0"], ["--camera has no effect with --no-video"]),
+        ("point_mass", ["--learning-rate", "3"], ["--learning-rate", "ppo or sac", "npg"]),
+        ("point_mass", ["--video-every", "1", "--camera", "side"], ["'side'"]),
+        ("point_mass", ["--camera", "0"], ["--camera", "--no-video"]),
         ("point_mass", ["--video-every", "-1"], ["video_every must be a whole number from 0"]),
         ("point_mass", ["--take-over"], ["--take-over has no effect without --resume"]),
         ("point_mass", ["--trust"], ["--trust has no effect without --resume or --from"]),
@@ -275,14 +240,12 @@ def test_train_exits_with_1_if_the_return_is_below_require_return(
 
 
 def test_default_number_of_worlds_depends_on_device_and_algorithm() -> None:
-    found = []
-    for device, size, nworld in (("cpu", 2, None), ("cuda:0", 1, None), ("cuda", 2, None), ("cuda", 2, 96)):
-        options = Train(task="hopper", env=EnvFlags(device=device), nworld=nworld)
-        found.append(options.configuration(None, Team(0, size)).options.nworld)
-    assert found == [64, 4096, 8192, 96]
-    for device, nworld in (("cpu", 8), ("cuda", 4096)):
-        options = Train(task="hopper", algorithm="sac", env=EnvFlags(device=device))
-        assert options.configuration(None, Team()).options.nworld == nworld
+    for device, processes, algorithm, flag, nworld in [
+        ("cpu", 2, "npg", None, 64), ("cuda:0", 1, "npg", None, 4096), ("cuda", 2, "npg", None, 8192),
+        ("cuda", 2, "npg", 96, 96), ("cpu", 1, "sac", None, 8), ("cuda", 1, "sac", None, 4096),
+    ]:  # fmt: skip
+        train = Train(task="hopper", algorithm=algorithm, env=EnvFlags(device=device), nworld=flag)
+        assert train.configuration(None, Team(0, processes)).options.nworld == nworld
 
 
 def suggesting(folder: Path, training: str) -> str:
@@ -294,13 +257,14 @@ def suggesting(folder: Path, training: str) -> str:
 def test_flags_override_the_training_settings_that_a_task_suggests(tmp_path: Path) -> None:
     task = suggesting(tmp_path, 'lw.Training(algorithm="ppo", settings={"lam": 0.5, "gamma": 0.9}, iterations=7)')
 
-    def chosen(**flags: Any) -> Configuration:
-        return Train(task=task, **flags).configuration(None, Team())
-
-    found = chosen(), chosen(algorithm="ppo", hyperparameters=Hyperparameters(lam=0.7)), chosen(algorithm="npg")
-    assert [(one.algorithm, one.iterations) for one in found] == [("ppo", 7), ("ppo", 7), ("npg", 100)]
-    assert found[0].hyperparameters == lw.PPOConfig(lam=0.5, gamma=0.9)
-    assert found[1].hyperparameters == lw.PPOConfig(lam=0.7, gamma=0.9) and found[2].hyperparameters == lw.NPGConfig()
+    for flags, algorithm, iterations, hyperparameters in [
+        ({}, "ppo", 7, lw.PPOConfig(lam=0.5, gamma=0.9)),
+        ({"algorithm": "ppo", "hyperparameters": Hyperparameters(lam=0.7)}, "ppo", 7, lw.PPOConfig(lam=0.7, gamma=0.9)),
+        ({"algorithm": "npg"}, "npg", 100, lw.NPGConfig()),
+    ]:
+        configuration = Train(task=task, **flags).configuration(None, Team())
+        assert (configuration.algorithm, configuration.iterations) == (algorithm, iterations)
+        assert configuration.hyperparameters == hyperparameters
 
 
 @pytest.mark.parametrize("training", ['lw.Training(algorithm="ppo", settings={"lamda": 0.5})',
@@ -385,4 +349,4 @@ def test_train_prints_the_result_of_the_transfer_test_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "run", "--iterations", "1", "--horizon", "20", "--transfer") == 0
-    assert "transfer: Warp engine on cpu against C engine: same (return " in capsys.readouterr().out
+    assert "transfer: Warp engine on cpu against C engine: same" in capsys.readouterr().out

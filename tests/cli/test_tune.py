@@ -2,6 +2,7 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from training_runs import refused
 
 from lyceum_warp import cli
 from lyceum_warp.tuning import judgement, search
@@ -23,18 +24,13 @@ def test_tune_prints_a_table_and_flags_for_other_commands(
     assert cli.main(["check", "half_cheetah", "--rule", "spaces", *flags]) == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["hoper"], "there is no task 'hoper'"),
-        (["hopper", "--tolerance", "tight"], "tolerance must be"),
-        (["hopper", "--param", "nworld=3"], "nworld is an option, not a parameter of the task: use --nworld"),
-        (["hopper", "--run", "none"], "there is no run in none"),
-    ],
-)
+@pytest.mark.parametrize(("options", "words"), [
+    (["hoper"], ["'hoper'"]),
+    (["hopper", "--tolerance", "tight"], ["tolerance", "'tight'"]),
+    (["hopper", "--run", "none"], ["none"]),
+])  # fmt: skip
 def test_invalid_tune_arguments_print_one_line(
-    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    options: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert cli.main(["tune", *words]) == 2
-    err = capsys.readouterr().err
-    assert message in err and err.count("\n") == 1
+    assert cli.main(["tune", *options]) == 2
+    refused(capsys, *words)

@@ -92,12 +92,12 @@ def test_view_plays_saved_episodes(opened: Opened, files: list[Path]) -> None:
 @pytest.mark.parametrize(
     ("words", "messages"),
     [
-        (["hoper"], ["there is no task 'hoper'"]),
+        (["hoper"], ["'hoper'"]),
         (["point_mass", "--follow"], ["--follow needs a run", "point_mass"]),
-        (["point_mass", "--samples", "4"], ["--samples is a setting of the planner: add --mppi"]),
-        (["point_mass", "hopper"], ["one task can be shown at a time, not 2"]),
-        (["missing.npz"], ["there is no file missing.npz"]),
-        (["point_mass", "--param", "nworld=3"], ["nworld is an option"]),
+        (["point_mass", "--samples", "4"], ["--samples", "--mppi"]),
+        (["point_mass", "hopper"], ["one task", "hopper"]),
+        (["point_mass", "--nworld", "0"], ["nworld", "0"]),
+        (["missing.npz"], ["missing.npz"]),
     ],
 )
 def test_invalid_view_arguments_print_one_line(
