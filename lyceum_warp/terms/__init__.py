@@ -1,182 +1,148 @@
 """Provide reward terms, commands, contact times, noise, random draws and motors that all tasks can use.
 
 Every function is a ``wp.func``. Its arguments are numbers, vectors, rows of ``World`` and tables of ``Params``. An
-argument's name has the same meaning in all functions; see ``ARGUMENTS``.
+argument's name has the same meaning in all functions:
+
+    action: the action of the step
+    active: 1 if the robot should move, else 0; see the function ``active``
+    actuator_biasprm: the model field
+    actuator_gainprm: the model field
+    actuators: array of Params: indices of actuators
+    age: age of a value in a history: the number of newer values
+    air_time: row of memory: seconds since each foot left the ground (0 in contact)
+    angular_velocity: angular velocity of the base in the base's axes (rad/s)
+    angular_velocity_variance: squared error at which the term is 1 / e (rad^2/s^2)
+    at: index of the first number
+    base: index of the base's body
+    base_height: height of the base's origin in the world (m)
+    bodies: array of Params: indices of bodies
+    body: index of a body
+    body_inertia: the model field
+    body_ipos: the model field
+    body_iquat: the model field
+    body_mass: the model field
+    command: forward and lateral velocity (m/s) and yaw rate (rad/s), in the base's axes
+    command_high: greatest forward and lateral velocity (m/s) and yaw rate (rad/s)
+    command_low: least forward and lateral velocity (m/s) and yaw rate (rad/s)
+    contact_seconds: the ``contact_time`` of one foot
+    contact_time: row of memory: seconds since each foot touched down (0 in the air)
+    default_pose: array of Params: default position of each joint (rad)
+    delay: row of memory with 1 number: a delay in steps
+    density: half the logarithm of the factor that multiplies the density
+    drawn_velocity: row of memory with 1 vector: the drawn command
+    dt: seconds in a step
+    earlier_action: row of memory: the action two steps ago
+    effort_limit: greatest continuous torque of a motor (N m)
+    encoder_bias: row of memory: error of each joint's encoder (rad)
+    fall_angle: greatest tilt (rad)
+    fastest_yaw_rate: greatest yaw rate (rad/s)
+    feet: array of Params: indices of the feet's sites
+    flag: row of memory with 1 number, which is 1 or 0
+    foot: index of a foot, from 0
+    foot_contacts: array of Params: indices in ``sensordata`` of a contact or touch sensor of each foot
+    foot_forces: array of Params: indices in ``sensordata`` of the contact force on each foot (N)
+    foot_height: height of a foot above the ground (m)
+    foot_velocities: array of Params: indices in ``sensordata`` of each foot's velocity in the world's axes (m/s)
+    foot_velocity: velocity of a foot in the world's axes (m/s)
+    forward_share: probability of a command to walk straight ahead
+    geom_friction: the model field
+    geoms: array of Params: indices of geoms
+    gravity: direction of gravity in the base's axes, a unit vector
+    heading: angle of the base about the world's z axis (rad)
+    heading_controlled: row of memory with 1 number, which is 1 if the yaw rate follows the heading
+    heading_gain: ratio of the yaw rate to the error of the heading (1/s)
+    heading_share: probability that the yaw rate follows the heading
+    heading_target: row of memory with 1 number: the commanded heading (rad)
+    high: upper end of the range
+    history: row of memory with 1 + n * width numbers: the last n values
+    i: index in a value
+    indices: array of Params: indices of elements
+    jnt_range: the model field
+    joint_dof: array of Params: index of each joint in ``qvel``
+    joint_position: position of a joint (rad)
+    joint_qpos: array of Params: index of each joint in ``qpos``
+    joint_target: target of a joint (rad)
+    joint_velocity: velocity of a joint (rad/s)
+    joints: array of Params: index of each joint in the ``jnt_`` fields
+    kd: damping of a servo (N m s/rad)
+    kd_scale: range of the factors of kd
+    kp: stiffness of a servo (N m/rad)
+    kp_scale: range of the factors of kp
+    least: smallest integer
+    least_air_time: shortest air time for which a foot counts (s)
+    least_command: ``command_size`` above which the robot should move
+    least_forward_velocity: smallest velocity of a command to walk straight ahead (m/s)
+    least_height: least height of the base (m)
+    linear_velocity: velocity of the base's origin in the base's axes (m/s)
+    linear_velocity_variance: squared error at which the term is 1 / e (m^2/s^2)
+    low: lower end of the range
+    matrix: a symmetric matrix, 3 x 3
+    most: largest integer
+    most_air_time: longest air time for which a foot counts (s)
+    noise: bound of uniform noise, or standard deviation of normal noise
+    offset: bounds of the offset (m)
+    peak_height: row of memory: greatest height of each foot since its last landing (m)
+    pose_std: array of Params: standard deviation of each joint (rad)
+    previous_action: row of memory: the action one step ago
+    push_spin: bounds of the change of angular velocity, in the world's axes (rad/s)
+    push_velocity: bounds of the change of velocity, in the world's axes (m/s)
+    qacc: the field after the last substep
+    qfrc_actuator: the field after the last substep
+    qpos: the field
+    qvel: the field
+    rng: the world's random stream
+    rolling_friction: range of the rolling friction
+    row: the row
+    running_command: smallest ``command_size`` at which the robot should run
+    running_pose_std: array of Params: standard deviation of each joint while running (rad)
+    saturation_torque: torque of a motor at rest (N m)
+    scale: range of the factors
+    seconds: range of the duration (s)
+    sensordata: the field
+    share: probability
+    shear: s12, s13 and s23 of the matrix D
+    shift: offset of the body's mass in the body's axes (m)
+    site_xpos: the field
+    sliding_friction: range of the sliding friction
+    soft_limit: fraction of a joint's range that has no cost, around the middle of the range
+    source: the row to read
+    spinning_friction: range of the spinning friction
+    standing: row of memory with 1 number, which is 1 if the robot should stand
+    standing_pose_std: array of Params: standard deviation of each joint while standing (rad)
+    stretch: logarithms of the diagonal of the matrix D
+    substep_dt: seconds in a substep
+    subtree_angmom: the field
+    swing_height: row of memory: greatest height of each foot in its last swing (m)
+    swing_target: desired height of a foot in its swing (m)
+    swing_time: row of memory: duration of each foot's last swing (s)
+    target: the row to write
+    target_heading: the commanded heading (rad)
+    target_height: desired height of the base (m)
+    tilt_variance: squared sine of the tilt at which the term is 1 / e
+    timer: row of memory with 1 number: the seconds left
+    torque: desired torque (N m)
+    touching: whether the foot touches the ground
+    value: the row to append
+    velocity: velocity in the world's axes (m/s)
+    velocity_limit: no-load speed of a motor (rad/s)
+    walking_pose_std: array of Params: standard deviation of each joint while walking (rad)
+    wanted_air_time: shortest duration of a rewarded swing (s)
+    width: number of elements of one value in a history
 """
 
-from lyceum_warp.support.docstrings import document_arguments
+import inspect
 
-# fmt: off
-# isort: off
-from lyceum_warp.terms.action_changes import action_acceleration_l2, action_rate_l2
-from lyceum_warp.terms.base_motion import (
-    alive, angular_momentum_l2, angular_velocity, base_height, base_height_l2, fell_over, gravity, heading,
-    linear_velocity, orientation, roll_pitch_rate_l2, tilt_l2, too_low, track_angular_velocity,
-    track_linear_velocity, track_planar_velocity, track_yaw_rate, upright, velocity_error, vertical_velocity_l2,
-    yaw_rate_error)
-from lyceum_warp.terms.draws import (
-    chosen, draw_delay, draw_friction, draw_row, log_uniform, scale_elements, scale_gains, scale_mass,
-    shift_center_of_mass, uniform_int)
-from lyceum_warp.terms.feet import (
-    clearance, feet_in_air, follow_swing, foot_clearance, foot_slip, foot_swing_height, ground_speed, landed,
-    long_swings, run_clocks, run_contact_clocks, sensor_vector, soft_landing)
-from lyceum_warp.terms.histories import delayed_action, history_length, push_history, put_history, read_history
-from lyceum_warp.terms.inertia import change_inertia, draw_inertia, symmetric_eigenvectors
-from lyceum_warp.terms.joints import (
-    absolute_power, gait_pose, joint_acceleration_l2, joint_limits, joint_velocity_l2, pose, pose_l1, posture,
-    power, sum_squares_at, torque_l2)
-from lyceum_warp.terms.motors import dc_motor_torque, servo_torque
-from lyceum_warp.terms.observations import add_normal_noise, add_uniform_noise, gather, gather_positions
-from lyceum_warp.terms.pushes import push
-from lyceum_warp.terms.velocity_commands import (
-    active, command_size, draw_flag, draw_forward_only, draw_heading, draw_timer, draw_velocity, heading_yaw_rate,
-    is_due, run_timer, velocity_command)
+from lyceum_warp.support.docstrings import listed
+from lyceum_warp.support.faces import face
 
-__all__ = [
-    "absolute_power", "action_acceleration_l2", "action_rate_l2", "active", "add_normal_noise", "add_uniform_noise",
-    "alive", "angular_momentum_l2", "angular_velocity", "base_height", "base_height_l2", "change_inertia", "chosen",
-    "clearance", "command_size", "dc_motor_torque", "delayed_action", "draw_delay", "draw_flag",
-    "draw_forward_only", "draw_friction", "draw_heading", "draw_inertia", "draw_row", "draw_timer", "draw_velocity",
-    "feet_in_air", "fell_over", "follow_swing", "foot_clearance", "foot_slip", "foot_swing_height", "gait_pose",
-    "gather", "gather_positions", "gravity", "ground_speed", "heading", "heading_yaw_rate", "history_length",
-    "is_due", "joint_acceleration_l2", "joint_limits", "joint_velocity_l2", "landed", "linear_velocity",
-    "log_uniform", "long_swings", "orientation", "pose", "pose_l1", "posture", "power", "push", "push_history",
-    "put_history", "read_history", "roll_pitch_rate_l2", "run_clocks", "run_contact_clocks", "run_timer",
-    "scale_elements", "scale_gains", "scale_mass", "sensor_vector", "servo_torque", "shift_center_of_mass",
-    "soft_landing", "sum_squares_at", "symmetric_eigenvectors", "tilt_l2", "too_low", "torque_l2",
-    "track_angular_velocity", "track_linear_velocity", "track_planar_velocity", "track_yaw_rate", "uniform_int",
-    "upright", "velocity_command", "velocity_error", "vertical_velocity_l2", "yaw_rate_error"]
-# isort: on
-# fmt: on
+__getattr__, __dir__, __all__ = face(__name__)
 
-ARGUMENTS = {
-    "action": "the action of the step",
-    "active": "1 if the robot should move, else 0; see the function ``active``",
-    "actuator_biasprm": "the model field",
-    "actuator_gainprm": "the model field",
-    "actuators": "array of Params: indices of actuators",
-    "age": "age of a value in a history: the number of newer values",
-    "air_time": "row of memory: seconds since each foot left the ground (0 in contact)",
-    "angular_velocity": "angular velocity of the base in the base's axes (rad/s)",
-    "angular_velocity_variance": "squared error at which the term is 1 / e (rad^2/s^2)",
-    "at": "index of the first number",
-    "base": "index of the base's body",
-    "base_height": "height of the base's origin in the world (m)",
-    "bodies": "array of Params: indices of bodies",
-    "body": "index of a body",
-    "body_inertia": "the model field",
-    "body_ipos": "the model field",
-    "body_iquat": "the model field",
-    "body_mass": "the model field",
-    "command": "forward and lateral velocity (m/s) and yaw rate (rad/s), in the base's axes",
-    "command_high": "greatest forward and lateral velocity (m/s) and yaw rate (rad/s)",
-    "command_low": "least forward and lateral velocity (m/s) and yaw rate (rad/s)",
-    "contact_seconds": "the ``contact_time`` of one foot",
-    "contact_time": "row of memory: seconds since each foot touched down (0 in the air)",
-    "default_pose": "array of Params: default position of each joint (rad)",
-    "delay": "row of memory with 1 number: a delay in steps",
-    "density": "half the logarithm of the factor that multiplies the density",
-    "drawn_velocity": "row of memory with 1 vector: the drawn command",
-    "dt": "seconds in a step",
-    "earlier_action": "row of memory: the action two steps ago",
-    "effort_limit": "greatest continuous torque of a motor (N m)",
-    "encoder_bias": "row of memory: error of each joint's encoder (rad)",
-    "fall_angle": "greatest tilt (rad)",
-    "fastest_yaw_rate": "greatest yaw rate (rad/s)",
-    "feet": "array of Params: indices of the feet's sites",
-    "flag": "row of memory with 1 number, which is 1 or 0",
-    "foot": "index of a foot, from 0",
-    "foot_contacts": "array of Params: indices in ``sensordata`` of a contact or touch sensor of each foot",
-    "foot_forces": "array of Params: indices in ``sensordata`` of the contact force on each foot (N)",
-    "foot_height": "height of a foot above the ground (m)",
-    "foot_velocities": "array of Params: indices in ``sensordata`` of each foot's velocity in the world's axes (m/s)",
-    "foot_velocity": "velocity of a foot in the world's axes (m/s)",
-    "forward_share": "probability of a command to walk straight ahead",
-    "geom_friction": "the model field",
-    "geoms": "array of Params: indices of geoms",
-    "gravity": "direction of gravity in the base's axes, a unit vector",
-    "heading": "angle of the base about the world's z axis (rad)",
-    "heading_controlled": "row of memory with 1 number, which is 1 if the yaw rate follows the heading",
-    "heading_gain": "ratio of the yaw rate to the error of the heading (1/s)",
-    "heading_share": "probability that the yaw rate follows the heading",
-    "heading_target": "row of memory with 1 number: the commanded heading (rad)",
-    "high": "upper end of the range",
-    "history": "row of memory with 1 + n * width numbers: the last n values",
-    "i": "index in a value",
-    "indices": "array of Params: indices of elements",
-    "jnt_range": "the model field",
-    "joint_dof": "array of Params: index of each joint in ``qvel``",
-    "joint_position": "position of a joint (rad)",
-    "joint_qpos": "array of Params: index of each joint in ``qpos``",
-    "joint_target": "target of a joint (rad)",
-    "joint_velocity": "velocity of a joint (rad/s)",
-    "joints": "array of Params: index of each joint in the ``jnt_`` fields",
-    "kd": "damping of a servo (N m s/rad)",
-    "kd_scale": "range of the factors of kd",
-    "kp": "stiffness of a servo (N m/rad)",
-    "kp_scale": "range of the factors of kp",
-    "least": "smallest integer",
-    "least_air_time": "shortest air time for which a foot counts (s)",
-    "least_command": "``command_size`` above which the robot should move",
-    "least_forward_velocity": "smallest velocity of a command to walk straight ahead (m/s)",
-    "least_height": "least height of the base (m)",
-    "linear_velocity": "velocity of the base's origin in the base's axes (m/s)",
-    "linear_velocity_variance": "squared error at which the term is 1 / e (m^2/s^2)",
-    "low": "lower end of the range",
-    "matrix": "a symmetric matrix, 3 x 3",
-    "most": "largest integer",
-    "most_air_time": "longest air time for which a foot counts (s)",
-    "noise": "bound of uniform noise, or standard deviation of normal noise",
-    "offset": "bounds of the offset (m)",
-    "peak_height": "row of memory: greatest height of each foot since its last landing (m)",
-    "pose_std": "array of Params: standard deviation of each joint (rad)",
-    "previous_action": "row of memory: the action one step ago",
-    "push_spin": "bounds of the change of angular velocity, in the world's axes (rad/s)",
-    "push_velocity": "bounds of the change of velocity, in the world's axes (m/s)",
-    "qacc": "the field after the last substep",
-    "qfrc_actuator": "the field after the last substep",
-    "qpos": "the field",
-    "qvel": "the field",
-    "rng": "the world's random stream",
-    "rolling_friction": "range of the rolling friction",
-    "row": "the row",
-    "running_command": "smallest ``command_size`` at which the robot should run",
-    "running_pose_std": "array of Params: standard deviation of each joint while running (rad)",
-    "saturation_torque": "torque of a motor at rest (N m)",
-    "scale": "range of the factors",
-    "seconds": "range of the duration (s)",
-    "sensordata": "the field",
-    "share": "probability",
-    "shear": "s12, s13 and s23 of the matrix D",
-    "shift": "offset of the body's mass in the body's axes (m)",
-    "site_xpos": "the field",
-    "sliding_friction": "range of the sliding friction",
-    "soft_limit": "fraction of a joint's range that has no cost, around the middle of the range",
-    "source": "the row to read",
-    "spinning_friction": "range of the spinning friction",
-    "standing": "row of memory with 1 number, which is 1 if the robot should stand",
-    "standing_pose_std": "array of Params: standard deviation of each joint while standing (rad)",
-    "stretch": "logarithms of the diagonal of the matrix D",
-    "substep_dt": "seconds in a substep",
-    "subtree_angmom": "the field",
-    "swing_height": "row of memory: greatest height of each foot in its last swing (m)",
-    "swing_target": "desired height of a foot in its swing (m)",
-    "swing_time": "row of memory: duration of each foot's last swing (s)",
-    "target": "the row to write",
-    "target_heading": "the commanded heading (rad)",
-    "target_height": "desired height of the base (m)",
-    "tilt_variance": "squared sine of the tilt at which the term is 1 / e",
-    "timer": "row of memory with 1 number: the seconds left",
-    "torque": "desired torque (N m)",
-    "touching": "whether the foot touches the ground",
-    "value": "the row to append",
-    "velocity": "velocity in the world's axes (m/s)",
-    "velocity_limit": "no-load speed of a motor (rad/s)",
-    "walking_pose_std": "array of Params: standard deviation of each joint while walking (rad)",
-    "wanted_air_time": "shortest duration of a rewarded swing (s)",
-    "width": "number of elements of one value in a history",
-}
-"""The meanings of arguments by name."""
+ARGUMENTS = dict(line.strip().split(": ", 1) for line in str(__doc__).splitlines() if line.startswith("    "))
+"""The meanings of arguments by name, from the list above."""
 
-for _name in __all__:
-    document_arguments(globals()[_name], ARGUMENTS)
+for _function in map(__getattr__, __all__):
+    _overloads = (*_function.user_overloads.values(), *_function.user_templates.values())
+    _names = dict.fromkeys(name for overload in _overloads for name in overload.input_types)
+    if _names:
+        _text = listed({name: ARGUMENTS[name] for name in _names})
+        _function.__doc__ = f"{inspect.cleandoc(_function.__doc__)}\n\nArgs:\n{_text}\n"
