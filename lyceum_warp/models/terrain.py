@@ -1,4 +1,4 @@
-"""Make rough ground from a height field with patches of increasing difficulty."""
+"""Make rough ground: a height field of patches of increasing difficulty, and the tables for its height scan."""
 
 import dataclasses
 import functools
@@ -149,14 +149,14 @@ class Terrain:
     def heights(self) -> np.ndarray:
         """Compute all heights, (points along y, points along x) in m."""
         cells, edge = self._cells, round(self.border / self.resolution)
-        found = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
+        heights = np.zeros([count * cells + 1 + 2 * edge for count in (self.levels, len(self.columns))])
         for level in range(self.levels):
             for column in range(len(self.columns)):
                 row, start = edge + level * cells, edge + column * cells
                 # the outline stays 0
-                inner = found[row + 1 : row + cells, start + 1 : start + cells]
+                inner = heights[row + 1 : row + cells, start + 1 : start + cells]
                 inner[:] = self._patch(level, column)[1:-1, 1:-1]
-        return found
+        return heights
 
     @functools.cached_property
     def origins(self) -> np.ndarray:
@@ -166,12 +166,13 @@ class Terrain:
         """
         cells, edge, around = self._cells, round(self.border / self.resolution), round(0.5 / self.resolution)
         around = min(around, cells // 2)
-        found = np.zeros((self.levels, len(self.columns), 3))
-        for level, column in np.ndindex(found.shape[:2]):
-            row, start = (edge + i * cells + cells // 2 for i in (level, column))
+        origins = np.zeros((self.levels, len(self.columns), 3))
+        for level, column in np.ndindex(origins.shape[:2]):
+            row = edge + level * cells + cells // 2
+            start = edge + column * cells + cells // 2
             near = self.heights[row - around : row + around + 1, start - around : start + around + 1]
-            found[level, column] = (*self._corner + self.patch * (np.array([column, level]) + 0.5), near.max())
-        return found
+            origins[level, column] = (*self._corner + self.patch * (np.array([column, level]) + 0.5), near.max())
+        return origins
 
     def add_to(self, spec: mujoco.MjSpec, *, name: str = "terrain") -> None:
         """Add the ground to a model in place of the world's plane.
@@ -248,12 +249,12 @@ def height_table(model: mujoco.MjModel, name: str) -> np.ndarray:
     position, (along_x, along_y, height, _) = data.geom_xpos[geoms[0]], model.hfield_size[number]
     nrow, ncol = int(model.hfield_nrow[number]), int(model.hfield_ncol[number])
     start = model.hfield_adr[number]
-    found = np.zeros((1 + nrow, 1 + ncol))
-    found[0, 1:] = position[0] + np.linspace(-along_x, along_x, ncol)
-    found[1:, 0] = position[1] + np.linspace(-along_y, along_y, nrow)
+    table = np.zeros((1 + nrow, 1 + ncol))
+    table[0, 1:] = position[0] + np.linspace(-along_x, along_x, ncol)
+    table[1:, 0] = position[1] + np.linspace(-along_y, along_y, nrow)
     heights = model.hfield_data[start : start + nrow * ncol].reshape(nrow, ncol)
-    found[1:, 1:] = position[2] + height * heights.astype(float)
-    return found
+    table[1:, 1:] = position[2] + height * heights.astype(float)
+    return table
 
 
 def height_field(name: str) -> Any:
@@ -281,5 +282,6 @@ def scan_grid(length: float, width: float, *, spacing: float = 0.1) -> np.ndarra
         width: Extent along y, in m.
         spacing: Distance between neighbouring points, in m.
     """
-    x, y = (np.linspace(-side / 2, side / 2, round(side / spacing) + 1) for side in (length, width))
+    x = np.linspace(-length / 2, length / 2, round(length / spacing) + 1)
+    y = np.linspace(-width / 2, width / 2, round(width / spacing) + 1)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -52,14 +52,14 @@ def servos(model: mujoco.MjModel, p: Any) -> list[int]:
         ValueError: A joint does not have exactly one actuator.
     """
     moved = np.where(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, model.actuator_trnid[:, 0], -1)
-    found = [np.flatnonzero(moved == joint) for joint in p.joints]
-    for joint, actuators in zip(p.joints, found, strict=True):
+    matches = [np.flatnonzero(moved == joint) for joint in p.joints]
+    for joint, actuators in zip(p.joints, matches, strict=True):
         if len(actuators) != 1:
             raise ValueError(
                 f"the joint {_name(model, _JOINT, joint)} has {len(actuators)} actuators but needs exactly one "
                 f"(tendon actuators do not count): change the model, or omit the joint from ``joints``"
             )
-    return [int(actuators[0]) for actuators in found]
+    return [int(actuators[0]) for actuators in matches]
 
 
 def controls(model: mujoco.MjModel, p: Any) -> np.ndarray:
@@ -173,7 +173,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     order = distances.argmin(1)
     feet = order, np.ones(len(order))
     vectors = (3 * order[:, None] + np.arange(3)).ravel(), np.tile(flip, len(order))
-    found: dict[str, Any] = {
+    maps: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
         "clock": (-1.0, -1.0),  # exchanging the legs shifts the clock's sine and cosine by half a cycle
@@ -185,8 +185,8 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     if hasattr(p, "scan"):
         scan = np.asarray(p.scan)
         rows = np.linalg.norm(scan[None] - scan[:, None] * flip[:2], axis=2).argmin(1)
-        found["height_scan"] = rows, np.ones(len(rows))
-    return Mirror(found)
+        maps["height_scan"] = rows, np.ones(len(rows))
+    return Mirror(maps)
 
 
 # legs
@@ -249,11 +249,11 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
         geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
         if not geoms:
             raise ValueError(f"no geom in foot_geoms belongs to the body of the foot {model.site(foot).name!r}")
-        found = np.concatenate([_with_margin(model, geom, spheres_of(model, data, geom)) for geom in geoms])
-        found[:, :3] -= data.xanchor[_last_joint(model, foot)]
-        spheres.append(found)
+        sole = np.concatenate([_with_margin(model, geom, spheres_of(model, data, geom)) for geom in geoms])
+        sole[:, :3] -= data.xanchor[_last_joint(model, foot)]
+        spheres.append(sole)
     most = max(map(len, spheres))
-    return np.array([np.resize(found, (most, 4)) for found in spheres])  # pad with copies
+    return np.array([np.resize(sole, (most, 4)) for sole in spheres])  # pad with copies
 
 
 def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -262,13 +262,13 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
     Raises:
         ValueError: A foot has no geom that can touch the ground.
     """
-    found = []
+    feet_geoms = []
     for foot in p.feet:
         touching = contact_geoms(model, int(model.site_bodyid[foot]))
         if not touching:
             raise ValueError(f"the foot {model.site(foot).name!r} has no geom that can touch the ground")
-        found += touching
-    return found
+        feet_geoms += touching
+    return feet_geoms
 
 
 def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
@@ -285,14 +285,14 @@ def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
     Raises:
         ValueError: The model has no sensor FOOT_force with three numbers.
     """
-    found = []
+    addresses = []
     for foot in p.feet:
         name = f"{model.site(foot).name}_force"
         sensor = mujoco.mj_name2id(model, _SENSOR, name)
         if sensor < 0 or model.sensor_dim[sensor] != 3:
             raise ValueError(f"the model has no sensor {name!r} of a contact's force: prepare_walker adds this sensor")
-        found.append(int(model.sensor_adr[sensor]))
-    return found
+        addresses.append(int(model.sensor_adr[sensor]))
+    return addresses
 
 
 def leg_of(model: mujoco.MjModel, body: int) -> list[int]:

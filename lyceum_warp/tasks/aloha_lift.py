@@ -93,7 +93,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 @lw.register
 class AlohaLift(lw.Task):
     model = lw.package_model("mujoco_warp", "test_data/aloha_pot/scene.xml", install="mujoco-warp>=4.0,<5")
-    keyframe, frame_skip, horizon, success_steps = "start", 8, 150, 10
+    keyframe = "start"
+    frame_skip, horizon, success_steps = 8, 150, 10
     obs = {"position": 16, "velocity": 22, "target": 14, "pot": 3, "pot_axes": 9, "handles_from_grips": 6}
     metrics, action_range = ("reach", "orient", "grasp", "lift"), (-1.0, 1.0)
     # planning with half the substeps is 1.9 times as fast; with longer substeps, contacts are softer and grasps fail

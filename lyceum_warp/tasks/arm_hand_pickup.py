@@ -91,7 +91,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 @lw.register
 class ArmHandPickup(lw.Task):
     model = jaco("jaco_arm.xml")
-    keyframe, frame_skip, horizon, success_steps = "home", 4, 300, 10
+    keyframe = "home"
+    frame_skip, horizon, success_steps = 4, 300, 10
     obs = {"joints": 9, "velocity": 9, "ball_velocity": 3, "ball": 3, "palm": 3, "goal": 3, "fingers": 9}
     metrics, action_range = ("palm_distance", "goal_distance", "finger_distances"), (-1.0, 1.0)
     # planners get larger values of ``far`` and ``finger_weight``

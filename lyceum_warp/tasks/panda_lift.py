@@ -88,7 +88,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 @lw.register
 class PandaLift(lw.Task):
     model = lw.package_model("robopal", "assets/models/manipulators/Panda/panda.xml", install="lyceum-warp[robots]")
-    keyframe, frame_skip, horizon, success_steps = "start", 8, 150, 10
+    keyframe = "start"
+    frame_skip, horizon, success_steps = 8, 150, 10
     obs = {"position": 9, "velocity": 15, "target": 8, "cube": 3, "cube_axes": 9, "cube_from_grip": 3}
     metrics = ("reach", "orient", "grasp", "lift")
     action_range = (-1.0, 1.0)

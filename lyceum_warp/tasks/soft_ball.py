@@ -107,7 +107,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @lw.register
 class SoftBall(lw.Task):
-    model, frame_skip, horizon, success_steps = "soft_ball.xml", 4, 200, 25
+    model = "soft_ball.xml"
+    frame_skip, horizon, success_steps = 4, 200, 25
     obs = {"gripper": 3, "gripper_speed": 3, "ball": 3, "ball_velocity": 3, "widths": 3, "to_grip": 3, "to_target": 3}
     metrics = ("near", "lifted", "squeezed")
     action_range = (-1.0, 1.0)

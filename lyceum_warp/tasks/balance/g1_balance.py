@@ -80,7 +80,7 @@ class G1Stand(balancing.Balance):
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = spec.copy().compile()
         pose = model.key("knees_bent").qpos
-        others = [joint for joint in spec.joints if joint.name not in LEGS][1:]
+        upper_joints = [joint for joint in spec.joints if joint.name not in LEGS][1:]
         servos = [servo for servo in spec.actuators if servo.target not in LEGS]
         hands = [pair for pair in spec.pairs if "hand" in pair.geomname1 + pair.geomname2]
         for element in (*spec.sensors, *spec.keys, *servos, *hands):
@@ -90,7 +90,7 @@ class G1Stand(balancing.Balance):
             for i, geom in enumerate(body.geoms):
                 if geom.meshname and geom.meshname in meshes[:i]:
                     spec.delete(geom)
-        for joint in others:
+        for joint in upper_joints:
             turn, turned = np.zeros(4), np.zeros(4)
             mujoco.mju_axisAngle2Quat(turn, joint.axis, pose[model.joint(joint.name).qposadr[0]])
             mujoco.mju_mulQuat(turned, joint.parent.quat, turn)

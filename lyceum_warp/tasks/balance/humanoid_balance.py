@@ -92,7 +92,8 @@ def stands(s: World, p: Params) -> bool:
 class HumanoidGetUp(HumanoidStand):
     """Gymnasium's humanoid gets up from its back or its front, and succeeds if it stands for a second."""
 
-    Params, initialize, randomize, success = GetUpParams, lie_down, turn_over, stands
+    Params = GetUpParams
+    initialize, randomize, success = lie_down, turn_over, stands
     terminations, success_steps = (), 67
     rewards = HumanoidStand.rewards | {
         "height_l2": -30.0,

@@ -37,14 +37,14 @@ def radii(model: mujoco.MjModel, p: Any) -> np.ndarray:
     The radii are along the geom's axes. The half length is 0 unless the geom is a capsule or a cylinder.
     """
     kind = mujoco.mjtGeom
-    found = np.zeros((len(p.geoms), 4))
-    for row, geom in zip(found, p.geoms, strict=True):
+    table = np.zeros((len(p.geoms), 4))
+    for row, geom in zip(table, p.geoms, strict=True):
         size, shape = model.geom_size[geom], model.geom_type[geom]
         long = shape in (kind.mjGEOM_CAPSULE, kind.mjGEOM_CYLINDER)
         row[:3] = size if shape == kind.mjGEOM_ELLIPSOID else size[0]
         row[2] *= shape != kind.mjGEOM_CYLINDER
         row[3] = size[1] * long
-    return found
+    return table
 
 
 @wp.struct

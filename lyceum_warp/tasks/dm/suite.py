@@ -27,8 +27,8 @@ def free_target(spec: mujoco.MjSpec) -> None:
 
 
 def count_contacts(spec: mujoco.MjSpec) -> None:
-    found = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
-    spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[found, 0, 1])
+    number = 1 << int(mujoco.mjtConDataField.mjCONDATA_FOUND)
+    spec.add_sensor(name="contacts", type=mujoco.mjtSensor.mjSENS_CONTACT, intprm=[number, 0, 1])
 
 
 def random_joints(model: mujoco.MjModel, p: Any) -> np.ndarray:

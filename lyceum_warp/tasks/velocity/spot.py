@@ -24,11 +24,8 @@ class Params(walking.Params):
 
 @lw.register
 class SpotVelocity(walking.Velocity):
-    model, keyframe, frame_skip = (
-        lw.playground_model("locomotion/spot/xmls/scene_mjx_feetonly_flat_terrain.xml"),
-        "home",
-        5,
-    )
+    model = lw.playground_model("locomotion/spot/xmls/scene_mjx_feetonly_flat_terrain.xml")
+    keyframe, frame_skip = "home", 5
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
