@@ -93,16 +93,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(argv: list[str]) -> int:
-    if argv[:1] in (["-h"], ["--help"]):
+    if argv[:1] in ([], ["-h"], ["--help"]):
         commands: Any = {name: type(name, (), {"__doc__": line}) for name, (_, line) in _COMMANDS.items()}
         tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])
-    if not argv:
-        raise ValueError(f"which command? The commands are {', '.join(_COMMANDS)}; lyceum-warp --help describes them")
-    name, *words = argv
+    name, *arguments = argv
     if name not in _COMMANDS:
         hint = did_you_mean(name, _COMMANDS, f"there are {', '.join(_COMMANDS)}")
         raise ValueError(f"there is no command {name!r}: {hint}")
     command = getattr(importlib.import_module(f"lyceum_warp.cli.{_COMMANDS[name][0]}"), name.capitalize())
     # arguments after the name of a bench/ program belong to that program
-    words, rest = (words[:1], words[1:]) if name == "bench" else (words, [])
-    return parse(command, f"lyceum-warp {name}", words).run(*rest) or 0
+    count = 1 if name == "bench" else len(arguments)
+    return parse(command, f"lyceum-warp {name}", arguments[:count]).run(*arguments[count:]) or 0

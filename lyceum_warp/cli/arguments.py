@@ -69,21 +69,21 @@ class OptionFlags:
     def __init_subclass__(
         cls, *, options: Sequence[type], omit: Collection[str] = (), defaults: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        own: dict[str, Any] = vars(cls).get("__annotations__", {})
+        declared: dict[str, Any] = vars(cls).get("__annotations__", {})
         types: dict[str, Any] = {}
         docs = attribute_docs(cls)
         for kind in options:
             types |= {name: hint for name, hint in typing.get_type_hints(kind).items() if name not in types}
             docs = attribute_docs(kind) | docs
         cls.__annotations__ = {}
-        for name, hint in (types | own).items():
+        for name, hint in (types | declared).items():
             if name in omit:
                 continue
             default = vars(cls).get(name)
             setattr(cls, name, default)
-            flag = hint if name in own else hint | None
-            shown = defaults.get(name, "") if default is None else None
-            text = tyro.conf.arg(help=" ".join(docs.get(name, "").split()), help_behavior_hint=shown)
+            flag = hint if name in declared else hint | None
+            default_text = defaults.get(name, "") if default is None else None
+            text = tyro.conf.arg(help=" ".join(docs.get(name, "").split()), help_behavior_hint=default_text)
             cls.__annotations__[name] = Annotated[flag, text]
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 
@@ -141,7 +141,7 @@ def parameters(texts: Iterable[str]) -> dict[str, Any]:
 
 def parameter(text: str) -> tuple[str, Any]:
     """Parse a task parameter or a solver limit, such as NAME=VALUE or NAME=0.7,inf."""
-    name, value = (part.strip() for part in text.partition("=")[::2])
+    name, _, value = map(str.strip, text.partition("="))
     parts = [part for part in value.strip("[]()").split(",") if part.strip()]
     if not name or not parts:
         raise ValueError(f"{text!r} must be written as NAME=VALUE")

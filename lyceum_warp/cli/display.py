@@ -138,20 +138,20 @@ def curve_table(rows: Sequence[Mapping[str, float | None]]) -> Table:
 
     Iterations that did not evaluate the mean policy are omitted if enough others remain.
     """
-    known = [_known(row) for row in rows]
-    evaluated = [row for row in known[1:-1] if "mean_return" in row]
-    shown = [known[0], *evaluated, known[-1]] if len(evaluated) >= 4 else known
-    if len(shown) > _TABLE_ROWS:
-        shown = [shown[round(i * (len(shown) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
+    iterations = [_known(row) for row in rows]
+    evaluated = [row for row in iterations[1:-1] if "mean_return" in row]
+    selection = [iterations[0], *evaluated, iterations[-1]] if len(evaluated) >= 4 else iterations
+    if len(selection) > _TABLE_ROWS:
+        selection = [selection[round(i * (len(selection) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
     columns = {}
     for heading, name, form in _COLUMNS:
-        cells = [format(row[name], form) if name in row else "" for row in shown]
-        if name == "reward_mean" and all("return_mean" in row for row in known):
+        cells = [format(row[name], form) if name in row else "" for row in selection]
+        if name == "reward_mean" and all("return_mean" in row for row in iterations):
             continue  # show rewards only if an iteration has no return
         if any(cells):
             columns[heading] = cells
     curve = table(columns)
-    sums = {what: round(sum(row.get(column, 0.0) for row in known)) for column, what in _COUNTED.items()}
+    sums = {what: round(sum(row.get(column, 0.0) for row in iterations)) for column, what in _COUNTED.items()}
     if bad := [counted(number, what) for what, number in sums.items() if number]:
         curve.caption = f"{' and '.join(bad)} in all {len(rows)} iterations"
     return curve

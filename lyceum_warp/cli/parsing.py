@@ -31,19 +31,19 @@ _ERRORS = (
 _CONFIG = (tyro.conf.DisallowNone, tyro.conf.OmitArgPrefixes)  # the word None is no value of an option
 
 
-def parse(command: type, prog: str, words: Sequence[str]) -> Any:
+def parse(command: type, prog: str, argv: Sequence[str]) -> Any:
     """Parse the options of a command, and return an instance of its class.
 
     If the class has an attribute ``USUAL``, --help describes only the options in it.
     """
-    if {"-h", "--help"} & set(words):
+    if {"-h", "--help"} & set(argv):
         _print_help(command, prog)
-    if "--help-all" in words:
-        words = ["--help"]
+    if "--help-all" in argv:
+        argv = ["--help"]
     options: Any
     with contextlib.redirect_stderr(io.StringIO()) as printed:
         try:
-            options, unknown = tyro.cli(command, prog=prog, args=words, config=_CONFIG, return_unknown_args=True)
+            options, unknown = tyro.cli(command, prog=prog, args=argv, config=_CONFIG, return_unknown_args=True)
         except SystemExit as error:
             if error.code:
                 raise ValueError(f"{_in_one_line(printed.getvalue())} ({prog} --help)") from None

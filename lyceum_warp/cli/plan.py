@@ -261,11 +261,11 @@ def _suggested_physics(task: type[Task]) -> str | None:
     return EnvOptions().changed(task.planning.options).physics.base
 
 
-def _fill(words: tuple[str, ...]) -> Any:
+def _fill(texts: tuple[str, ...]) -> Any:
     try:
-        numbers = [float(word) for word in words]
+        numbers = [float(text) for text in texts]
     except ValueError:
-        return " ".join(words)  # MPPIConfig raises an error for unknown words
+        return " ".join(texts)  # MPPIConfig raises an error for unknown words
     return numbers[0] if len(numbers) == 1 else numbers
 
 

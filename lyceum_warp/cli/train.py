@@ -56,8 +56,8 @@ def _default_texts() -> dict[str, str]:
     for algorithm, (_, config) in ALGORITHMS.items():
         for field in dataclasses.fields(config):
             default = getattr(config, field.name)
-            shown = " ".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else default
-            texts.setdefault(field.name, []).append(f"{algorithm} {shown}".strip())
+            text = " ".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else default
+            texts.setdefault(field.name, []).append(f"{algorithm} {text}".strip())
     return {name: f"({', '.join(each)})" for name, each in texts.items()}
 
 
