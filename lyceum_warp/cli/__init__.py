@@ -35,18 +35,7 @@ Only the module of the given command is imported, because most modules import to
 
 _DESCRIPTION = """Batched MuJoCo worlds for robot learning.
 
-$ lyceum-warp tasks
-$ lyceum-warp new my_task --model robot.xml
-$ lyceum-warp check my_task.py
-$ lyceum-warp train hopper --iterations 100
-$ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
-$ lyceum-warp export runs/hopper-20260101-120000 --to policy.onnx
-$ lyceum-warp plan reach --real-time
-$ lyceum-warp tune humanoid --short
-$ lyceum-warp view reach --mppi
-$ lyceum-warp bench throughput --short
-
-lyceum-warp COMMAND --help describes a command and its usual options, --help-all all its options.
+lyceum-warp COMMAND --help describes a command and its usual options, with examples. --help-all describes all options.
 """
 
 

@@ -55,15 +55,9 @@ class Settings(OptionFlags, options=[MPPIConfig]):
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
     The Python API also accepts a covariance matrix."""
-    smoothing: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="B0 B1 B2")] = None
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
-    termination: Annotated[str | None, tyro.conf.arg(metavar="stop|ignore")] = None
     update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling")] = None
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
-    include_plan: bool | None = None
-    spline: Annotated[str | None, tyro.conf.arg(metavar="zero|linear|cubic")] = None
-    between: Annotated[str | None, tyro.conf.arg(metavar="hold|linear")] = None
-    risk: Annotated[str | None, tyro.conf.arg(metavar="mean|worst")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
         """Override a configuration's settings with the given flags."""

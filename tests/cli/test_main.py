@@ -22,7 +22,7 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
     out = help_of([], capsys)
-    assert all(f"• {name} " in out and f"$ lyceum-warp {name}" in out for name in COMMANDS)
+    assert all(f"• {name} " in out for name in COMMANDS)
     for name in COMMANDS:
         assert f"$ lyceum-warp {name}" in help_of([name, "--help"], capsys)
 

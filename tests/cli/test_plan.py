@@ -148,13 +148,16 @@ def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytes
 def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_envs: list[lw.Env]) -> None:
     out = tmp_path / "run"
     options = ["--solver", "iterations=5", "--solver", "noslip_iterations=0", "--deterministic"]
+    options += ["--engine", "mujoco", "--nthread", "2"]
     assert plan(out, *QUIET, "--steps", "3", "--episodes", "2", *options, task="hopper") == 0
     plant, planner = made_envs
-    own = lw.make("hopper").model.opt
-    assert (plant.model.opt.integrator, plant.model.opt.iterations) == (own.integrator, own.iterations)
+    assert (plant.model.opt.integrator, plant.model.opt.iterations) == (mujoco.mjtIntegrator.mjINT_RK4, 100)
     assert (planner.model.opt.integrator, planner.model.opt.iterations) == (mujoco.mjtIntegrator.mjINT_EULER, 5)
     assert planner.options.physics.deterministic and not plant.options.physics.deterministic
-    settings = json.loads((out / "config.json").read_text())["planner"]
+    config = json.loads((out / "config.json").read_text())
+    assert [env.options.nthread for env in made_envs] == [1, 2]
+    assert (config["engine"], config["device"], config["nthread"]) == ("mujoco", "cpu", 2)
+    settings = config["planner"]
     assert settings["solver"] == {"iterations": 5, "noslip_iterations": 0}
     assert (settings["integrator"], settings["deterministic"]) == ("euler", True)
 
@@ -251,13 +254,6 @@ def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(t
     assert config["planner"]["temperature"] == 0.25
     assert config["params"] == {"temperature": 0.5} and config["planner_params"] == {"temperature": 0.75}
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
-
-
-def test_flag_nthread_sets_the_number_of_planner_threads(tmp_path: Path, made_envs: list[lw.Env]) -> None:
-    assert plan(tmp_path / "run", *QUIET, "--steps", "1", "--nthread", "2", "--engine", "mujoco") == 0
-    assert [env.options.nthread for env in made_envs] == [1, 2]
-    config = json.loads((tmp_path / "run" / "config.json").read_text())
-    assert (config["engine"], config["device"], config["nthread"]) == ("mujoco", "cpu", 2)
 
 
 def test_live_display_shows_the_real_time_factor_or_the_age_of_actions(capsys: pytest.CaptureFixture[str]) -> None:

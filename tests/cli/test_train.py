@@ -27,19 +27,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_task_metrics_are_columns_before_and_after_resuming(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    metered, out = str(Path(__file__).parent.parent / "metered_task.py"), tmp_path / "run"
-    assert train(out, "--iterations", "1", task=metered) == 0
-    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
-    for row in Run.open(out).rows():
-        forward, effort = row["metrics/forward"], row["metrics/effort"]
-        assert forward is not None and effort is not None
-        assert row["return_mean"] == pytest.approx(forward - 0.1 * effort, abs=1e-5)
-    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
-    printed = capsys.readouterr().out
-    assert " forward " in printed and " effort " in printed
-
-
 def test_train_and_eval_accept_a_task_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = tiny_task.changed(("dt: float", "dt: float\n    gain: float = 1.0"), ("class Tiny", "class Mine"))
     mine = tiny_task.write(tmp_path, f"{source}    horizon = 20\n", "mine.py")
@@ -343,10 +330,3 @@ def test_second_interrupt_ends_a_run_immediately(
     assert f"curve:      {out / 'curve.png'}" in shown and (out / "curve.png").stat().st_size > 1000
     assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
     assert metrics(out) == metrics(trained)
-
-
-def test_train_prints_the_result_of_the_transfer_test_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert train(tmp_path / "run", "--iterations", "1", "--horizon", "20", "--transfer") == 0
-    assert "transfer: Warp engine on cpu against C engine: same" in capsys.readouterr().out

@@ -61,15 +61,6 @@ def test_view_shows_a_task(opened: Opened) -> None:
     assert opened.options == {"host": "127.0.0.1", "port": 8123}
 
 
-@pytest.mark.long
-def test_view_shows_a_task_controlled_by_a_planner(opened: Opened) -> None:
-    opened.number = 12
-    assert cli.main(["view", "point_mass", "--mppi", "--samples", "4", "--horizon", "5", "--paused"]) == 0
-    (scene,) = opened.scenes
-    assert scene.controllers == ("mppi",) and scene.modes == ("controller", "passive")
-    assert opened.frames[-1].status.paused
-
-
 def test_view_shows_the_policy_of_a_run(opened: Opened, run: Path) -> None:
     assert cli.main(["view", str(run), "--seed", "3"]) == 0
     (scene,) = opened.scenes
