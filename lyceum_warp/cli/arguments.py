@@ -7,7 +7,7 @@ import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -81,9 +81,14 @@ class OptionFlags:
                 continue
             default = vars(cls).get(name)
             setattr(cls, name, default)
-            flag = hint if name in declared else hint | None
-            default_text = defaults.get(name, "") if default is None else None
-            text = tyro.conf.arg(help=" ".join(docs.get(name, "").split()), help_behavior_hint=default_text)
+            kinds = (hint, *typing.get_args(hint))
+            words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
+            flag = hint if name in declared else (str if words else hint) | None
+            text = tyro.conf.arg(
+                metavar="|".join(words) or None,
+                help=" ".join(docs.get(name, "").split()),
+                help_behavior_hint=defaults.get(name, "") if default is None else None,
+            )
             cls.__annotations__[name] = Annotated[flag, text]
         dataclasses.dataclass(frozen=True, kw_only=True)(cls)
 

@@ -56,7 +56,6 @@ class Settings(OptionFlags, options=[MPPIConfig]):
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
     The Python API also accepts a covariance matrix."""
     fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
-    update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling")] = None
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:

@@ -67,6 +67,8 @@ def test_openmp_threads_of_a_command_do_not_spin() -> None:
     ("train hopper --gamma high", "--gamma takes a number, not 'high'"),
     ("train hopper --hidden 64,64", "--hidden takes numbers separated by spaces, not '64,64'"),
     ("train hopper --seed None", "--seed takes a whole number, not 'None'"),
+    ("plan hopper --smoothing 1 2", "--smoothing takes FLOAT FLOAT FLOAT, not '1', '2'"),
+    ("plan hopper --risk best", "risk must be 'mean' or 'worst', not 'best'"),
     ("train hopper --iterations", "--iterations needs a value"),
     ("new robot --model robot.xml --template walk", "--template takes 'plain', 'velocity', not 'walk'"),
     ("new robot", "--model is missing"),
