@@ -34,8 +34,10 @@ from lyceum_warp.support.versions import versions
 
 FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
-NAMES = ("throughput", "npg", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "agreement",
-         "equivalence", "policies", "soak")  # fmt: skip
+NAMES = (
+    "throughput", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "agreement", "equivalence",
+    "policies", "soak",
+)  # fmt: skip
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")
 """Fields of stored results. Results are compared only if these fields are equal."""
@@ -133,14 +135,13 @@ class Experiment:
     """Measure a case; raise Skipped if this machine cannot."""
     tables: Callable[[Sequence[Row]], Sequence[Table]]
     """Make tables from the stored results of one machine."""
-    figure: Callable[[Sequence[Row]], Any] | None = None
-    """Draw the stored results of one machine; return None if there is nothing to draw."""
-    conditions: str = ""
+    conditions: str
     """Engine and physics of the results, for the page of tables."""
+    figure: Callable[[Sequence[Row]], Any] | None = None
+    """Plot the stored results of one machine; return None if there is nothing to plot."""
     options: type[Options] = Options
     packages: tuple[str, ...] = ()
     """Other libraries whose versions are stored with the results."""
-    apart: bool = False
     parallel: bool = False
     """Whether cases may run in subprocesses (``--jobs``)."""
     pooled: bool = False
@@ -348,7 +349,7 @@ def run(experiment: Experiment, options: Options) -> int:
     left = {name: case for name, case in cases.items() if name not in known}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are stored; the rest takes about {took}")
-    if options.jobs != 1 and not (experiment.apart or experiment.parallel):
+    if options.jobs != 1 and not experiment.parallel:
         raise ValueError(f"the cases of {experiment.name} compete for the cores: jobs must be 1")
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists():
@@ -380,7 +381,7 @@ def run(experiment: Experiment, options: Options) -> int:
 def outcomes(
     experiment: Experiment, cases: Sequence[Any], options: Options
 ) -> Iterator[tuple[Any, dict[str, Any] | Exception, float]]:
-    if not experiment.apart and options.jobs == 1:
+    if options.jobs == 1:
         for case in cases:
             began = time.perf_counter()
             try:

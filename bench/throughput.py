@@ -36,10 +36,10 @@ SUITE = (
 SUITE_WORLDS = (2, 16, 128)
 SCALED = ("humanoid",)
 PARTS = {
-    "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync", "dm_control"),
+    "sampling": ("native", "c", "warp", "envpool", "gym-async", "gym-sync"),
     "suite": ("dm_control", "c", "envpool"),
-    "single": ("gymnasium", "c", "envpool", "dm_control"),
-    "cores": ("native", "c", "envpool", "gym-async", "dm_control"),
+    "single": ("gymnasium", "c", "envpool"),
+    "cores": ("native", "c", "envpool", "gym-async"),
     "worlds": ("warp", "c"),
     "kept": ("c", "warp"),
 }
@@ -151,6 +151,11 @@ def rates(rows: Sequence[Row], contestant: str) -> list[float]:
     return [row.result["env_steps_per_second"] for row in rows if row.case["contestant"] == contestant]
 
 
+def contestants_of(part: str) -> tuple[str, ...]:
+    """Return the contestants of a part, and those of its earlier stored results."""
+    return tuple(dict.fromkeys((*PARTS[part], *LABELS)))
+
+
 def peers(rows: Sequence[Row]) -> str:
     found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
     return f" ({'; '.join(sorted(found))})" * bool(found)
@@ -166,7 +171,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         ("worlds", ("task", "worlds"), "Environment steps per second by worlds."),
     ):
         groups = grouped(rows, part, *by)
-        names = [name for name in PARTS[part] if any(rates(same, name) for same in groups.values())]
+        names = [name for name in contestants_of(part) if any(rates(same, name) for same in groups.values())]
         lines = []
         for place, same in groups.items():
             ratios = experiment.paired(same, "env_steps_per_second", UNITS[part]) if part in UNITS else {}
@@ -201,7 +206,7 @@ def kept_line(row: Row) -> list[str]:
 def figure(rows: Sequence[Row]) -> Any:
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
-    names = [name for name in PARTS["sampling"][1:] if any(found.get(name) for found in ratios.values())]
+    names = [name for name in contestants_of("sampling")[1:] if any(found.get(name) for found in ratios.values())]
     if not names:
         return None
     made = new_figure("throughput", 9.5, 3.9)

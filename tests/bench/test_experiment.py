@@ -55,7 +55,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
         drawn.subplots().plot([row.result["rate"] for row in rows])
         return drawn
 
-    made = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, figure)
+    made = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, "C engine", figure)
     monkeypatch.setattr(experiment, "NAMES", ("toy",))
     monkeypatch.setitem(sys.modules, "toy", SimpleNamespace(EXPERIMENT=made))
     return SimpleNamespace(measured=measured, main=lambda *words: experiment.main(made, [*map(str, words)]))
@@ -117,14 +117,6 @@ def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", experiment.NAMES)
-def test_tables_of_every_experiment_name_engine_and_physics(name: str) -> None:
-    conditions = experiment.load(name).conditions
-    assert "engine" in conditions and "physics" in conditions
-    path = experiment.RESULTS / f"{name}.md"
-    assert not path.exists() or conditions in path.read_text()
-
-
 def test_results_file_with_invalid_lines_raises_an_error(
     toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -134,24 +126,22 @@ def test_results_file_with_invalid_lines_raises_an_error(
 
 
 @pytest.mark.parametrize(
-    ("name", "words", "message"),
+    ("name", "words", "value"),
     [
-        ("throughput", "--tasks hoper", "there is no task 'hoper': did you mean hopper?"),
-        ("throughput", "--parts one", "there is no part 'one': there are sampling, suite, single, cores, worlds, kept"),
-        ("throughput", "--device cuda:99", "there is no GPU for --device cuda:99"),
-        ("mppi", "--jobs 2", "plans and GPU cases are timed alone: give --jobs 1, or --parts episodes"),
-        ("mppi", "--block 0", "episodes, block and repeats must be at least 1"),
-        ("npg", "--jobs 1000", "1000 jobs with 2 threads need 2000 cores"),
-        ("fidelity", "--nworld 0", "--nworld"),
+        ("throughput", "--tasks hoper", "'hoper': did you mean hopper?"),
+        ("throughput", "--device cuda:99", "cuda:99"),
+        ("throughput", "--jobs 2", "throughput compete for the cores"),
+        ("mppi", "--block 0", "block"),
+        ("fidelity", "--jobs 1000", "1000 jobs"),
     ],
 )
-def test_invalid_experiment_options_print_one_line(
-    name: str, words: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_invalid_options_are_named_in_one_line(
+    name: str, words: str, value: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     options = ["--short", "--out", str(tmp_path / "out.jsonl"), *words.split()]
     assert experiment.main(experiment.load(name), options) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"{name}: ") and message in error and error.count("\n") == 1
+    assert error.startswith(f"{name}: ") and value in error and error.count("\n") == 1
 
 
 def test_figures_and_tables_are_made_from_stored_results(
@@ -190,18 +180,13 @@ def test_other_library_runs_in_a_separate_virtual_environment(
     venvs._made.cache_clear()
     assert venvs.python_of("echo") == python
     assert capsys.readouterr().out.count("making a virtual environment for echo") == 1
-    worker.write_text("raise ValueError('no')")
-    with pytest.raises(RuntimeError, match="ValueError: no"):
-        venvs.run(python, worker)
     worker.write_text("import a_missing_package")
-    with pytest.raises(experiment.Skipped, match="worker.py needs the package a_missing_package"):
+    with pytest.raises(experiment.Skipped, match="a_missing_package"):
         venvs.run(python, worker)
     (tmp_path / "lost").mkdir()
     (tmp_path / "lost" / "requirements.txt").write_text(f"{tmp_path}/no_package.whl\n")
-    for _ in range(2):
-        with pytest.raises(experiment.Skipped, match="lost cannot be installed: .*no_package"):
-            venvs.python_of("lost")
-    assert capsys.readouterr().out.count("making a virtual environment for lost") == 1
+    with pytest.raises(experiment.Skipped, match="lost.*no_package"):
+        venvs.python_of("lost")
 
 
 TOY = """
@@ -225,17 +210,22 @@ def measure(case, options):
 def test_cases_run_in_subprocesses_on_separate_cores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "apart_toy.py").write_text(TOY)
+    (tmp_path / "parallel_toy.py").write_text(TOY)
     monkeypatch.syspath_prepend(str(tmp_path))
-    import apart_toy
+    import parallel_toy
 
     made = experiment.Experiment(
-        "toy", "A toy.", lambda options: [apart_toy.Case(i) for i in range(3)], lambda case: 60.0, apart_toy.measure,
-        lambda rows: [], None, apart=True,
-    )  # fmt: skip
+        "toy",
+        "A toy.",
+        cases=lambda options: [parallel_toy.Case(i) for i in range(3)],
+        estimate=lambda case: 60.0,
+        measure=parallel_toy.measure,
+        tables=lambda rows: [],
+        conditions="C engine",
+        parallel=True,
+    )
     out, before = tmp_path / "toy.jsonl", os.sched_getaffinity(0)
-    jobs = min(2, len(before))
-    assert experiment.main(made, ["--out", str(out), "--threads", "1", "--jobs", str(jobs)]) == 1
+    assert experiment.main(made, ["--out", str(out), "--threads", "1", "--jobs", "2"]) == 1
     assert "RuntimeError: it broke" in capsys.readouterr().err and os.sched_getaffinity(0) == before
     results = [found.result for found in experiment.read(out)]
     assert len(results) == 2 and len({result["process"] for result in results} | {os.getpid()}) == 3

@@ -18,7 +18,7 @@ import numpy as np
 KEPT_ACTIONS = 4096
 """Number of actions that are drawn before the clock starts."""
 
-ENVPOOL = {
+GYMNASIUM = {
     "hopper": "Hopper-v5",
     "walker2d": "Walker2d-v5",
     "half_cheetah": "HalfCheetah-v5",
@@ -30,6 +30,8 @@ ENVPOOL = {
     "pusher": "Pusher-v5",
     "inverted_pendulum": "InvertedPendulum-v5",
     "inverted_double_pendulum": "InvertedDoublePendulum-v5",
+}
+ENVPOOL = GYMNASIUM | {
     "cartpole": "CartpoleBalance-v1",
     "dm/cartpole_swingup": "CartpoleSwingup-v1",
     "dm/cheetah_run": "CheetahRun-v1",
@@ -45,7 +47,6 @@ def draw(low: np.ndarray, high: np.ndarray, envs: int, seed: int) -> np.ndarray:
 class Gymnasium:
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
         import gymnasium
-        from python_tasks import GYMNASIUM
 
         name = GYMNASIUM[task]
         self.single = contestant == "gymnasium"
@@ -72,28 +73,30 @@ class Gymnasium:
         self.env.close()
 
 
+def dm_control_env(task: str, seed: int) -> Any:
+    from dm_control import suite
+
+    domain, name = next(pair for pair in suite.ALL_TASKS if task == f"dm/{'_'.join(pair)}")
+    return suite.load(domain, name, task_kwargs={"random": seed})
+
+
 class DmControl:
-    """dm_control's environments in persistent subprocesses, or one environment in this process.
+    """dm_control's environments in persistent subprocesses.
 
     The authors of dm_control recommend subprocesses (github.com/google-deepmind/dm_control/issues/94). Each process
     gets one message per step; actions and results are in shared memory.
     """
 
     def __init__(self, contestant: str, task: str, envs: int, threads: int, seed: int) -> None:
-        from python_tasks import dm_control_env
-
         first = dm_control_env(task, seed)
         spec = first.action_spec()
         self.actions = draw(spec.minimum, spec.maximum, envs, seed)
         self.pipes: list[Connection] = []
-        if envs == 1:
-            self.one = Share(task, [seed], None, None)
-            return
         context = multiprocessing.get_context("fork")
         nobs = sum(int(np.prod(part.shape)) for part in first.observation_spec().values())
         self.shared_actions = shared(context, (envs, *spec.shape))
         results = shared(context, (envs, nobs + 2))
-        for part in np.array_split(np.arange(envs), threads):
+        for part in np.array_split(np.arange(envs), min(envs, threads)):
             here, there = context.Pipe()
             args = (there, task, [seed + int(i) for i in part], self.shared_actions[part[0] : part[-1] + 1],
                     results[part[0] : part[-1] + 1])  # fmt: skip
@@ -103,9 +106,6 @@ class DmControl:
             pipe.recv_bytes()
 
     def step(self, t: int) -> None:
-        if not self.pipes:
-            self.one.step(self.actions[t])
-            return
         self.shared_actions[:] = self.actions[t]
         for pipe in self.pipes:
             pipe.send_bytes(b"step")
@@ -123,30 +123,29 @@ def shared(context: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 class Share:
-    def __init__(self, task: str, seeds: list[int], actions: Any, results: Any) -> None:
-        from python_tasks import dm_control_env
+    """The environments of one subprocess."""
 
+    def __init__(self, task: str, seeds: list[int], actions: np.ndarray, results: np.ndarray) -> None:
         self.envs = [dm_control_env(task, seed) for seed in seeds]
         for env in self.envs:
             env.reset()
         self.actions, self.results = actions, results
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self) -> None:
         for i, env in enumerate(self.envs):
-            step = env.step(actions[i])
+            step = env.step(self.actions[i])
             reward, end = step.reward, step.last()
             if end:
                 step = env.reset()
             obs = np.concatenate([np.ravel(part) for part in step.observation.values()])
-            if self.results is not None:
-                self.results[i, :-2], self.results[i, -2], self.results[i, -1] = obs, reward, end
+            self.results[i, :-2], self.results[i, -2], self.results[i, -1] = obs, reward, end
 
     @classmethod
     def serve(cls, pipe: Connection, *args: Any) -> None:
         share = cls(*args)
         pipe.send_bytes(b"ready")
         while pipe.recv_bytes() == b"step":
-            share.step(share.actions)
+            share.step()
             pipe.send_bytes(b"done")
 
 
