@@ -116,10 +116,8 @@ def test_torch_loop_example_learns_to_approach_the_target(run) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
-def test_examples_are_short_and_use_public_names_only(path: Path) -> None:
+def test_examples_use_public_names_only(path: Path) -> None:
     source = path.read_text()
-    most = {"commanded_speed.py": 180, "random_search.py": 80, "td3.py": 150}
-    assert len(source.splitlines()) < most.get(path.name, 60)
     modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
     assert modules <= {"lyceum_warp", "lyceum_warp.testing"}
     assert not re.search(r"\b(env|plan|npg)\._", source)

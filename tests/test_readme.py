@@ -20,10 +20,3 @@ def test_every_python_block_of_the_readme_runs(task_file: TaskFile, capsys: pyte
     *_, first, second, third, planned = capsys.readouterr().out.splitlines()
     assert all(0 < float(line) < 200 for line in (first, second, third))
     assert planned.startswith("success: True")
-
-
-def test_hopper_in_the_readme_is_shorter_than_the_listing_in_the_paper() -> None:
-    """The paper's listing of Hopper takes 39 lines without comments."""
-    source = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)[1]
-    lines = [line for line in source.splitlines() if line.strip() and not line.strip().startswith("#")]
-    assert len(lines) < 39
