@@ -15,7 +15,7 @@ from training_runs import TINY
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.binding import file_name, package_task_names
+from lyceum_warp.binding import package_task_names
 from lyceum_warp.training import Run
 from lyceum_warp.tuning import search
 from lyceum_warp.viewer import show as views
@@ -227,12 +227,8 @@ def test_table_of_terms_is_up_to_date() -> None:
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
 
 
-def test_workflow_runs_the_checks_on_every_supported_python() -> None:
+def test_workflow_runs_on_every_supported_python() -> None:
     yaml = pytest.importorskip("yaml")
     workflow = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
-    job = workflow["jobs"]["check"]
-    commands = [step.get("run") for step in job["steps"]]
-    assert "bash .ci/run" in commands and "make test-all" in commands
-    assert "bash .ci/wheel" in [step.get("run") for step in workflow["jobs"]["wheel"]["steps"]]
     classifiers = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text())
-    assert job["strategy"]["matrix"]["python"] == classifiers
+    assert workflow["jobs"]["check"]["strategy"]["matrix"]["python"] == classifiers

@@ -117,14 +117,6 @@ def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys
     assert len(lines(path)) == 3 and "failed: task=walk repeat=0 contestant=ours" in capsys.readouterr().err
 
 
-def test_results_file_with_invalid_lines_raises_an_error(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "toy.jsonl").write_text("{}\n")
-    assert toy.main("--out", tmp_path / "toy.jsonl") == 2
-    assert capsys.readouterr().err.endswith("toy.jsonl: line 1 is not a result of an experiment\n")
-
-
 @pytest.mark.parametrize(
     ("name", "words", "value"),
     [

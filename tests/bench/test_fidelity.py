@@ -1,34 +1,11 @@
-import json
 import math
-from pathlib import Path
 from typing import Any
 
-import experiment
 import fidelity
 import pytest
 import torch
 
 import lyceum_warp as lw
-
-TASK = "point_mass"
-SMALL = ("--short", "--tasks", TASK, "--nworld", "3", "--steps", "4")
-
-
-def run(out: Path, *words: str) -> int:
-    return int(experiment.main(fidelity.EXPERIMENT, ["--out", str(out), *words]))
-
-
-def test_short_fidelity_run_compares_trajectories(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "fidelity.jsonl"
-    assert run(out, *SMALL) == 0
-    result = json.loads(out.read_text())["result"]
-    assert result["steps"] == [1, 4]
-    for found in result["pairs"].values():
-        low, high = found["obs"]["median"], found["obs"]["p99"]
-        assert all(0.0 <= a <= b < 1e-5 for a, b in zip(low, high, strict=True))
-        assert found["half_apart"] is None and found["faults"] == 0
-    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0
-    assert f"| {TASK} | 3 |" in capsys.readouterr().out
 
 
 def test_trajectories_with_different_dynamics_diverge(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +16,7 @@ def test_trajectories_with_different_dynamics_diverge(monkeypatch: pytest.Monkey
         return make(task, **(words | ({"engine": "mujoco", "frame_skip": 60} if words["engine"] == "warp" else {})))
 
     monkeypatch.setattr(fidelity.lw, "make", replaced)
-    pairs = fidelity.measure(fidelity.Case(TASK, 3, 4, "cpu", 0), fidelity.Options(threads=1))["pairs"]
+    pairs = fidelity.measure(fidelity.Case("point_mass", 3, 4, "cpu", 0), fidelity.Options(threads=1))["pairs"]
     assert pairs["engines"]["half_apart"] <= 4 and pairs["moved"]["half_apart"] is None
 
 

@@ -1,18 +1,5 @@
-from pathlib import Path
-
 import experiment
 import humanoid
-import pytest
-
-
-def test_short_humanoid_run_uses_every_control_loop(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["--short", "--threads", "1", "--out", str(tmp_path / "humanoid.jsonl")]
-    assert experiment.main(humanoid.EXPERIMENT, words) == 0
-    out = capsys.readouterr().out
-    assert "| humanoid_stand | in real time | 1 | horizon 40," in out and "physics fast | 1 of 1 " in out
-    for row in experiment.read(tmp_path / "humanoid.jsonl"):
-        assert row.result["seconds"] == pytest.approx(0.3) and not row.result["fell"] and row.result["up_share"] == 1.0
-        assert "physics fast" in row.case["settings"]
 
 
 def test_each_humanoid_task_has_its_own_success_criterion() -> None:

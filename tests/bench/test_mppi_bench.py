@@ -1,16 +1,10 @@
-from pathlib import Path
 from typing import Any
 
-import experiment
 import mppi
 import pytest
 import torch
 
 import lyceum_warp as lw
-
-
-def main(out: Path, *words: str) -> int:
-    return experiment.main(mppi.EXPERIMENT, ["--short", "--threads", "1", "--out", str(out), *words])
 
 
 @pytest.mark.parametrize("task", ["reach", "half_cheetah", "adroit_pen"])
@@ -25,17 +19,6 @@ def test_plain_python_environments_return_the_rewards_of_the_package(task: str) 
     for _ in range(5):
         env.step(2.0 * torch.rand(env.action.shape, generator=generator) - 1.0)
         assert theirs.step(env.action[0].numpy().astype(float))[1] == pytest.approx(env.reward.item(), abs=2e-4)
-
-
-@pytest.mark.long
-def test_python_planner_reaches_the_return_of_mppi(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "mppi.jsonl"
-    assert main(out, "--contestants", "mppi", "python") == 0
-    assert "| reach | 30 x 16 | lyceum_warp, C engine |" in capsys.readouterr().out
-    rows = experiment.read(out)
-    assert all(row.result["plan_ms"] > 0.0 for row in rows)
-    returns = [row.result["return"] for row in rows if row.case["part"] == "episodes"]
-    assert max(returns) - min(returns) < 0.2 * abs(min(returns))
 
 
 def test_episode_that_was_measured_in_two_blocks_counts_once() -> None:

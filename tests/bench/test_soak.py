@@ -69,26 +69,9 @@ def test_soak_run_reports_missed_faults_and_faults_in_other_worlds(
 
 @pytest.mark.long
 def test_killed_and_resumed_training_equals_uninterrupted_training(work: Path, tmp_path: Path) -> None:
-    memory, kills = sorted(run(tmp_path / "soak.jsonl", "--short", "--parts", "kills", "memory", "--work", str(work)),
-                           key=len)  # fmt: skip
+    (kills,) = run(tmp_path / "soak.jsonl", "--short", "--parts", "kills", "--work", str(work))
     assert kills["kills"] == 1 and kills["exit_code"] == 0 and kills["iterations"] == 60
     assert kills["equal_rows"] and kills["equal_policy"]
-    assert len(memory["memory"]) == soak.SAMPLES and memory["bytes_per_env"] < 1e6
-
-
-def test_soak_run_with_random_actions_counts_faults_without_injecting_any(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("--short", "--parts", "random", "--threads", "1", "--nworld", "16", "--steps", "1600")
-    (result,) = run(tmp_path / "soak.jsonl", *words)
-    assert result["steps"] == 1600 and result["first"] is None and not any(result["faults"].values())
-    assert "| point_mass | mujoco, cpu | 16 | 1,600 | " in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("device", ["cpu", "cuda"])
-def test_random_part_of_the_soak_runs_every_task(device: str) -> None:
-    cases = soak.cases(soak.Options(parts=("random",), device=device))
-    assert [case.task for case in cases] == lw.task_names() and {case.steps for case in cases} == {10**6}
 
 
 def test_stored_random_runs_are_as_long_as_claimed_and_without_faults() -> None:

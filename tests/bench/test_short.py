@@ -1,0 +1,93 @@
+"""Run experiments with --short, and check the results on which their claims depend."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import experiment
+import pytest
+
+Result = dict[str, Any]
+
+
+def agreement(hopper: Result, ant: Result) -> None:
+    assert hopper["obs"] < 1e-6 and hopper["reward"] < 1e-5 and hopper["agree_steps"] == 100
+    assert hopper["terminations"] > 0 == hopper["different_terminations"]
+    # Gymnasium computes the ant's contact forces after the last substep
+    assert ant["obs"] < 1e-6 < 1e-3 < ant["contact_force"]
+
+
+def equivalence(*results: Result) -> None:
+    assert all(30.0 < result["area"] < 200.0 and result["curve"][-1][0] == 2000 for result in results)
+
+
+def fidelity(result: Result) -> None:
+    assert result["steps"] == [1, 4]
+    for pair in result["pairs"].values():
+        assert all(0.0 <= low <= high < 1e-5 for low, high in zip(*pair["obs"].values(), strict=True))
+        assert pair["half_apart"] is None and pair["faults"] == 0
+    assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0
+
+
+def humanoid(*results: Result) -> None:
+    assert all(not result["fell"] and result["up_share"] == 1.0 for result in results)
+
+
+def latency(*results: Result) -> None:
+    for result in results:
+        assert result["plans"] > 1 and 0.0 < result["plan_ms"] <= result["max_ms"] and result["deadline_ms"] == 20.0
+        assert result["age_steps"] <= result["age_steps_max"] and result["episodes"] == 1
+
+
+def mppi(*results: Result) -> None:
+    returns = [result["return"] for result in results if "return" in result]
+    assert len(returns) == 2 and max(returns) - min(returns) < 0.2 * abs(min(returns))
+
+
+def policies(result: Result) -> None:
+    engines, physics = result["comparisons"]
+    assert (engines["first"], engines["second"]) == ("C engine", "Warp engine on cpu")
+    assert physics["second"] == "fast physics"
+
+
+def soak(random: Result, memory: Result) -> None:
+    assert random["steps"] == 1600 and random["first"] is None and not any(random["faults"].values())
+    assert memory["bytes_per_env"] < 1e6
+
+
+def throughput(*results: Result) -> None:
+    assert len(results) == 6 and all(result["env_steps_per_second"] > 0.0 for result in results)
+    assert results[-1]["kept"] > 0.0
+
+
+SHORT: dict[Callable[..., None], str] = {
+    agreement: "--tasks hopper ant",
+    equivalence: "--threads 1",
+    fidelity: "--tasks point_mass --nworld 3 --steps 4",
+    humanoid: "--threads 1",
+    latency: "--threads 1 --samples 8",
+    mppi: "--threads 1 --contestants mppi python",
+    policies: "",
+    soak: "--parts random memory --threads 1 --nworld 16 --steps 1600",
+    throughput: "--tasks hopper --contestants native c gymnasium gym-sync --threads 1 --parts sampling single kept",
+}
+"""For each check, named like its experiment, the options of the experiment."""
+
+
+@pytest.mark.quick("agreement", "fidelity", "humanoid", "policies", "throughput")
+@pytest.mark.parametrize("check", SHORT, ids=lambda check: check.__name__)
+def test_short_run_stores_plausible_results_once(
+    check: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = experiment.load(check.__name__)
+    words = ["--short", "--out", "out.jsonl", *SHORT[check].split()]
+    assert experiment.main(made, words) == 0
+    rows = experiment.read(tmp_path / "out.jsonl")
+    check(*(row.result for row in rows))
+    assert all(table.rows for table in made.tables(rows))
+    if made.figure is not None:
+        made.figure(rows).savefig("figure.png")
+    capsys.readouterr()
+    assert experiment.main(made, words) == 0
+    assert f"{made.name}: {len(rows)} of {len(rows)} cases are stored" in capsys.readouterr().out
