@@ -66,7 +66,8 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     parts = pair.ours.obs_space.parts
     forces = np.zeros(pair.ours.obs_space.size, bool)
     forces[parts.get("contact_force", slice(0, 0))] = True
-    obs, theirs = (np.array([row[i] for row in rows], float) for i in (0, 1))
+    obs = np.array([row[0] for row in rows], float)
+    theirs = np.array([row[1] for row in rows], float)
     error = np.abs(obs - theirs) / np.maximum(1.0, np.abs(theirs))
     far = np.flatnonzero((error[:, ~forces] > TOLERANCE).any(1))
     return {
@@ -111,14 +112,14 @@ def robotics_rows(case: Case) -> tuple[Any, list[tuple[Any, ...]]]:
 def tables(rows: Sequence[Row]) -> list[Table]:
     lines = []
     for row in rows:
-        found = row.result
-        ours, theirs = found["solvers"]
-        force = found["contact_force"]
+        result = row.result
+        ours, theirs = result["solvers"]
+        force = result["contact_force"]
         lines.append([
-            row.case["task"], f"{ours}, {theirs}", f"{found['agree_steps']:,} of {row.case['steps']:,}",
-            f"{found['obs']:.0e}", "" if force is None else f"{force:.2g}",
-            f"{found['reward']:.0e} ({found['reward_scale']:.2g})",
-            f"{found['different_terminations']} of {found['terminations']}",
+            row.case["task"], f"{ours}, {theirs}", f"{result['agree_steps']:,} of {row.case['steps']:,}",
+            f"{result['obs']:.0e}", "" if force is None else f"{force:.2g}",
+            f"{result['reward']:.0e} ({result['reward_scale']:.2g})",
+            f"{result['different_terminations']} of {result['terminations']}",
         ])  # fmt: skip
     title = (
         "Largest differences between a task on the C engine with its own physics and the unmodified environment of "

@@ -137,35 +137,35 @@ def differences(
 ) -> Iterator[Difference]:
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
-        whole = f"{unit}/{name}"
+        path = f"{unit}/{name}"
         if name not in new:
-            yield Difference(whole, f"removed: {old[name].dtype} {old[name].shape}")
+            yield Difference(path, f"removed: {old[name].dtype} {old[name].shape}")
         elif name not in old:
-            yield Difference(whole, f"added: {new[name].dtype} {new[name].shape}")
-        elif (found := difference(whole, old[name], new[name], axes.get(name, ()))) is not None:
-            yield found
+            yield Difference(path, f"added: {new[name].dtype} {new[name].shape}")
+        elif (change := difference(path, old[name], new[name], axes.get(name, ()))) is not None:
+            yield change
 
 
 # checkouts
 
 
 @contextlib.contextmanager
-def checkout(given: str, folder: Path) -> Iterator[tuple[Path, str]]:
+def checkout(source: str, folder: Path) -> Iterator[tuple[Path, str]]:
     """Yield a checkout's folder and its description. Unpack a git revision into the empty ``folder`` first."""
-    if Path(given, PACKAGE, "__init__.py").is_file():
-        yield Path(given).resolve(), str(Path(given).resolve())
+    if Path(source, PACKAGE, "__init__.py").is_file():
+        yield Path(source).resolve(), str(Path(source).resolve())
         return
     git = ["git", "-C", str(ROOT)]
-    found = subprocess.run(
-        [*git, "rev-parse", "--verify", "--quiet", f"{given}^{{commit}}"], capture_output=True, text=True, check=False
+    revision = subprocess.run(
+        [*git, "rev-parse", "--verify", "--quiet", f"{source}^{{commit}}"], capture_output=True, text=True, check=False
     )
-    if found.returncode:
-        raise ValueError(f"{given!r} is neither a folder with {PACKAGE}/ nor a revision of git: give one of them")
-    commit = found.stdout.strip()
+    if revision.returncode:
+        raise ValueError(f"{source!r} is neither a folder with {PACKAGE}/ nor a revision of git: give one of them")
+    commit = revision.stdout.strip()
     packed = subprocess.run([*git, "archive", "--format=tar", commit, PACKAGE], capture_output=True, check=True).stdout
     with tarfile.open(fileobj=io.BytesIO(packed)) as files:
         files.extractall(folder, filter="data")
-    yield folder.resolve(), f"{given} ({commit[:10]})"
+    yield folder.resolve(), f"{source} ({commit[:10]})"
 
 
 class Side:
@@ -179,20 +179,20 @@ class Side:
     def start(self) -> None:
         path = os.pathsep.join([str(self.root), *filter(None, [os.environ.get("PYTHONPATH")])])
         # Warp's compiler leaves temporary files here if the process is killed
-        own = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
+        variables = {"PYTHONPATH": path, "TMPDIR": str(self.folder), "CUBLAS_WORKSPACE_CONFIG": ":4096:8"}
         with self._log.open("w") as log:
             # -P keeps bench/ off sys.path, where its modules could shadow others
             self._process = subprocess.Popen(
-                [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | own, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
+                [sys.executable, "-P", str(PROBE), str(self._file)], cwd=self.folder, env=os.environ | variables,
+                text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, start_new_session=True,
             )  # fmt: skip
 
     def contents(self) -> dict[str, Any]:
-        found = self.answer()
-        if "file" in found and not Path(found["file"]).is_relative_to(self.root):
-            text = f"imports {found['file']} instead of {self.root}"
+        contents = self.answer()
+        if "file" in contents and not Path(contents["file"]).is_relative_to(self.root):
+            text = f"imports {contents['file']} instead of {self.root}"
             return {"failure": {"text": text, "trace": "", "missing": False}}
-        return found
+        return contents
 
     def ask(self, unit: Mapping[str, Any]) -> None:
         self._file.unlink(missing_ok=True)
@@ -230,10 +230,10 @@ class Side:
 
 
 def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> Iterator[Unit]:
-    given = set(options.tasks)
+    requested = set(options.tasks)
 
-    def chosen(default: Sequence[str]) -> list[str]:
-        if given and not given & set(default):
+    def selection(default: Sequence[str]) -> list[str]:
+        if requested and not requested & set(default):
             return list(tasks)
         return [task for task in default if task in tasks]
 
@@ -250,19 +250,19 @@ def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> It
                     variants = EVERY_VARIANT if task in MANY_PLANNERS else EVERY_VARIANT[:1]
                     yield Unit(part, task, engine, {"variants": variants})
             elif part == "learners":
-                for task in chosen(LEARNING[engine]):
+                for task in selection(LEARNING[engine]):
                     for learner in learners:
                         more = {"learner": learner, "iterations": options.iterations}
                         yield Unit(part, task, engine, more, learner)
             else:
-                for task in chosen(COMMANDS[engine]):
+                for task in selection(COMMANDS[engine]):
                     yield Unit(part, task, engine, {"iterations": options.iterations})
 
 
 @dataclasses.dataclass
 class Report:
     ignore: Sequence[str]
-    found: list[Difference] = dataclasses.field(default_factory=list)
+    differences: list[Difference] = dataclasses.field(default_factory=list)
     skipped: list[str] = dataclasses.field(default_factory=list)
     """Names of the units whose models are missing."""
     differing: int = 0
@@ -270,24 +270,24 @@ class Report:
     arrays: int = 0
     ignored: int = 0
 
-    def kept(self, name: str) -> bool:
+    def selects(self, name: str) -> bool:
         if any(fnmatch.fnmatchcase(name, pattern) for pattern in self.ignore):
             self.ignored += 1
             return False
         return True
 
-    def add(self, name: str, found: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
+    def add(self, name: str, differences: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
         """Add the differences found in a unit of work, and print them."""
-        self.found += found
-        self.differing += bool(found)
+        self.differences += differences
+        self.differing += bool(differences)
         self.units += 1
         self.arrays += arrays
-        summary = f"{len(found)} differences" if found else "equal"
+        summary = f"{len(differences)} differences" if differences else "equal"
         print(f"{name}: {summary}, {arrays} arrays, {seconds:.1f} s", flush=True)
-        for each in found[:LINES]:
+        for each in differences[:LINES]:
             print(f"    {each.name.removeprefix(f'{name}/')}: {each.text}", flush=True)
-        if len(found) > LINES:
-            print(f"    and {len(found) - LINES} more", flush=True)
+        if len(differences) > LINES:
+            print(f"    and {len(differences) - LINES} more", flush=True)
 
 
 def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
@@ -309,14 +309,15 @@ def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report)
         print(f"{unit.name}: skipped, {answers['new']['failure']['text']}", flush=True)
         return
     old, new = (
-        {name: array for name, array in side.arrays().items() if report.kept(f"{unit.name}/{name}")} for side in sides
+        {name: array for name, array in side.arrays().items() if report.selects(f"{unit.name}/{name}")}
+        for side in sides
     )
     axes = {**answers["new"].get("axes", {}), **answers["old"].get("axes", {})}
-    found = [each for each in failures(unit.name, answers) if report.kept(each.name)]
-    if found:  # arrays that are missing because of a failure are not reported
+    changes = [each for each in failures(unit.name, answers) if report.selects(each.name)]
+    if changes:  # arrays that are missing because of a failure are not reported
         old, new = ({name: array for name, array in side.items() if name in old and name in new} for side in (old, new))
-    found += differences(unit.name, old, new, axes)
-    report.add(unit.name, found, time.perf_counter() - began, len({**old, **new}))
+    changes += differences(unit.name, old, new, axes)
+    report.add(unit.name, changes, time.perf_counter() - began, len({**old, **new}))
 
 
 def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
@@ -326,19 +327,19 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
     if failed := failures("package", contents):
         report.add("package", failed)
         return
-    old, new = (contents[side.name]["tasks"] for side in sides)
-    wanted = options.tasks or (SHORT if options.short else sorted({*old, *new}))
-    for task in wanted:
+    old, new = contents["old"]["tasks"], contents["new"]["tasks"]
+    names = options.tasks or (SHORT if options.short else sorted({*old, *new}))
+    for task in names:
         if task not in old and task not in new:
             raise ValueError(f"neither checkout has a task {task!r}: there are {', '.join(sorted({*old, *new}))}")
     one_sided = [
         Difference(f"tasks/{task}", "added" if task in new else "removed")
-        for task in wanted
-        if (task in old) != (task in new) and report.kept(f"tasks/{task}")
+        for task in names
+        if (task in old) != (task in new) and report.selects(f"tasks/{task}")
     ]
     if one_sided:
         report.add("tasks", one_sided)
-    tasks = [task for task in wanted if task in old and task in new]
+    tasks = [task for task in names if task in old and task in new]
     learners = [name for name in contents["old"]["learners"] if name in contents["new"]["learners"]]
     for unit in units(options, tasks, learners):
         compare_unit(unit, sides, options.device, report)
@@ -354,10 +355,10 @@ def run(options: Options) -> Report:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lyceum-warp-compare-")))
         sides = []
-        for name, given in (("old", options.old), ("new", options.new)):
+        for name, source in (("old", options.old), ("new", options.new)):
             for part in ("checkout", "files"):
                 (folder / name / part).mkdir(parents=True)
-            root, described = stack.enter_context(checkout(given, folder / name / "checkout"))
+            root, described = stack.enter_context(checkout(source, folder / name / "checkout"))
             print(f"{name}: {described}", flush=True)
             sides.append(Side(name, root, folder / name / "files"))
             stack.callback(sides[-1].close)
@@ -368,7 +369,7 @@ def run(options: Options) -> Report:
     if report.ignored:
         print(f"excluded by --ignore: {report.ignored} names")
     compared = f"{report.arrays:,} arrays in {report.units} units, {seconds:.0f} s"
-    print(f"{len(report.found)} differences in {report.differing} units; {compared}" if report.found
+    print(f"{len(report.differences)} differences in {report.differing} units; {compared}" if report.differences
           else f"no difference: {compared}")  # fmt: skip
     return report
 
@@ -378,7 +379,7 @@ def main(options: Options) -> int:
     for number in (signal.SIGTERM, signal.SIGHUP):  # SIGTERM raises SystemExit, so temporary folders are removed
         signal.signal(number, lambda number, frame: sys.exit(128 + number))
     try:
-        return 1 if run(options).found else 0
+        return 1 if run(options).differences else 0
     except ValueError as error:
         print(f"compare: {error}", file=sys.stderr)
         return 2

@@ -59,13 +59,13 @@ def measure(
     torch.set_num_threads(1)
     with experiment.cores(threads):
         if contestant in ("c", "warp"):
-            made: LyceumWarp | Native = LyceumWarp(contestant, task, worlds, threads, device, seed)
+            stepper: LyceumWarp | Native = LyceumWarp(contestant, task, worlds, threads, device, seed)
         elif contestant == "native":
-            made = Native(task, worlds, threads, seed, warm)
+            stepper = Native(task, worlds, threads, seed, warm)
         else:
             settings = {"contestant": contestant, "task": task, "envs": worlds, "threads": threads}
             return venvs.run(python_of(contestant), WORKER, **settings, seed=seed, seconds=seconds, warm=warm)
-        steps, passed = sampling.timed(made.step, len(made.actions), warm, seconds, made.wait)
+        steps, passed = sampling.timed(stepper.step, len(stepper.actions), warm, seconds, stepper.wait)
     return {"env_steps_per_second": steps * worlds / passed, "steps": steps}
 
 
@@ -92,9 +92,10 @@ class LyceumWarp:
 
 def actions(env: lw.Env, seed: int) -> list[torch.Tensor]:
     """Return a list with the actions of each step; indexing a tensor would take time."""
-    low, high = (np.nan_to_num(x, posinf=1.0, neginf=-1.0) for x in (env.action_space.low, env.action_space.high))
-    drawn = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
-    return list(torch.as_tensor(drawn, dtype=torch.float32, device=env.obs.device))
+    low = np.nan_to_num(env.action_space.low, neginf=-1.0)
+    high = np.nan_to_num(env.action_space.high, posinf=1.0)
+    draws = sampling.draw(np.asarray(low), np.asarray(high), env.nworld, seed)
+    return list(torch.as_tensor(draws, dtype=torch.float32, device=env.obs.device))
 
 
 class Native:
@@ -120,12 +121,12 @@ class Native:
     def _split(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the states of a rollout, and the accelerations that warm-start its solver."""
         data = mujoco.MjData(self.model)
-        whole, full = mujoco.mjtState.mjSTATE_INTEGRATION.value, mujoco.mjtState.mjSTATE_FULLPHYSICS.value
-        physics = np.zeros((len(states), mujoco.mj_stateSize(self.model, full)))
+        integration, full_physics = mujoco.mjtState.mjSTATE_INTEGRATION.value, mujoco.mjtState.mjSTATE_FULLPHYSICS.value
+        physics = np.zeros((len(states), mujoco.mj_stateSize(self.model, full_physics)))
         warmstart = np.zeros((len(states), self.model.nv))
         for i, state in enumerate(states):
-            mujoco.mj_setState(self.model, data, state, whole)
-            mujoco.mj_getState(self.model, data, physics[i], full)
+            mujoco.mj_setState(self.model, data, state, integration)
+            mujoco.mj_getState(self.model, data, physics[i], full_physics)
             warmstart[i] = data.qacc_warmstart
         return physics, warmstart
 

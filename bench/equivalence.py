@@ -100,15 +100,15 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             areas = groups.setdefault((case["task"], case["samples"], device), {name: [] for name in ENGINES})
             areas[case["engine"]].append(row.result["area"])
     for (task, samples, device), areas in groups.items():
-        a, b = (np.array(areas[name]) for name in ENGINES)
+        a, b = np.array(areas["mujoco"]), np.array(areas["warp"])
         if min(len(a), len(b)) < 2:
             continue
-        found = equivalence(a, b)
-        verdict = found["verdict"] if found["margin"] < abs(a.mean()) else "margin exceeds the mean"
+        test = equivalence(a, b)
+        verdict = test["verdict"] if test["margin"] < abs(a.mean()) else "margin exceeds the mean"
         lines.append([
             task, f"{samples:,}", device, f"{len(a)}, {len(b)}", f"{a.mean():.5g} ± {a.std(ddof=1):.3g}",
-            f"{b.mean():.5g} ± {b.std(ddof=1):.3g}", f"{found['difference']:+.3g} ± {found['half']:.3g}",
-            f"{found['margin']:.3g}", verdict,
+            f"{b.mean():.5g} ± {b.std(ddof=1):.3g}", f"{test['difference']:+.3g} ± {test['half']:.3g}",
+            f"{test['margin']:.3g}", verdict,
         ])  # fmt: skip
     title = (
         "Area under NPG's learning curves on both engines, mean and standard deviation over seeds; the difference with "

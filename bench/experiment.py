@@ -153,15 +153,15 @@ def load(name: str) -> Experiment:
     return importlib.import_module(name).EXPERIMENT
 
 
-def choose(given: Sequence[str], known: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
+def choose(names: Sequence[str], choices: Iterable[str], default: Sequence[str] = (), *, what: str) -> tuple[str, ...]:
     """Return the given names, the default names or all known names: the first of these that is not empty."""
-    known = tuple(known)
-    for name in given:
-        if name not in known:
-            close = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(known)}"
+    choices = tuple(choices)
+    for name in names:
+        if name not in choices:
+            close = difflib.get_close_matches(name, choices, 1)
+            hint = f"did you mean {close[0]}?" if close else f"there are {', '.join(choices)}"
             raise ValueError(f"there is no {what} {name!r}: {hint}")
-    return tuple(given) or tuple(default) or known
+    return tuple(names) or tuple(default) or choices
 
 
 def installed(module: str, requirement: str) -> Any:
@@ -177,15 +177,15 @@ def installed(module: str, requirement: str) -> Any:
 
 
 def stored(names: Sequence[str], results: Path) -> dict[str, Path]:
-    found = {name: results / f"{name}.jsonl" for name in choose(names, NAMES, what="experiment")}
+    paths = {name: results / f"{name}.jsonl" for name in choose(names, NAMES, what="experiment")}
     if not names:
-        found = {name: path for name, path in found.items() if path.exists()}
-    for name, path in found.items():
+        paths = {name: path for name, path in paths.items() if path.exists()}
+    for name, path in paths.items():
         if not path.exists():
             raise FileNotFoundError(f"there is no {path}: run the experiment {name} first")
-    if not found:
+    if not paths:
         raise FileNotFoundError(f"there are no results in {results}: run an experiment first")
-    return found
+    return paths
 
 
 def read(path: Path) -> list[Row]:
@@ -245,12 +245,12 @@ def slug(row: Row) -> str:
 
 
 def described(rows: Sequence[Row]) -> str:
-    found = rows[-1].provenance
-    parts = [f"{found['cores']} cores ({found['cpu']})"]
-    if found.get("gpu"):
-        parts.append(f"{found['gpu']} (driver {found.get('driver')})")
+    provenance = rows[-1].provenance
+    parts = [f"{provenance['cores']} cores ({provenance['cpu']})"]
+    if provenance.get("gpu"):
+        parts.append(f"{provenance['gpu']} (driver {provenance.get('driver')})")
     names = {"mujoco": "mujoco", "mujoco_warp": "mujoco_warp", "warp_lang": "Warp", "torch": "torch"}
-    parts.append(", ".join(f"{label} {found.get(name)}" for name, label in names.items()))
+    parts.append(", ".join(f"{label} {provenance.get(name)}" for name, label in names.items()))
     by_date = sorted(rows, key=lambda row: row.provenance.get("date", ""))
     commits = dict.fromkeys(commit[:7] for row in by_date if (commit := row.provenance.get("commit")))
     dates = sorted({date[:10] for row in rows if (date := row.provenance.get("date"))})
@@ -270,10 +270,10 @@ def key(case: Mapping[str, Any]) -> str:
 
 def grouped(rows: Sequence[Row], *names: str) -> dict[tuple[Any, ...], list[Row]]:
     """Group rows by the named entries of their cases."""
-    found: dict[tuple[Any, ...], list[Row]] = {}
+    groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        found.setdefault(tuple(row.case.get(name) for name in names), []).append(row)
-    return found
+        groups.setdefault(tuple(row.case.get(name) for name in names), []).append(row)
+    return groups
 
 
 def paired(rows: Sequence[Row], quantity: str, unit: str) -> dict[str, list[float]]:
@@ -315,7 +315,7 @@ def duration(seconds: float) -> str:
 
 
 def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
-    found = versions(device)
+    entries = versions(device)
     if (program := shutil.which("nvidia-smi")) is not None and device.startswith("cuda"):
         index = device.partition(":")[2] or "0"
         query = f"--query-gpu={','.join(GPU_QUERY.values())}"
@@ -324,13 +324,13 @@ def provenance(experiment: Experiment, device: str) -> dict[str, Any]:
         )
         values = [value.strip() for value in done.stdout.strip().split(",")]
         if done.returncode == 0 and len(values) == len(GPU_QUERY):
-            found |= dict(zip(GPU_QUERY, values, strict=True))
+            entries |= dict(zip(GPU_QUERY, values, strict=True))
     peers = {}
     for package in experiment.packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             peers[package] = importlib.metadata.version(package)
     date = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return found | {"gpu": found.get("gpu"), "peers": peers, "date": date}
+    return entries | {"gpu": entries.get("gpu"), "peers": peers, "date": date}
 
 
 def run(experiment: Experiment, options: Options) -> int:
@@ -345,8 +345,8 @@ def run(experiment: Experiment, options: Options) -> int:
     path = options.out or folder / f"{experiment.name}.jsonl"
     rows, size = _read(path) if path.exists() else ([], 0)
     now = Row({}, {}, provenance(experiment, options.device), 0.0)
-    known = {key(row.case) for row in rows if machine(row) == machine(now) and software(row) == software(now)}
-    left = {name: case for name, case in cases.items() if name not in known}
+    stored_cases = {key(row.case) for row in rows if machine(row) == machine(now) and software(row) == software(now)}
+    left = {name: case for name, case in cases.items() if name not in stored_cases}
     took = duration(sum(map(experiment.estimate, left.values())) / max(1, options.jobs))
     print(f"{experiment.name}: {len(cases) - len(left)} of {len(cases)} cases are stored; the rest takes about {took}")
     if options.jobs != 1 and not experiment.parallel:

@@ -57,7 +57,8 @@ class Case:
 
 def cases(options: Options) -> list[Case]:
     tasks = experiment.choose(options.tasks, lw.task_names(), ("hopper",) if options.short else (), what="task")
-    nworld, steps = (whole_number(f"--{name}", getattr(options, name), low=1) for name in ("nworld", "steps"))
+    nworld = whole_number("--nworld", options.nworld, low=1)
+    steps = whole_number("--steps", options.steps, low=1)
     if options.short:
         nworld, steps = min(nworld, 8), min(steps, 20)
     return [
@@ -91,11 +92,11 @@ def faulty(env: lw.Env) -> torch.Tensor:
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
-    words: dict[str, Any] = {"nworld": case.nworld, "seed": case.seed}
+    worlds: dict[str, Any] = {"nworld": case.nworld, "seed": case.seed}
     endless = {"autoreset": False, "horizon": 0}
     try:
-        first = lw.make(case.task, engine="mujoco", nthread=options.threads, **words)
-        warp = lw.make(case.task, engine="warp", device=case.device, **words, **endless)
+        first = lw.make(case.task, engine="mujoco", nthread=options.threads, **worlds)
+        warp = lw.make(case.task, engine="warp", device=case.device, **worlds, **endless)
     except (FileNotFoundError, ImportError) as error:
         raise Skipped(f"{case.task}: {error}") from error
     actions = contestants.actions(first, case.seed)
@@ -104,31 +105,31 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         first.step(actions[t % len(actions)])
     state = rounded(first, first.get_state())
     c = first.replicate(**endless)
-    others = {"engines": warp, "rounded": c.replicate(), "moved": c.replicate()}
+    simulations = {"engines": warp, "rounded": c.replicate(), "moved": c.replicate()}
     c.set_state(state)
-    for name, env in others.items():
+    for name, env in simulations.items():
         env.set_state((moved(env, state, case.seed) if name == "moved" else state).to(env.obs.device))
     compared = torch.ones(c.obs_space.size, dtype=torch.bool)
     if (part := c.obs_space.parts.get("contact_force")) is not None:
         compared[part] = False
-    errors = {name: torch.full((case.steps, case.nworld), torch.nan) for name in others}
-    good = {name: torch.ones(case.nworld, dtype=torch.bool) for name in others}
+    errors = {name: torch.full((case.steps, case.nworld), torch.nan) for name in simulations}
+    good = {name: torch.ones(case.nworld, dtype=torch.bool) for name in simulations}
     bad = torch.zeros(case.nworld, dtype=torch.bool)
     for t in range(case.steps):
         action = actions[(SETTLING + t) % len(actions)]
         c.step(action)
         bad |= faulty(c)
-        for name, env in others.items():
+        for name, env in simulations.items():
             env.step(action.to(env.action.device))
             good[name] &= ~faulty(env) & ~bad
             gap = (env.obs.cpu() - c.obs).abs() / c.obs.abs().clamp(min=1.0)
             errors[name][t] = gap[:, compared].amax(1).masked_fill(~good[name], torch.nan)
             if name == "rounded":
                 env.set_state(rounded(env, env.get_state()), check=False)
-    shown = [*(t for t in SHOWN if t < case.steps), case.steps]
-    return {"steps": shown, "pairs": {
+    stored_steps = [*(t for t in SHOWN if t < case.steps), case.steps]
+    return {"steps": stored_steps, "pairs": {
         name: {
-            "obs": quantiles(error, shown),
+            "obs": quantiles(error, stored_steps),
             "half_apart": half_apart(error[:, good[name]]),
             "faults": int((~good[name]).sum()),
         }
@@ -136,11 +137,11 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     }}  # fmt: skip
 
 
-def quantiles(error: torch.Tensor, shown: Sequence[int]) -> dict[str, list[float | None]]:
+def quantiles(error: torch.Tensor, steps: Sequence[int]) -> dict[str, list[float | None]]:
     """Return the median and the 99 % quantile of the worlds' differences at each of the given steps."""
-    rows = error[[t - 1 for t in shown]].double()
-    found = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
-    return {name: [value if math.isfinite(value) else None for value in values] for name, values in found.items()}
+    rows = error[[t - 1 for t in steps]].double()
+    by_quantile = {name: rows.nanquantile(q, dim=1).tolist() for name, q in (("median", 0.5), ("p99", 0.99))}
+    return {name: [value if math.isfinite(value) else None for value in values] for name, values in by_quantile.items()}
 
 
 def half_apart(error: torch.Tensor) -> int | None:
@@ -153,8 +154,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     for row in sorted(rows, key=lambda row: row.case["task"]):
         pairs, steps = row.result["pairs"], row.result["steps"]
         at = []
-        for wanted in (*SHOWN, steps[-1]):
-            pair = [pairs["engines"]["obs"][q][steps.index(wanted)] if wanted in steps else None
+        for step in (*SHOWN, steps[-1]):
+            pair = [pairs["engines"]["obs"][q][steps.index(step)] if step in steps else None
                     for q in ("median", "p99")]  # fmt: skip
             at.append("" if None in pair else ", ".join(f"{value:.0e}" if value else "0" for value in pair))
         half = [str(pairs[name]["half_apart"] or f"> {steps[-1]}") for name in ("engines", "rounded", "moved")]

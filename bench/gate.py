@@ -90,15 +90,15 @@ class Case:
 
 
 def cases(options: Options) -> list[Case]:
-    found = []
+    cases = []
     for folder in options.policy:
         run = Run.open(folder)
         task = options.task or run.task_name
         gate = "nanoG1" if Path(task).name.startswith("g1_") else "walks"
         starts = 1 if options.short else NOISY_STARTS if gate == "nanoG1" else STARTS
         steps = 50 if options.short else STEPS
-        found.append(Case(task, gate, folder.name, digest(folder, options), starts, steps))
-    return found
+        cases.append(Case(task, gate, folder.name, digest(folder, options), starts, steps))
+    return cases
 
 
 def digest(folder: Path, options: Options) -> str:
@@ -141,8 +141,8 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
-    words = place | {"horizon": 0, "seed": 1000}
-    return run_worlds(Run.open(folder), words, params, nworld=nworld, task=options.task, trust=False)
+    env_options = place | {"horizon": 0, "seed": 1000}
+    return run_worlds(Run.open(folder), env_options, params, nworld=nworld, task=options.task, trust=False)
 
 
 def calm(env: lw.Env) -> dict[str, Any]:
@@ -197,19 +197,19 @@ def walks(case: Case, folder: Path, options: Options) -> dict[str, Any]:
     policy = lw.load(folder, which=options.which)
     commands = [command for command in COMMANDS for _ in range(case.starts)]
     memory = curriculum(folder, options)
-    found: dict[str, Any] = {"memory": memory.text}
+    result: dict[str, Any] = {"memory": memory.text}
     for prefix, params in (("", {"push_seconds": [NEVER, NEVER]}), ("pushed_", {})):
         env = worlds(folder, len(commands), options, **params)
         start_episodes(env, None, memory)
         played = play(env, policy, commands, case.steps, env.get_state())
-        found |= {
+        result |= {
             f"{prefix}falls": int(played.fell.any(0).sum()),
             f"{prefix}velocity_error": float(played.velocity_error.mean()),
             f"{prefix}yaw_rate_error": float(played.yaw_rate_error.mean()),
         }
         by_command = played.velocity_error.mean(0).reshape(len(COMMANDS), -1).mean(1)
-        found[f"{prefix}velocity_error_by_command"] = by_command.tolist()
-    return found
+        result[f"{prefix}velocity_error_by_command"] = by_command.tolist()
+    return result
 
 
 def within(kind: str, value: float, limit: float) -> bool:
@@ -228,7 +228,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    made = []
+    tables = []
     for row in rows:
         case, result = row.case, row.result
         lines = []
@@ -242,8 +242,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             f"{case['task']}: the policy {case['policy'][:8]} of {case['run']} {verdict} on the C engine under exact "
         )
         title += f"physics{memory}."
-        made.append(Table(title, ["", "measured", "limit", ""], lines))
-    return made
+        tables.append(Table(title, ["", "measured", "limit", ""], lines))
+    return tables
 
 
 EXPERIMENT = Experiment(

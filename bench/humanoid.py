@@ -85,21 +85,21 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
     params = STARTS | TASKS[case.task]
     with experiment.cores(case.threads):
         plant = lw.make(case.task, autoreset=False, nthread=1, **params)
-        words: dict[str, Any] = dict(steps=round(case.seconds / plant.timestep), seed=case.seed)
+        episode: dict[str, Any] = dict(steps=round(case.seconds / plant.timestep), seed=case.seed)
         if case.contestant == "in_turn":
-            done = lw.control(plant, planner(case.task, case.threads), **words)
+            trajectory = lw.control(plant, planner(case.task, case.threads), **episode)
         else:
             predict = case.contestant == "predicted"
-            done = lw.control_async(plant, planner(case.task, case.threads), predict=predict, **words)
-    report = lw.control_report([done])
-    positions = done.states[:, slice(*done.state_parts["qpos"])]
-    up = positions[:, 2] > UP
+            trajectory = lw.control_async(plant, planner(case.task, case.threads), predict=predict, **episode)
+    report = lw.control_report([trajectory])
+    positions = trajectory.states[:, slice(*trajectory.state_parts["qpos"])]
+    up, seconds = positions[:, 2] > UP, trajectory.steps * trajectory.timestep
     return {
-        "seconds": done.steps * done.timestep, "fell": bool(plant.terminated), "return": done.episode_return,
-        "speed": ((positions[-1, 0] - positions[0, 0]) / (done.steps * done.timestep)).item(),
+        "seconds": seconds, "fell": bool(plant.terminated), "return": trajectory.episode_return,
+        "speed": ((positions[-1, 0] - positions[0, 0]) / seconds).item(),
         "up_share": up.float().mean().item(), "up_at_the_end": bool(up[-round(0.05 * len(up)) :].all()),
         "plans": report.plans, "misses": report.misses, "plan_ms": report.plan_p50_ms,
-        "plan_max_ms": report.plan_max_ms, "oldest_action_steps": int(done.age_steps.max()),
+        "plan_max_ms": report.plan_max_ms, "oldest_action_steps": int(trajectory.age_steps.max()),
     }  # fmt: skip
 
 
@@ -118,16 +118,17 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     groups = experiment.grouped(rows, "task", "contestant", "threads", "settings")
     lines = []
     for (task, name, threads, settings_of_plans), same in groups.items():
-        found = [row.result for row in same]
-        plans, misses = (sum(one[key] for one in found) for key in ("plans", "misses"))
+        episodes = [row.result for row in same]
+        plans = sum(one["plans"] for one in episodes)
+        misses = sum(one["misses"] for one in episodes)
         lines.append([
             task, CONTESTANTS[name], str(threads), settings_of_plans,
-            share(sum(success(task, one) for one in found), len(found)),
-            median_and_range([one["seconds"] for one in found], ".1f"),
-            median_and_range([one["speed"] for one in found]), f"{1 - misses / max(plans, 1):.2%}",
-            median_and_range([one["plan_ms"] for one in found if one["plan_ms"]], ".1f"),
-            f"{max(one['plan_max_ms'] or 0.0 for one in found):.1f}",
-            str(max(one["oldest_action_steps"] for one in found)),
+            share(sum(success(task, one) for one in episodes), len(episodes)),
+            median_and_range([one["seconds"] for one in episodes], ".1f"),
+            median_and_range([one["speed"] for one in episodes]), f"{1 - misses / max(plans, 1):.2%}",
+            median_and_range([one["plan_ms"] for one in episodes if one["plan_ms"]], ".1f"),
+            f"{max(one['plan_max_ms'] or 0.0 for one in episodes):.1f}",
+            str(max(one["oldest_action_steps"] for one in episodes)),
         ])  # fmt: skip
     walks = ", ".join(f"{speed} m/s ({task})" for task, speed in WALKS.items())
     title = (

@@ -29,7 +29,8 @@ BLOCK = 10
 
 def next_controls(env: lw.Env) -> torch.Tensor:
     if (control := env.task.kernels.control_worlds) is None:
-        low, high = (torch.as_tensor(x, device=env.obs.device) for x in (env.action_space.low, env.action_space.high))
+        low = torch.as_tensor(env.action_space.low, device=env.obs.device)
+        high = torch.as_tensor(env.action_space.high, device=env.obs.device)
         return env.action.clamp(low, high)
     controls = wp.zeros_like(env.engine.ctrl)
     args = [env.worlds.after, env.worlds.params, env.worlds.action, controls]
@@ -124,7 +125,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             env.action.copy_(actions[t])
             env.step()
 
-    whole, alone = [], []
+    env_seconds, bare_seconds = [], []
     # the first blocks are not counted: they capture graphs, and a robot takes two seconds to start walking
     warm = max(2 if policy is None else 20, env.horizon // 500)
     for repetition in range(warm + blocks):
@@ -142,12 +143,12 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
             bare.load(snapshot)
             time_bare += seconds(env, bare.step)
         if repetition >= warm:
-            whole.append(time_env / BLOCK)
-            alone.append(time_bare / BLOCK)
+            env_seconds.append(time_env / BLOCK)
+            bare_seconds.append(time_bare / BLOCK)
     return {
-        "env_steps_per_second": env.nworld / statistics.median(whole),
-        "bare_steps_per_second": env.nworld / statistics.median(alone),
-        "kept": statistics.median(b / a for a, b in zip(whole, alone, strict=True)),
-        "added_microseconds": 1e6 * statistics.median(a - b for a, b in zip(whole, alone, strict=True)),
+        "env_steps_per_second": env.nworld / statistics.median(env_seconds),
+        "bare_steps_per_second": env.nworld / statistics.median(bare_seconds),
+        "kept": statistics.median(b / a for a, b in zip(env_seconds, bare_seconds, strict=True)),
+        "added_microseconds": 1e6 * statistics.median(a - b for a, b in zip(env_seconds, bare_seconds, strict=True)),
         "bytes_per_world": env.bytes_per_world,
     }

@@ -72,11 +72,11 @@ def cases(options: Options) -> list[Case]:
     samples = options.samples or (SAMPLES[:1] if short else SAMPLES)
     horizons = options.horizons or (HORIZONS[:1] if short else HORIZONS)
     sizes = {task: [(number, horizon) for horizon in horizons for number in samples] for task in tasks}
-    chosen = bool(options.samples or options.horizons or cuda)
+    unlimited = bool(options.samples or options.horizons or cuda)
     if options.own:
         if options.samples or options.horizons:
             raise ValueError("--own takes the samples and the horizon of each task: omit --samples and --horizons")
-        configs, chosen = {task: task_config(find_task(task)) for task in tasks}, True
+        configs, unlimited = {task: task_config(find_task(task)) for task in tasks}, True
         sizes = {task: [(config.samples, config.horizon)] for task, config in configs.items()}
     seconds, threads = 1.0 if short else options.seconds, options.threads or cpu_cores()
     devices = {"mujoco": "cpu", "warp": options.device}
@@ -84,15 +84,15 @@ def cases(options: Options) -> list[Case]:
         Case(task, physics, number, horizon, name, devices[name], threads, seconds, repeat)
         for repeat in range(options.repeats or 1) for task in tasks for physics in physics_of(task, options.physics)
         for number, horizon in sizes[task] for name in contestants
-        if chosen or expected(task, physics, number, horizon) < LONGEST
+        if unlimited or expected(task, physics, number, horizon) < LONGEST
     ]  # fmt: skip
 
 
 def physics_of(task: str, names: Sequence[str]) -> Sequence[str]:
-    found = find_task(task)
+    definition = find_task(task)
     if names:
-        return [name for name in names if name == "exact" or name in found.physics]
-    suggested = EnvOptions().changed(found.planning.options).physics.base
+        return [name for name in names if name == "exact" or name in definition.physics]
+    suggested = EnvOptions().changed(definition.planning.options).physics.base
     return ["own"] if suggested is None else list(dict.fromkeys((suggested, "exact")))
 
 
@@ -113,12 +113,12 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
     with experiment.cores(case.threads):
         plant = lw.make(case.task, autoreset=False, nthread=1)
-        words: dict[str, Any] = {} if case.physics == "own" else {"physics": case.physics}
+        placement: dict[str, Any] = {} if case.physics == "own" else {"physics": case.physics}
         if case.contestant == "mujoco":
-            words["nthread"] = case.threads
+            placement["nthread"] = case.threads
         planner = lw.MPPI(
             case.task, samples=case.samples, horizon=case.horizon, engine=case.contestant, device=case.device,
-            **words,
+            **placement,
         )  # fmt: skip
         done: list[lw.Trajectory] = []
         steps = round(case.seconds / plant.timestep)
@@ -137,25 +137,25 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    made: dict[str, list[list[str]]] = {}
+    lines_of: dict[str, list[list[str]]] = {}
     deadlines = {row.case["task"]: row.result["deadline_ms"] for row in rows}
     order = ("physics", "contestant", "device", "horizon", "samples", "repeat")
     for row in sorted(rows, key=lambda row: [row.case[name] for name in order]):
-        case, found = row.case, row.result
-        made.setdefault(case["task"], []).append([
+        case, result = row.case, row.result
+        lines_of.setdefault(case["task"], []).append([
             case["physics"], f"{case['samples']} x {case['horizon']}",
-            f"{CONTESTANTS[case['contestant']]}, {case['device']}", number(found["plan_ms"], ".3g"),
-            number(found["p99_9_ms"], ".3g") or f"{number(found['max_ms'], '.3g')} (longest)",
-            number(found["met"], ".1%"), f"{found['age_steps']:.2f} (at most {found['age_steps_max']})",
-            f"{found['age_ms']:.0f}", f"{found['reward_per_second']:.4g}",
-            f"{found['terminated']} of {found['episodes']}", median_and_range(found.get("returns", ()), ".4g"),
+            f"{CONTESTANTS[case['contestant']]}, {case['device']}", number(result["plan_ms"], ".3g"),
+            number(result["p99_9_ms"], ".3g") or f"{number(result['max_ms'], '.3g')} (longest)",
+            number(result["met"], ".1%"), f"{result['age_steps']:.2f} (at most {result['age_steps_max']})",
+            f"{result['age_ms']:.0f}", f"{result['reward_per_second']:.4g}",
+            f"{result['terminated']} of {result['episodes']}", median_and_range(result.get("returns", ()), ".4g"),
         ])  # fmt: skip
     header = ["physics", "samples x horizon", "engine", "plan, ms", "99.9 %, ms", "deadlines met", "age, steps",
               "age, ms", "reward a second", "ended early", "returns"]  # fmt: skip
     return [
         Table(f"{task}, a step every {deadlines[task]:.3g} ms. Plan: median time; below a thousand plans, the longest "
               "time stands for the 99.9 % quantile. Age of actions: mean and maximum.", header, lines)
-        for task, lines in made.items()
+        for task, lines in lines_of.items()
     ]  # fmt: skip
 
 

@@ -81,26 +81,26 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     if case.algorithm == "npg":
         changes["samples"] = 64 if short else per_iteration
     next(learner(case, 4, **(changes | ({"samples": 64} if case.algorithm == "npg" else {}))))  # compiles kernels
-    made = learner(case, case.nworld, **changes)
-    judge = Judge(made.env) if judge_every else None
+    learning = learner(case, case.nworld, **changes)
+    judge = Judge(learning.env) if judge_every else None
     recent: collections.deque[float] = collections.deque(maxlen=RECENT)
     seconds, curve, mean = 0.0, [], -math.inf
     while seconds < case.seconds and mean < case.target:
         began = time.perf_counter()
-        it = next(made)  # an iteration ends with a copy to the host, which waits for the device
+        it = next(learning)  # an iteration ends with a copy to the host, which waits for the device
         seconds += time.perf_counter() - began
         if judge is None:
-            returns = made.rollout.episode_return[made.rollout.done]
+            returns = learning.rollout.episode_return[learning.rollout.done]
             recent.extend(returns[~returns.isnan()][-RECENT:].tolist())
             mean = statistics.fmean(recent) if recent else -math.inf
         elif it.iteration % judge_every == 0:
-            mean = judge(made.policy)
+            mean = judge(learning.policy)
         else:
             continue
         if math.isfinite(mean):
             curve.append([it.samples, round(seconds, 4), round(mean, 3)])
-    walked = walk(case, made.policy) if case.task == "go1_velocity" else {}
-    return {"reached": mean >= case.target, "seconds": seconds, "samples": made.samples, "curve": curve, **walked}
+    walked = walk(case, learning.policy) if case.task == "go1_velocity" else {}
+    return {"reached": mean >= case.target, "seconds": seconds, "samples": learning.samples, "curve": curve, **walked}
 
 
 @torch.no_grad()
@@ -159,8 +159,8 @@ def figure(rows: Sequence[Row]) -> Any:
     runs = [row for row in rows if (row.case["task"], row.case["algorithm"]) == ("go1_velocity", "ppo")]
     if not runs:
         return None
-    made = new_figure("learning", 6.5, 3.9)
-    axes = made.subplots()
+    figure = new_figure("learning", 6.5, 3.9)
+    axes = figure.subplots()
     color, marker, line = STYLES[0]
     gpu = runs[0].provenance.get("gpu")
     ours = f"lyceum_warp on {f'an {gpu.split()[1]}' if gpu else 'CPU cores'}"
@@ -180,7 +180,7 @@ def figure(rows: Sequence[Row]) -> Any:
     axes.set_title("go1_velocity, 4,096 worlds", loc="left", fontsize="medium")
     axes.legend(frameon=False, loc="lower right")
     finish_axes([axes])
-    return made
+    return figure
 
 
 EXPERIMENT = Experiment(

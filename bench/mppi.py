@@ -93,18 +93,20 @@ def cases(options: Options) -> list[Case]:
     sets = options.sets[:1] if short else options.sets
     if min(count, options.block, repeats) < 1:
         raise ValueError("episodes, block and repeats must be at least 1")
-    found = []
+    cases = []
     if "plans" in parts:
-        found += [Case("plans", task, name, repeat, 500 + repeat, 0, 10 if short else 75, seconds, threads)
+        cases += [Case("plans", task, name, repeat, 500 + repeat, 0, 10 if short else 75, seconds, threads)
                   for repeat in range(repeats) for task in PLANS if task in tasks for name in single]  # fmt: skip
     if "episodes" in parts:
-        chosen = [task for task in EPISODES if task in tasks and (options.tasks or task in PAPER)]
+        episode_tasks = [task for task in EPISODES if task in tasks and (options.tasks or task in PAPER)]
         blocks = [(first, min(options.block, count - first), single) for first in range(0, count, options.block)]
         blocks.append((0, count, [name for name in contestants if name in TOGETHER]))
-        found += [Case("episodes", task, name, number, 1000 * number + first, size, 10 if short else EPISODES[task],
-                       0.0, threads)
-                  for number in sets for first, size, names in blocks for task in chosen for name in names]  # fmt: skip
-    return [case for case in found if case.contestant != "mppi_fast" or "fast" in find_task(case.task).physics]
+        cases += [
+            Case("episodes", task, name, number, 1000 * number + first, size, 10 if short else EPISODES[task], 0.0,
+                 threads)
+            for number in sets for first, size, names in blocks for task in episode_tasks for name in names
+        ]  # fmt: skip
+    return [case for case in cases if case.contestant != "mppi_fast" or "fast" in find_task(case.task).physics]
 
 
 def estimate(case: Case) -> float:
@@ -150,12 +152,15 @@ def run_episodes(case: Case, options: Options) -> dict[str, Any]:
     if case.contestant in TOGETHER:
         successes, returns, times = episodes_together(case, options, seeds)
     else:
-        made, env = controller(case, options), plant(case.task, case.steps)
-        lw.control(env, made, seed=0, steps=3)  # the first plan captures graphs and wakes threads
-        done = [lw.control(env, made, seed=seed) for seed in seeds]
-        successes, returns = [episode.succeeded for episode in done], [episode.episode_return for episode in done]
-        times = [episode.wall_seconds for episode in done]
-        plans["plan_ms"] = 1e3 * torch.cat([episode.plan_times for episode in done]).median().item()
+        control, env = controller(case, options), plant(case.task, case.steps)
+        lw.control(env, control, seed=0, steps=3)  # the first plan captures graphs and wakes threads
+        episodes = [lw.control(env, control, seed=seed) for seed in seeds]
+        successes, returns = (
+            [episode.succeeded for episode in episodes],
+            [episode.episode_return for episode in episodes],
+        )
+        times = [episode.wall_seconds for episode in episodes]
+        plans["plan_ms"] = 1e3 * torch.cat([episode.plan_times for episode in episodes]).median().item()
     each = [[seed, success, round(value, 4), round(seconds, 4)]
             for seed, success, value, seconds in zip(seeds, successes, returns, times, strict=True)]  # fmt: skip
     return {"successes": sum(successes), "return": statistics.fmean(returns), "each": each,
@@ -166,7 +171,7 @@ def episodes_together(
     case: Case, options: Options, seeds: Sequence[int]
 ) -> tuple[list[bool], list[float], list[float]]:
     """Run all episodes with one planner. Return successes, returns, and the wall-clock seconds per episode."""
-    made = planner(case.task, case.contestant, case.threads, options.device, case.count)
+    planning = planner(case.task, case.contestant, case.threads, options.device, case.count)
     env, one = plant(case.task, case.steps, case.count, case.threads), plant(case.task, case.steps)
     starts = []
     for seed in seeds:
@@ -174,12 +179,12 @@ def episodes_together(
         starts.append(one.get_state()[0])
     for steps in (min(3, case.steps), case.steps):  # the first steps capture graphs and wake threads
         env.set_state(torch.stack(starts))
-        made.reset(seeds)
+        planning.reset(seeds)
         returns = torch.zeros(case.count, dtype=torch.float64)
-        success, going = (torch.full((case.count,), value) for value in (False, True))
+        success, going = torch.zeros(case.count, dtype=torch.bool), torch.ones(case.count, dtype=torch.bool)
         began = time.perf_counter()
         for step in range(steps):
-            env.step(made(env.get_state(), shift=min(step, 1)))
+            env.step(planning(env.get_state(), shift=min(step, 1)))
             returns += torch.where(going, env.reward, 0.0)
             success = torch.where(going, env.success, success)
             going &= ~env.done
@@ -199,15 +204,15 @@ def states(task: str, seed: int, steps: int, threads: int) -> torch.Tensor:
 
 def run_plans(case: Case, options: Options) -> dict[str, Any]:
     """Measure plans from the states of an episode, without the first four plans."""
-    made, given = controller(case, options), states(case.task, case.first, case.steps, case.threads)
-    made.reset(case.first)
+    plan, starts = controller(case, options), states(case.task, case.first, case.steps, case.threads)
+    plan.reset(case.first)
     times: list[float] = []
     end = time.perf_counter() + case.seconds
-    for state in itertools.cycle(given):
+    for state in itertools.cycle(starts):
         began = time.perf_counter()
         if len(times) >= 14 and began > end:
             break
-        made(state).cpu()
+        plan(state).cpu()
         times.append(1e3 * (time.perf_counter() - began))
     config = planner(case.task, "mppi", case.threads, "cpu").config
     return {"plans": len(times) - 4, "plan_ms": statistics.median(times[4:]), "samples": config.samples,
@@ -230,16 +235,16 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def grouped(rows: Sequence[Row], part: str) -> dict[str, dict[str, list[Row]]]:
-    found: dict[str, dict[str, list[Row]]] = {}
+    groups: dict[str, dict[str, list[Row]]] = {}
     for row in sorted(rows, key=lambda row: TASKS.index(row.case["task"])):
         if row.case["part"] == part:
-            found.setdefault(row.case["task"], {}).setdefault(row.case["contestant"], []).append(row)
-    return {task: {name: same[name] for name in CONTESTANTS if name in same} for task, same in found.items()}
+            groups.setdefault(row.case["task"], {}).setdefault(row.case["contestant"], []).append(row)
+    return {task: {name: same[name] for name in CONTESTANTS if name in same} for task, same in groups.items()}
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    made = {"episodes": episode_table, "plans": plan_table}
-    return [make(found) for part, make in made.items() if (found := grouped(rows, part))]
+    makers = {"episodes": episode_table, "plans": plan_table}
+    return [make(groups) for part, make in makers.items() if (groups := grouped(rows, part))]
 
 
 def episodes_of(rows: Sequence[Row]) -> dict[int, dict[int, list[Any]]]:
@@ -262,9 +267,9 @@ def mean_seconds(each: Sequence[Sequence[Any]]) -> float | None:
     return statistics.fmean(timed) if timed else None
 
 
-def episode_table(found: dict[str, dict[str, list[Row]]]) -> Table:
+def episode_table(groups: dict[str, dict[str, list[Row]]]) -> Table:
     lines = []
-    for task, same in found.items():
+    for task, same in groups.items():
         for name, group in same.items():
             sets, each = episodes_of(group), flat(group)
             good = sum(int(episode[1]) for episode in each)
@@ -290,9 +295,9 @@ def episode_table(found: dict[str, dict[str, list[Row]]]) -> Table:
     return Table(title, header, lines)
 
 
-def plan_table(found: dict[str, dict[str, list[Row]]]) -> Table:
+def plan_table(groups: dict[str, dict[str, list[Row]]]) -> Table:
     lines = []
-    for task, same in found.items():
+    for task, same in groups.items():
         every = [row for group in same.values() for row in group]
         ratios = experiment.paired(every, "plan_ms", "mppi")
         for name, group in same.items():

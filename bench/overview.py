@@ -8,9 +8,11 @@ from rich.table import Table
 def main() -> None:
     table = Table("experiment", "what it measures", "--short", "whole", box=None, pad_edge=False)
     for name in experiment.NAMES:
-        found = experiment.load(name)
-        times = (sum(map(found.estimate, found.cases(found.options(short=short)))) for short in (True, False))
-        table.add_row(name, found.summary, *map(experiment.duration, times))
+        definition = experiment.load(name)
+        times = (
+            sum(map(definition.estimate, definition.cases(definition.options(short=short)))) for short in (True, False)
+        )
+        table.add_row(name, definition.summary, *map(experiment.duration, times))
     Console(width=120).print(table)
     print("\nlyceum-warp bench NAME --help     # list the options of an experiment or of another program in bench/")
     print("lyceum-warp bench compare OLD     # compare this working tree with a revision, bit for bit")

@@ -42,9 +42,9 @@ def cases(options: Options) -> list[Case]:
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
     run = Run.open(lw.pretrained_run(case.task))
-    words = {} if options.threads is None else {"nthread": options.threads}
+    threads = {} if options.threads is None else {"nthread": options.threads}
     try:
-        env = run_worlds(run, words, {}, nworld=1, task=None, trust=False)
+        env = run_worlds(run, threads, {}, nworld=1, task=None, trust=False)
     except (FileNotFoundError, ImportError) as error:
         raise Skipped(f"{case.task}: {error}") from error
     return lw.transfer(env, lw.load(run), case.episodes, seed=case.seed, device=case.device).to_dict()
@@ -53,15 +53,15 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 def tables(rows: Sequence[Row]) -> list[Table]:
     lines = []
     for row in sorted(rows, key=lambda row: (row.case["task"], row.case["episodes"])):
-        for found in row.result["comparisons"]:
-            returns, _, failures = found["differences"]
+        for comparison in row.result["comparisons"]:
+            returns, _, failures = comparison["differences"]
             half = (returns["high"] - returns["low"]) / 2
             lines.append([
-                row.case["task"], f"{row.case['episodes']}", found["second"], found["first"],
+                row.case["task"], f"{row.case['episodes']}", comparison["second"], comparison["first"],
                 f"{returns['second']:,.5g}", f"{returns['first']:,.5g}",
                 f"{(returns['high'] + returns['low']) / 2:+.3g} ± {half:.2g}",
                 f"{failures['second']:.1%}, {failures['first']:.1%} {failures['quantity']}",
-                f"{sum(found['faults'])}", found["verdict"],
+                f"{sum(comparison['faults'])}", comparison["verdict"],
             ])  # fmt: skip
     title = (
         "Pretrained policies on pairs of episodes: mean returns of a simulation and of its reference, their difference "

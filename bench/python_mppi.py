@@ -122,20 +122,26 @@ class PythonMPPI:
 
 
 def _roll_out(
-    pipe: Connection, task: str, samples: int, horizon: int, scale: Any, smoothing: tuple[float, float, float], own: int
+    pipe: Connection,
+    task: str,
+    samples: int,
+    horizon: int,
+    scale: Any,
+    smoothing: tuple[float, float, float],
+    process: int,
 ) -> None:
     """Receive plans in a subprocess, roll out samples of each plan, and send their returns and actions."""
     env = ENVS[task](lw.make(task, nthread=1).model)
-    random = np.random.default_rng((own, 0))
+    random = np.random.default_rng((process, 0))
     pipe.send("ready")
     while True:
         message = pipe.recv()
         if isinstance(message, int):
-            random = np.random.default_rng((own, message))
+            random = np.random.default_rng((process, message))
             continue
         state, plan = message
         noise = smoothed(scale * random.standard_normal((samples, horizon, plan.shape[1])), smoothing)
-        if own == 0:
+        if process == 0:
             noise[0] = 0.0  # the plan itself is one of the samples
         actions = np.clip(plan + noise, -1.0, 1.0)
         returns = np.zeros(samples)

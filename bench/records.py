@@ -187,19 +187,19 @@ def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]
         yield os.environ | {name: f"{empty}/{folder}" for name, folder in caches.items()}
 
 
-def run(words: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[bytes]":
-    return subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL)
+def run(command: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[bytes]":
+    return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
 
 
 def timed(
-    words: Sequence[str], folder: Path, environment: dict[str, str], limit: float
+    command: Sequence[str], folder: Path, environment: dict[str, str], limit: float
 ) -> tuple[dict[str, Any] | None, float]:
     """Run the command until it reaches its target return, or for ``limit`` seconds.
 
     Return the entry "reached" of config.json, or None after the limit, and the seconds.
     """
     began, reached = time.perf_counter(), None
-    process = run(words, environment)
+    process = run(command, environment)
     config = folder / "config.json"
     while True:
         code = process.poll()
@@ -210,7 +210,7 @@ def timed(
             process.wait()  # the process saves the policy and evaluates it
             return reached, seconds
         if code is not None:
-            raise RuntimeError(f"{' '.join(words)} ended with code {code} before it reached the target")
+            raise RuntimeError(f"{' '.join(command)} ended with code {code} before it reached the target")
         if seconds > limit:
             process.send_signal(signal.SIGTERM)  # the process saves the run after the current iteration
             process.wait()

@@ -29,7 +29,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -187,12 +187,12 @@ class Kills:
 def cases(options: Options) -> list[Any]:
     parts, short, cuda = experiment.choose(options.parts, PARTS, what="part"), options.short, options.device != "cpu"
     everything = TASKS | {task: OTHERS for task in lw.task_names() if task not in TASKS}
-    known = {"point_mass": SHORT} if short else GPU_TASKS if cuda else everything
-    runs = [(task, known.get(task, SHORT if short else OTHERS), not cuda)
-            for task in experiment.choose(options.tasks, lw.task_names(), tuple(known), what="task")]  # fmt: skip
+    sizes_of = {"point_mass": SHORT} if short else GPU_TASKS if cuda else everything
+    runs = [(task, sizes_of.get(task, SHORT if short else OTHERS), not cuda)
+            for task in experiment.choose(options.tasks, lw.task_names(), tuple(sizes_of), what="task")]  # fmt: skip
     if cuda and not short and not options.tasks:
         runs += [(task, sizes, True) for task, sizes in SAME_BITS.items()]
-    found: list[Any] = []
+    cases: list[Any] = []
     for seed in options.seeds or (0,):
         for task, sizes, compared in runs if "faults" in parts else ():
             nworld = whole_number("--nworld", options.nworld or sizes[0], low=8)
@@ -200,20 +200,22 @@ def cases(options: Options) -> list[Any]:
             chunks = [Faults(task, chunk, steps, nworld, options.engine, options.device, compared,
                              1e-2 if short else 1e-3, seed) for chunk in range(sizes[2])]  # fmt: skip
             # continue from the last stored state; another machine may have stored it
-            done = max((i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1)
-            found += chunks[done - 1 :]
+            first_chunk = max(
+                (i for i in range(1, len(chunks) + 1) if chunks[0].state(options.work, i).exists()), default=1
+            )
+            cases += chunks[first_chunk - 1 :]
         if "random" in parts:
             sizes = SHORT if short else OTHERS
             nworld, steps = options.nworld or sizes[0], options.steps or sizes[1]
-            found += [Random(task, steps, nworld, options.engine, options.device, seed)
-                      for task in (tuple(known) if short else options.tasks or lw.task_names())]  # fmt: skip
+            cases += [Random(task, steps, nworld, options.engine, options.device, seed)
+                      for task in (tuple(sizes_of) if short else options.tasks or lw.task_names())]  # fmt: skip
         if "kills" in parts and not cuda:
             trainings = {"point_mass": SHORT_TRAINING} if short else TRAININGS
             kills = (1, 0.2) if short else (10, options.kill_every)
-            found += [Kills(task, words, *kills, seed) for task, words in trainings.items()]
+            cases += [Kills(task, words, *kills, seed) for task, words in trainings.items()]
     if "memory" in parts:
-        found.append(Memory("hopper", 10 if short else 100, 32, options.engine, options.device))
-    return found
+        cases.append(Memory("hopper", 10 if short else 100, 32, options.engine, options.device))
+    return cases
 
 
 def estimate(case: Any) -> float:
@@ -238,13 +240,13 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     """Write a variant of a task, whose additional action requests a fault; return it, and the range of the other
     actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
-    own = TaskSource(parent, task)
-    functions, nact = own.functions, plain.action.shape[1]
+    source_task = TaskSource(parent, task)
+    functions, nact = source_task.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")
     own_model = r'"(\w+\.xml)"'  # the model's path is relative to the task's file
     source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
-    fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in own.world.vars]
+    fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in source_task.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3
     # if a module defines several tasks, their functions and structs have different names
@@ -252,7 +254,8 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     world, params = (struct.cls.__name__ for struct in list(functions["observe"].func.__annotations__.values())[:2])
     copy = "for i in range(ctrl.shape[0]):\n        ctrl[i] = action[i]"
     source += VARIANT.format(
-        parent=parent.__name__, task_structs=f"{own.world.cls.__name__}, {own.defaults.__name__}", nact=nact,
+        parent=parent.__name__, nact=nact,
+        task_structs=f"{source_task.world.cls.__name__}, {source_task.defaults.__name__}",
         world=world, params=params, rng=", rng" if noisy else "",
         rng_argument=", rng: Row[wp.uint32]" if noisy else "", observe=names["observe"], reward=names["reward"],
         control=f"{names['control']}(s, action, p, ctrl)" if functions["control"] else copy,
@@ -265,7 +268,9 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     space, limited = plain.action_space, plain.model.actuator_ctrllimited[:, None].astype(bool)
     low, high = np.where(limited, plain.model.actuator_ctrlrange, np.inf).T  # the variant does not scale actions
     if functions["control"]:
-        low, high = (np.full(nact, np.inf) if bound is None else bound for bound in (space.low, space.high))
+        unbounded = np.full(nact, np.inf)
+        low = unbounded if space.low is None else space.low
+        high = unbounded if space.high is None else space.high
     bounded = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
     return f"{path}:Soak", torch.as_tensor(low).float(), torch.as_tensor(high).float()
@@ -359,14 +364,23 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
         if case.chunk:
             twin.set_state(start["twin"])
     kind, qpos, qvel = torch.zeros_like(row), *(env.state_space.parts[name].start for name in ("qpos", "qvel"))
-    injected, reasons, outcome = (row.new_zeros(case.nworld, n) for n in (7, 7 * NBIT, 3))
-    drawn = [low.to(worlds.device), high.to(worlds.device), pending, row, kind, env.action, twin_action]
-    tallied = [row, kind, env.done_reason, env.done, env.obs, env.reward, twin.done_reason, twin.obs, twin.reward,
-               pending, clean, injected, reasons, outcome]  # fmt: skip
-    drawn, tallied = (list(map(wp.from_torch, tensors)) for tensors in (drawn, tallied))
+    injected = row.new_zeros(case.nworld, 7)
+    reasons = row.new_zeros(case.nworld, 7 * NBIT)
+    outcome = row.new_zeros(case.nworld, 3)
+    draw_arrays = [
+        wp.from_torch(tensor)
+        for tensor in (low.to(worlds.device), high.to(worlds.device), pending, row, kind, env.action, twin_action)
+    ]
+    tally_arrays = [
+        wp.from_torch(tensor)
+        for tensor in (
+            row, kind, env.done_reason, env.done, env.obs, env.reward, twin.done_reason, twin.obs, twin.reward, pending,
+            clean, injected, reasons, outcome,
+        )
+    ]  # fmt: skip
     steps, samples, began = -(-case.steps // case.nworld), [], time.perf_counter()
     for t in range(case.chunk * steps, case.chunk * steps + steps):
-        wp.launch(draw, case.nworld, [case.seed, t, case.rate, *drawn], device=env.device)
+        wp.launch(draw, case.nworld, [case.seed, t, case.rate, *draw_arrays], device=env.device)
         if t % EVERY == 0 and (mask := (kind == 1) | (kind == 2)).any():
             state = env.get_state()
             state[kind == 1, torch.where(worlds % 2 == 0, qpos, qvel)[kind == 1]] = torch.nan
@@ -375,10 +389,10 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
         env.step()
         if case.compared:
             twin.step()
-        wp.launch(tally, case.nworld, tallied, device=env.device)
-        done = t % steps + 1
-        if done * SAMPLES // steps > (done - 1) * SAMPLES // steps:
-            samples.append([done * case.nworld, *memory(worlds.device)])
+        wp.launch(tally, case.nworld, tally_arrays, device=env.device)
+        steps_done = t % steps + 1
+        if steps_done * SAMPLES // steps > (steps_done - 1) * SAMPLES // steps:
+            samples.append([steps_done * case.nworld, *memory(worlds.device)])
     compared, different, infinite = outcome.sum(0).tolist()
     seconds = time.perf_counter() - began
     end = {"state": env.get_state(), "pending": pending, "clean": clean}
@@ -390,17 +404,17 @@ def inject(case: Faults, options: Options) -> dict[str, Any]:
         torch.save(end, temporary)
     case.state(options.work, case.chunk - 1).unlink(missing_ok=True)
     names = {bit.name.lower(): bit.bit_length() - 1 for bit in FAULTS if bit.name}
-    own = list(enumerate((bit.bit_length() - 1 for bit in KINDS.values()), start=1))
+    kind_bits = list(enumerate((bit.bit_length() - 1 for bit in KINDS.values()), start=1))
     by_kind = reasons.sum(0).view(7, NBIT)
     counts = {name: int(by_kind[:, bit].sum()) for name, bit in names.items()}
-    found = [int(by_kind[k, bit]) for k, bit in own]
-    for k, bit in own:
+    reported = [int(by_kind[k, bit]) for k, bit in kind_bits]
+    for k, bit in kind_bits:
         by_kind[k, bit] = 0
-    beside, other = ({name: int(row[bit]) for name, bit in names.items() if row[bit]}
-                     for row in (by_kind[1:].sum(0), by_kind[0]))  # fmt: skip
+    beside = {name: int(by_kind[1:, bit].sum()) for name, bit in names.items() if by_kind[1:, bit].any()}
+    other = {name: int(by_kind[0, bit]) for name, bit in names.items() if by_kind[0, bit]}
     return {
         "injected": dict(zip(KINDS, injected.sum(0).tolist()[1:], strict=True)),
-        "found": dict(zip(KINDS, found, strict=True)), "beside": beside, "other": other,
+        "found": dict(zip(KINDS, reported, strict=True)), "beside": beside, "other": other,
         "counts_agree": counts == env.fault_counts,
         "compared": compared, "different": different, "not_finite": infinite, "steps": steps * case.nworld,
         "memory": samples, "steps_per_second": steps * case.nworld / seconds,
@@ -417,10 +431,11 @@ def step_randomly(case: Random, options: Options) -> dict[str, Any]:
                       nthread=options.threads)  # fmt: skip
     except (FileNotFoundError, ImportError) as error:
         raise Skipped(f"{case.task}: {error}") from error
-    low, high = (torch.as_tensor(np.nan_to_num(bound, posinf=1.0, neginf=-1.0), dtype=torch.float32)
-                 for bound in (env.action_space.low, env.action_space.high))  # fmt: skip
-    low, width = low.to(env.action.device), (high - low).to(env.action.device)
-    generator = torch.Generator(env.action.device).manual_seed(case.seed)
+    device = env.action.device
+    low = torch.as_tensor(np.nan_to_num(env.action_space.low, neginf=-1.0), dtype=torch.float32, device=device)
+    high = torch.as_tensor(np.nan_to_num(env.action_space.high, posinf=1.0), dtype=torch.float32, device=device)
+    width = high - low
+    generator = torch.Generator(device).manual_seed(case.seed)
     steps, began = -(-case.steps // case.nworld), time.perf_counter()
     first: list[Any] | None = None
     for t in range(steps):
@@ -469,7 +484,8 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
     """Train once without interruption and once with kills, and compare the results."""
-    straight, killed = (options.work / f"{case.task}-{case.seed}-{name}" for name in ("straight", "killed"))
+    straight = options.work / f"{case.task}-{case.seed}-straight"
+    killed = options.work / f"{case.task}-{case.seed}-killed"
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)
     program, quiet = [sys.executable, "-m", "lyceum_warp.cli", "train"], ["--no-video", "--no-plot"]
@@ -511,47 +527,12 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    faults, grown, calm, made, kills = [], [], [], [], []
-    runs: dict[str, list[Row]] = {}
+    parts: dict[str, list[Row]] = {}
     for row in rows:
-        case, result = row.case, row.result
-        runs.setdefault(experiment.key({**case, "chunk": None}), []).append(row)
-        if case["part"] == "memory":
-            made.append([case["task"], case["device"], f"{case['nworld']}", f"{case['made']}",
-                         f"{result['bytes_per_env']:,.0f}", f"{result['gpu_bytes_per_env']:,.0f}"])  # fmt: skip
-        elif case["part"] == "random":
-            counts = ", ".join(f"{name} {number:,}" for name, number in result["faults"].items() if number)
-            first = result["first"] and "step {:,}, world {}: {}".format(*result["first"])
-            engine = result.get("engine", case["engine"])  # the case may say "auto"
-            calm.append([case["task"], f"{engine}, {case['device']}", f"{case['nworld']}",
-                         f"{result['steps']:,}", f"{result['steps_per_second']:,.0f}", counts or "none",
-                         first or ""])  # fmt: skip
-        elif case["part"] == "kills":
-            kills.append([f"{case['task']} {case['words']}", *(f"{result[name]}" for name in (
-                "kills", "iterations", "equal_rows", "equal_policy"))])  # fmt: skip
-    for run in runs.values():
-        case, results = run[0].case, [row.result for row in run]
-        if case["part"] != "faults":
-            continue
-        injected, found, beside, other = (
-            sum((collections.Counter(result[name]) for result in results), collections.Counter())
-            for name in ("injected", "found", "beside", "other")
-        )
-        cells = [f"{found[kind]:,}" + ("" if found[kind] == injected[kind] else f" of {injected[kind]:,}")
-                 for kind in KINDS]  # fmt: skip
-        steps, compared, different, infinite = (sum(result[name] for result in results) for name in (
-            "steps", "compared", "different", "not_finite"))  # fmt: skip
-        name = f"{case['task']}, {case['device']}{', deterministic' * (case['compared'] and case['device'] != 'cpu')}"
-        faults.append([name, f"{case['nworld']:,}", f"{steps:.4g}", *cells, *(
-            ", ".join(f"{kind} {number:,}" for kind, number in counts.items()) for counts in (beside, other)
-        ), f"{all(result['counts_agree'] for result in results)}", f"{infinite}", f"{compared:.4g}", f"{different}",
-        ])  # fmt: skip
-        for column, what in ((1, "resident"), (2, "GPU")):
-            levels = [sample[column] / 2**20 for result in results for sample in result["memory"]]
-            if any(levels):
-                slopes = [round(1e6 * slope(result["memory"], column)) for result in results]
-                grown.append([name, what, f"{levels[0]:,.0f}", f"{max(levels):,.0f}", f"{levels[-1]:,.0f}",
-                              experiment.median_and_range(slopes, ",.0f")])  # fmt: skip
+        parts.setdefault(row.case["part"], []).append(row)
+    chunks: dict[str, list[Row]] = {}
+    for row in parts.get("faults", ()):
+        chunks.setdefault(experiment.key({**row.case, "chunk": None}), []).append(row)
     every = [
         Table(
             "Faults reported where they were injected (one number if all were), other bits reported with them, and "
@@ -559,18 +540,80 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             "worlds without faults that were compared to the bit with an environment without faults, and the number "
             "of differences.",
             ["task", "worlds", "steps", *KINDS, "beside", "others", "counts agree", "not finite", "compared", "differ"],
-            faults,
+            [fault_line(run) for run in chunks.values()],
         ),
         Table("Memory, MiB, and its growth, bytes per million steps: median over chunks and range.",
-              ["task", "memory", "first", "most", "last", "growth"], grown),
+              ["task", "memory", "first", "most", "last", "growth"],
+              [line for run in chunks.values() for line in growth_lines(run)]),
         Table("Uniformly random actions under the task's own physics: faults by reason, and the first fault.",
-              ["task", "engine", "worlds", "steps", "steps/s", "faults", "first"], calm),
+              ["task", "engine", "worlds", "steps", "steps/s", "faults", "first"],
+              [random_line(row) for row in parts.get("random", ())]),
         Table("Bytes that remain allocated per environment that was made and deleted.",
-              ["task", "device", "worlds", "made", "resident", "GPU"], made),
+              ["task", "device", "worlds", "made", "resident", "GPU"],
+              [memory_line(row) for row in parts.get("memory", ())]),
         Table("Trainings that were killed and resumed, compared with an uninterrupted one.",
-              ["training", "kills", "iterations", "equal metrics", "equal policy"], kills),
+              ["training", "kills", "iterations", "equal metrics", "equal policy"],
+              [kill_line(row) for row in parts.get("kills", ())]),
     ]  # fmt: skip
     return [table for table in every if table.rows]
+
+
+def run_name(case: Mapping[str, Any]) -> str:
+    deterministic = case["compared"] and case["device"] != "cpu"
+    return f"{case['task']}, {case['device']}{', deterministic' * deterministic}"
+
+
+def fault_line(run: Sequence[Row]) -> list[str]:
+    """Add up the chunks of a run."""
+    case, results = run[0].case, [row.result for row in run]
+    counts = {
+        name: sum((collections.Counter(result[name]) for result in results), collections.Counter())
+        for name in ("injected", "found", "beside", "other")
+    }
+    sums = {name: sum(result[name] for result in results) for name in ("steps", "compared", "different", "not_finite")}
+    injected, reported = counts["injected"], counts["found"]
+    return [
+        run_name(case), f"{case['nworld']:,}", f"{sums['steps']:.4g}",
+        *(f"{reported[kind]:,}" + f" of {injected[kind]:,}" * (reported[kind] != injected[kind]) for kind in KINDS),
+        text_of(counts["beside"]), text_of(counts["other"]), f"{all(result['counts_agree'] for result in results)}",
+        f"{sums['not_finite']}", f"{sums['compared']:.4g}", f"{sums['different']}",
+    ]  # fmt: skip
+
+
+def growth_lines(run: Sequence[Row]) -> list[list[str]]:
+    lines = []
+    for column, kind in ((1, "resident"), (2, "GPU")):
+        levels = [sample[column] / 2**20 for row in run for sample in row.result["memory"]]
+        if any(levels):
+            slopes = [round(1e6 * slope(row.result["memory"], column)) for row in run]
+            lines.append([
+                run_name(run[0].case), kind, f"{levels[0]:,.0f}", f"{max(levels):,.0f}", f"{levels[-1]:,.0f}",
+                experiment.median_and_range(slopes, ",.0f"),
+            ])  # fmt: skip
+    return lines
+
+
+def random_line(row: Row) -> list[str]:
+    case, result = row.case, row.result
+    engine = result.get("engine", case["engine"])  # the case may say "auto"
+    first = "step {:,}, world {}: {}".format(*result["first"]) if result["first"] else ""
+    return [case["task"], f"{engine}, {case['device']}", f"{case['nworld']}", f"{result['steps']:,}",
+            f"{result['steps_per_second']:,.0f}", text_of(result["faults"]) or "none", first]  # fmt: skip
+
+
+def memory_line(row: Row) -> list[str]:
+    case, result = row.case, row.result
+    return [case["task"], case["device"], f"{case['nworld']}", f"{case['made']}", f"{result['bytes_per_env']:,.0f}",
+            f"{result['gpu_bytes_per_env']:,.0f}"]  # fmt: skip
+
+
+def kill_line(row: Row) -> list[str]:
+    numbers = (row.result[name] for name in ("kills", "iterations", "equal_rows", "equal_policy"))
+    return [f"{row.case['task']} {row.case['words']}", *map(str, numbers)]
+
+
+def text_of(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {number:,}" for name, number in counts.items() if number)
 
 
 EXPERIMENT = Experiment(

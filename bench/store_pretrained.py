@@ -30,9 +30,9 @@ def store(folder: Path, which: str) -> Path:
     content = read_checkpoint(run.policy_file(which), parts=("iteration", "policy"))
     saved = content["policy"]
     state = {name: part.half() if name.startswith("network.") else part for name, part in saved["state"].items()}
-    kept = {name: value for name, value in run.config["kept"].items() if name in ("name", "model_hash")}
+    saved_task = {name: value for name, value in run.config["kept"].items() if name in ("name", "model_hash")}
     config = {name: run.config[name] for name in KEPT} | {
-        algorithm: run.config[algorithm], "engine": "auto", "device": "cpu", "kept": kept,
+        algorithm: run.config[algorithm], "engine": "auto", "device": "cpu", "kept": saved_task,
         "versions": {"mujoco": run.config["versions"]["mujoco"]},
     }  # fmt: skip
     out.mkdir(parents=True, exist_ok=True)

@@ -10,17 +10,17 @@ from lyceum_warp.support.files import replaced
 
 def main(options: experiment.Stored) -> int:
     for name, path in experiment.stored(options.names, options.results).items():
-        found = experiment.load(name)
+        definition = experiment.load(name)
         source = f"Written by `lyceum-warp bench tables {name}` from `{path.name}`."
-        parts = [f"# {name}", f"{found.summary} {found.conditions} {source}"]
+        parts = [f"# {name}", f"{definition.summary} {definition.conditions} {source}"]
         machines = experiment.by_machine(experiment.read(path))
         for machine, rows in machines.items():
             parts += [f"## {machine}", experiment.described(rows)]
-            if not found.pooled:
-                parts += [table.markdown() for table in found.tables(rows)]
-        if found.pooled:
+            if not definition.pooled:
+                parts += [table.markdown() for table in definition.tables(rows)]
+        if definition.pooled:
             rows = list({experiment.key(row.case): row for rows in machines.values() for row in rows}.values())
-            parts += ["## All machines", *(table.markdown() for table in found.tables(rows))]
+            parts += ["## All machines", *(table.markdown() for table in definition.tables(rows))]
         page = path.with_suffix(".md")
         with replaced(page) as temporary:
             temporary.write_text("\n\n".join(parts) + "\n")

@@ -80,16 +80,16 @@ class Case:
 def cases(options: Options) -> list[Case]:
     everything = dict.fromkeys(name for names in PARTS.values() for name in names)
     named = choose(options.contestants, everything, what="contestant")
-    known = (*TASKS, *sorted({*lw.task_names()} - {*TASKS}))
-    given = choose(options.tasks, known, SHORT_TASKS if options.short else TASKS, what="task")
+    choices = (*TASKS, *sorted({*lw.task_names()} - {*TASKS}))
+    tasks = choose(options.tasks, choices, SHORT_TASKS if options.short else TASKS, what="task")
     usual = {"cores": SCALED, "worlds": SCALED, "suite": SUITE[:1] if options.short else SUITE}
     threads, gpu = options.threads or cpu_cores(), options.device.startswith("cuda")
     repeats = options.repeats or (1 if options.short else 3)
     seconds, warm = (0.2, 20) if options.short else (options.seconds, 100)
 
     def size(part: str, name: str, cores: int) -> int:
-        own = options.worlds if name in ("native", "c", "warp") else None
-        return 1 if part == "single" else own or contestants.worlds(name, cores, options.device)
+        requested = options.worlds if name in ("native", "c", "warp") else None
+        return 1 if part == "single" else requested or contestants.worlds(name, cores, options.device)
 
     def sizes(part: str, name: str) -> list[tuple[int, int]]:
         if part == "cores":
@@ -108,7 +108,7 @@ def cases(options: Options) -> list[Case]:
              0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20,
              options.policy if part == "kept" else None)
         for part in choose(options.parts, PARTS, what="part")
-        for task in (given if options.tasks else usual.get(part, given))
+        for task in (tasks if options.tasks else usual.get(part, tasks))
         for repeat in range(1 if part == "kept" else repeats)
         for name in PARTS[part]
         if name in named and (name != "warp" or gpu or options.contestants)
@@ -157,12 +157,12 @@ def contestants_of(part: str) -> tuple[str, ...]:
 
 
 def peers(rows: Sequence[Row]) -> str:
-    found = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
-    return f" ({'; '.join(sorted(found))})" * bool(found)
+    peer_versions = {row.result.get("versions") for row in rows if row.case["part"] == "suite"} - {None}
+    return f" ({'; '.join(sorted(peer_versions))})" * bool(peer_versions)
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    made = []
+    tables = []
     for part, by, title in (
         ("sampling", ("task",), "Environment steps per second, and their ratio to native C's."),
         ("suite", ("task", "worlds"), f"dm_control's suite{peers(rows)}: steps/s, and their ratio to dm_control's."),
@@ -175,30 +175,30 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         lines = []
         for place, same in groups.items():
             ratios = experiment.paired(same, "env_steps_per_second", UNITS[part]) if part in UNITS else {}
-            cells = [f"{statistics.median(found):,.0f}" if (found := rates(same, name)) else "" for name in names]
+            cells = [f"{statistics.median(values):,.0f}" if (values := rates(same, name)) else "" for name in names]
             beside = [median_and_range(ratios.get(name, [])) if name != UNITS.get(part) else "" for name in names]
             both = [f"{cell}; {ratio}" if ratio else cell for cell, ratio in zip(cells, beside, strict=True)]
             lines.append([*(f"{value:,}" if isinstance(value, int) else value for value in place), *both])
         explained = "Medians over the repeats; ratios of the same repeat: median (smallest to largest)."
         if lines:
-            made.append(Table(f"{title} {explained}", [*by, *(LABELS[name] for name in names)], lines))
+            tables.append(Table(f"{title} {explained}", [*by, *(LABELS[name] for name in names)], lines))
     if lines := [kept_line(row) for (row,) in grouped(rows, "kept", "task", "contestant", "worlds", "policy").values()]:
         header = ["task", "engine", "worlds", "env steps/s", "of the bare engine's", "added to a step", "kB a world"]
-        made.append(
+        tables.append(
             Table("Environment and bare engine on the same states, alternating every ten steps.", header, lines)
         )
-    return made
+    return tables
 
 
 def kept_line(row: Row) -> list[str]:
-    case, found = row.case, row.result
-    step = case["worlds"] / found["env_steps_per_second"]
-    memory = found["bytes_per_world"]
+    case, result = row.case, row.result
+    step = case["worlds"] / result["env_steps_per_second"]
+    memory = result["bytes_per_world"]
     task = case["task"] + (", trained policy" if case.get("policy") else "")
     return [
         task, "Warp" if case["contestant"] == "warp" else "C", f"{case['worlds']:,}",
-        f"{found['env_steps_per_second']:,.0f}", f"{found['kept']:.1%}",
-        f"{found['added_microseconds']:,.0f} µs of {step * 1e3:.2f} ms",
+        f"{result['env_steps_per_second']:,.0f}", f"{result['kept']:.1%}",
+        f"{result['added_microseconds']:,.0f} µs of {step * 1e3:.2f} ms",
         "" if memory is None else f"{memory / 1e3:,.1f}",
     ]  # fmt: skip
 
@@ -206,22 +206,24 @@ def kept_line(row: Row) -> list[str]:
 def figure(rows: Sequence[Row]) -> Any:
     groups = grouped(rows, "sampling", "task")
     ratios = {task: experiment.paired(same, "env_steps_per_second", "native") for (task,), same in groups.items()}
-    names = [name for name in contestants_of("sampling")[1:] if any(found.get(name) for found in ratios.values())]
+    names = [
+        name for name in contestants_of("sampling")[1:] if any(task_ratios.get(name) for task_ratios in ratios.values())
+    ]
     if not names:
         return None
-    made = new_figure("throughput", 9.5, 3.9)
-    axes = made.subplots()
+    figure = new_figure("throughput", 9.5, 3.9)
+    axes = figure.subplots()
     for k, (name, (color, marker, _)) in enumerate(zip(names, STYLES, strict=False)):
-        there = [(i, values) for i, found in enumerate(ratios.values()) if (values := found.get(name))]
-        places = [i + 0.12 * (k - (len(names) - 1) / 2) for i, _ in there]
-        middles = [statistics.median(values) for _, values in there]
-        axes.vlines(places, [min(values) for _, values in there], [max(values) for _, values in there], color=color)
+        points = [(i, values) for i, task_ratios in enumerate(ratios.values()) if (values := task_ratios.get(name))]
+        places = [i + 0.12 * (k - (len(names) - 1) / 2) for i, _ in points]
+        middles = [statistics.median(values) for _, values in points]
+        axes.vlines(places, [min(values) for _, values in points], [max(values) for _, values in points], color=color)
         axes.plot(places, middles, linestyle="", marker=marker, color=color, markersize=6, label=LABELS[name])
     axes.axhline(1.0, color="black", linewidth=1.0, label=LABELS["native"])
     axes.set_yscale("log")
     axes.set_yticks([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100])
     axes.minorticks_off()
-    every = [1.0, *(ratio for found in ratios.values() for name in names for ratio in found.get(name, ()))]
+    every = [1.0, *(ratio for task_ratios in ratios.values() for name in names for ratio in task_ratios.get(name, ()))]
     axes.set_ylim(0.8 * min(every), 1.25 * max(every))
     axes.yaxis.set_major_formatter("{x:g}")
     for i in range(1, len(ratios)):
@@ -231,10 +233,10 @@ def figure(rows: Sequence[Row]) -> Any:
     axes.set_ylabel("environment steps per second,\nnative C = 1")
     threads = max(row.case["threads"] for row in rows if row.case["part"] == "sampling")
     axes.set_title(f"{threads} threads, log scale", loc="left", fontsize="medium")
-    made.legend(loc="outside lower center", frameon=False, ncols=4, fontsize="small")
+    figure.legend(loc="outside lower center", frameon=False, ncols=4, fontsize="small")
     finish_axes([axes])
     axes.grid(visible=False, axis="x")
-    return made
+    return figure
 
 
 EXPERIMENT = Experiment(

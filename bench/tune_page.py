@@ -19,15 +19,15 @@ TEXT = (
 
 def searches(name: str) -> list[list[dict[str, Any]]]:
     """Read the results of all searches from a file. A search's result is a list of settings, the fastest one first."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    by_search: dict[str, list[dict[str, Any]]] = {}
     for line in (RESULTS / name).read_text().splitlines():
         row = json.loads(line)
-        found.setdefault(json.dumps(row["identity"]), []).append(row)
-    for rows in found.values():
+        by_search.setdefault(json.dumps(row["identity"]), []).append(row)
+    for rows in by_search.values():
         for row in rows:
             row["verdict"] = verdict(row, "strict") if row["physics"] else "reference"
         rows.sort(key=lambda row: -row.get("speedup", 0.0))
-    return sorted(found.values(), key=lambda rows: (rows[0]["identity"]["task"], not rows[0]["identity"]["short"]))
+    return sorted(by_search.values(), key=lambda rows: (rows[0]["identity"]["task"], not rows[0]["identity"]["short"]))
 
 
 def fastest(rows: Sequence[dict[str, Any]], *verdicts: str) -> dict[str, Any] | None:
@@ -36,12 +36,14 @@ def fastest(rows: Sequence[dict[str, Any]], *verdicts: str) -> dict[str, Any] | 
 
 def changes(row: dict[str, Any]) -> str:
     both = [("", row["returns"]), ("clearly worse, ", row.get("clearly_worse", {}))]
-    return "; ".join(f"{text}{source} {Difference(**found)}" for text, part in both for source, found in part.items())
+    return "; ".join(
+        f"{text}{source} {Difference(**interval)}" for text, part in both for source, interval in part.items()
+    )
 
 
-def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Table:
+def worlds_table(machine: str, results: Sequence[Sequence[dict[str, Any]]]) -> Table:
     lines = []
-    for rows in found:
+    for rows in results:
         who = rows[0]["identity"]
         exact, same = fastest(rows, "reference"), fastest(rows, "same")
         faster = [row for row in rows if row["verdict"] in ("different", "not shown", "faults")
@@ -54,7 +56,7 @@ def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Tab
             "; ".join(f"{row['name']}: {row['speedup']:.2f}, {row['verdict']}, {changes(row)}" for row in faster[:2]),
         ])  # fmt: skip
     title = (
-        f"{machine}, {found[0][0]['identity']['nworld']} worlds: the fastest setting with the same returns (strict: "
+        f"{machine}, {results[0][0]['identity']['nworld']} worlds: the fastest setting with the same returns (strict: "
         "within 2 %), under random actions and, where it is named, under a policy. Speed: relative to the task as it "
         "is; the number after steps/s is the task as it is against itself, which shows the noise. Intervals: difference"
         " of returns, %."
@@ -63,9 +65,9 @@ def worlds_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Tab
     return Table(title, header, lines)
 
 
-def planning_table(machine: str, found: Sequence[Sequence[dict[str, Any]]]) -> Table:
+def planning_table(machine: str, results: Sequence[Sequence[dict[str, Any]]]) -> Table:
     lines = []
-    for rows in found:
+    for rows in results:
         for row in rows:
             if row["verdict"] in ("same", "not shown", "ranks badly") and row["speedup"] > 1.2:
                 ranks = [f"{value['mean']:.2f} ({value['low']:.2f})" for value in row["ranks"].values()]
@@ -81,10 +83,10 @@ def main() -> None:
     names = sorted(path.name for path in RESULTS.glob("tune-*.jsonl"))
     parts = [TEXT.format(", ".join(f"`{name}`" for name in names))]
     for name in names:
-        found = searches(name)
-        machine = "{device} ({engine} engine)".format(**found[0][0]["identity"])
-        planning = [rows for rows in found if "planner" in rows[0]["identity"]]
-        worlds = [rows for rows in found if rows not in planning]
+        results = searches(name)
+        machine = "{device} ({engine} engine)".format(**results[0][0]["identity"])
+        planning = [rows for rows in results if "planner" in rows[0]["identity"]]
+        worlds = [rows for rows in results if rows not in planning]
         tables = [make(machine, kind) for make, kind in ((worlds_table, worlds), (planning_table, planning)) if kind]
         parts += [table.markdown() for table in tables]
     with replaced(RESULTS / "tune.md") as temporary:

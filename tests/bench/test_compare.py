@@ -36,7 +36,7 @@ def test_changed_reward_and_broken_tasks_are_reported(tmp_path: Path, capsys: py
     tasks = ("cartpole_swingup", "cartpole", "point_mass")
     copy = str(copied(tmp_path, changes))
     report = compare.run(compare.Options(str(ROOT), copy, tasks=tasks, ignore=("*/masked_step/*",), **QUICK))
-    found = {each.name.removeprefix("env/"): each.text for each in report.found}
+    found = {each.name.removeprefix("env/"): each.text for each in report.differences}
     places = ("steps", "of_states", "after_getters", "restored_step", "masked_rand_reset", "fault", "rollout")
     assert set(found) == {
         *(f"point_mass/mujoco/{place}/reward" for place in places), "cartpole/mujoco", "cartpole_swingup/mujoco",

@@ -212,14 +212,14 @@ def timed(
 
 
 def main() -> None:
-    given = json.load(sys.stdin)
-    settings = {name: given[name] for name in ("contestant", "task", "envs", "threads", "seed")}
-    made = CONTESTANTS[given["contestant"]](**settings)
-    steps, seconds = timed(made.step, len(made.actions), given["warm"], given["seconds"])
-    share = made.transition_share() if isinstance(made, EnvPool) else 1.0
-    width = made.actions.shape[1]
-    made.close()
-    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES[type(made)])
+    request = json.load(sys.stdin)
+    settings = {name: request[name] for name in ("contestant", "task", "envs", "threads", "seed")}
+    contestant = CONTESTANTS[request["contestant"]](**settings)
+    steps, seconds = timed(contestant.step, len(contestant.actions), request["warm"], request["seconds"])
+    share = contestant.transition_share() if isinstance(contestant, EnvPool) else 1.0
+    width = contestant.actions.shape[1]
+    contestant.close()
+    versions = ", ".join(f"{name} {version(name)}" for name in PACKAGES[type(contestant)])
     rate = steps * width * share / seconds
     print(json.dumps({"env_steps_per_second": rate, "steps": steps, "versions": versions}))
 
