@@ -78,17 +78,17 @@ def fill(app: Any, docname: str, source: list[str]) -> None:
     if docname.startswith("docs/") and not docname.startswith("docs/notebooks/"):
         kinds = "|".join(PLACES)
         source[0] = re.sub(
-            rf"<!-- ({kinds}):? ?(.*?)-->", lambda found: PLACES[found[1]](found[2]), source[0], flags=re.DOTALL
+            rf"<!-- ({kinds}):? ?(.*?)-->", lambda match: PLACES[match[1]](match[2]), source[0], flags=re.DOTALL
         )
 
 
 def link_names(app: Any, doctree: nodes.document) -> None:
     """Link inline code such as ``lw.make`` to the reference."""
     for literal in list(doctree.findall(nodes.literal)):
-        found = re.fullmatch(r"(lw\.\w+)(\(.*\))?", literal.astext())
-        if found and not isinstance(literal.parent, nodes.reference | pending_xref):
+        match = re.fullmatch(r"(lw\.\w+)(\(.*\))?", literal.astext())
+        if match and not isinstance(literal.parent, nodes.reference | pending_xref):
             link = pending_xref(
-                "", refdomain="py", reftype="obj", reftarget=found[1], refdoc=app.env.docname, refwarn=False
+                "", refdomain="py", reftype="obj", reftarget=match[1], refdoc=app.env.docname, refwarn=False
             )
             literal.replace_self(link)
             link += literal

@@ -156,7 +156,7 @@ for _name in ("g1_full_velocity", "g1_rough_velocity"):
     SHOWS[_name] = dataclasses.replace(SHOWS[_name], settings=_settings, replan_every=2, start=0.0, seconds=1.6)
 
 
-def draw(name: str, run: Path | None) -> dict[str, str]:
+def render(name: str, run: Path | None) -> dict[str, str]:
     """Render a task's animation, and return its command and its result."""
     show = SHOWS.get(name, Show())
     env = lw.make(name, autoreset=False)
@@ -202,11 +202,11 @@ def training(name: str, run: Path, config: dict[str, Any]) -> str:
 
 def written(flags: dict[str, Any]) -> str:
     """Write settings as command-line flags, each preceded by a space."""
-    words = ""
+    text = ""
     for name, value in flags.items():
         flag = name.replace("_", "-")
-        words += f" --{'no-' * (value is False)}{flag}" if isinstance(value, bool) else f" --{flag} {value}"
-    return words
+        text += f" --{'no-' * (value is False)}{flag}" if isinstance(value, bool) else f" --{flag} {value}"
+    return text
 
 
 def planned(env: lw.Env, show: Show, steps: int) -> tuple[torch.Tensor, str]:
@@ -245,9 +245,9 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
     model = copy.copy(env.model)  # the painter sets each world's model fields
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
     painter = Painter(mujoco, model, size, camera_values(model, show.camera))
-    chosen = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
-    drawn = [painter.draw(shot) for shot in shots(env, states[chosen])]
-    return [Image.fromarray(picture).resize(SIZE, Image.Resampling.LANCZOS) for picture in drawn]
+    steps = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
+    images = [painter.draw(shot) for shot in shots(env, states[steps])]
+    return [Image.fromarray(picture).resize(SIZE, Image.Resampling.LANCZOS) for picture in images]
 
 
 def save(images: list[Image.Image], path: Path) -> None:
@@ -270,12 +270,12 @@ def number(value: float) -> str:
 
 def families() -> dict[str, tuple[str, list[str]]]:
     """Return a dict with the title and the task names of each page in docs/tasks/."""
-    found = {}
+    pages = {}
     for path in sorted((DOCS / "tasks").glob("*.md")):
         text = path.read_text()
         names = " ".join(re.findall(r"<!-- tasks: (.*?)-->", text, re.DOTALL)).split()
-        found[path.stem] = (text.partition("\n")[0].removeprefix("# "), names)
-    return found
+        pages[path.stem] = (text.partition("\n")[0].removeprefix("# "), names)
+    return pages
 
 
 def page(results: dict[str, dict[str, str]]) -> str:
@@ -289,11 +289,11 @@ def page(results: dict[str, dict[str, str]]) -> str:
     for stem, (title, names) in families().items():
         cells = []
         for name in names:
-            own = results.get(name)
-            if own:
+            result = results.get(name)
+            if result:
                 picture = f"![{name}](images/gallery/{file_name(name)}.webp)"
                 link = f"[{name}](tasks/{stem}.md#{name.replace('/', '')})"
-                cells.append(f"{picture}<br>{link}<br>{own['result']}<br>`{own['command']}`")
+                cells.append(f"{picture}<br>{link}<br>{result['result']}<br>`{result['command']}`")
         if not cells:
             continue
         lines += [f"## {title}", "", "| | | |", "|---|---|---|"]
@@ -314,10 +314,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     parser.add_argument("--runs", type=Path, metavar="FOLDER", default=PRETRAINED)
-    words = parser.parse_args()
-    runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(words.runs.glob("*/config.json"))}
-    for name in words.tasks or [name for _, names in families().values() for name in names]:
-        result = draw(name, runs.get(name))
+    arguments = parser.parse_args()
+    runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(arguments.runs.glob("*/config.json"))}
+    for name in arguments.tasks or [name for _, names in families().values() for name in names]:
+        result = render(name, runs.get(name))
         # read the file again, because another process may have added results
         results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
         results[name] = result

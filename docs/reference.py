@@ -44,22 +44,22 @@ SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=Fal
 # public names
 
 
-def names(words: str) -> str:
-    """Return the documentation of the public names in ``words``."""
-    return "\n".join(["```{eval-rst}", *(line for name in words.split() for line in entry(lw, name)), "```"])
+def names(text: str) -> str:
+    """Return the documentation of the public names in ``text``."""
+    return "\n".join(["```{eval-rst}", *(line for name in text.split() for line in entry(lw, name)), "```"])
 
 
-def modules(words: str) -> str:
-    """Return the documentation of the modules in ``words``, such as ``walkers``."""
+def modules(text: str) -> str:
+    """Return the documentation of the modules in ``text``, such as ``walkers``."""
     lines = ["```{eval-rst}"]
-    for word in words.split():
+    for word in text.split():
         module = importlib.import_module(f"lyceum_warp.{word}")
         sys.modules[f"lw.{word}"] = module
-        found = [
+        public = [
             name for name, value in vars(module).items()
             if not name.startswith("_") and inspect.isfunction(value) and value.__module__ == module.__name__
         ]  # fmt: skip
-        lines += [line for name in found for line in entry(module, name, f"lw.{word}")]
+        lines += [line for name in public for line in entry(module, name, f"lw.{word}")]
     return "\n".join([*lines, "```"])
 
 
@@ -74,8 +74,8 @@ def entry(module: Any, name: str, prefix: str = "lw") -> list[str]:
     if not isinstance(value, type):
         return [f".. autofunction:: {prefix}.{name}", ""]
     lines = [f".. autoclass:: {prefix}.{name}"]
-    if found := members(value):
-        lines.append(f"   :members: {', '.join(found)}")
+    if public := members(value):
+        lines.append(f"   :members: {', '.join(public)}")
     bases = [f"``lw.{base.__name__}``" for base in value.__mro__[1:] if is_public(base)]
     return [*lines, "", *([f"   Members as in {' and '.join(bases)}.", ""] if bases else [])]
 
@@ -87,12 +87,14 @@ def is_public(cls: type) -> bool:
 
 def members(cls: type) -> list[str]:
     """Return the names of a class's public members that have docstrings; include members of private base classes."""
-    found: dict[str, None] = {}
+    members: dict[str, None] = {}
     for base in reversed(cls.__mro__):
         if base is cls or (base.__module__.startswith("lyceum_warp.") and not is_public(base)):
-            found |= dict.fromkeys(attribute_docs(base))
-            found |= {name: None for name, value in vars(base).items() if isinstance(value, METHODS) and value.__doc__}
-    return [name for name in found if not name.startswith("_")]
+            members |= dict.fromkeys(attribute_docs(base))
+            members |= {
+                name: None for name, value in vars(base).items() if isinstance(value, METHODS) and value.__doc__
+            }
+    return [name for name in members if not name.startswith("_")]
 
 
 def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
@@ -104,7 +106,7 @@ def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[
 
 def converted(text: str) -> list[str]:
     """Convert a docstring to lines of reStructuredText, and escape vertical bars outside of code."""
-    text = re.sub(r"``.*?``|\|", lambda found: "\\|" if found[0] == "|" else found[0], text, flags=re.DOTALL)
+    text = re.sub(r"``.*?``|\|", lambda match: "\\|" if match[0] == "|" else match[0], text, flags=re.DOTALL)
     return str(GoogleDocstring(text, SECTIONS)).splitlines()
 
 
@@ -117,16 +119,16 @@ def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, sign
 
 def warp_function(function: Any, name: str) -> list[str]:
     """Return a Warp function's documentation: signatures of all overloads, and the docstring."""
-    found: dict[tuple[str, ...], dict[str, dict[str, None]]] = {}
+    overloads: dict[tuple[str, ...], dict[str, dict[str, None]]] = {}
     for overload in dict.fromkeys(each.func for each in (*function.user_overloads.values(),
                                                          *function.user_templates.values())):  # fmt: skip
         signature = inspect.signature(overload)
-        kinds = found.setdefault(tuple(signature.parameters), {})
+        kinds = overloads.setdefault(tuple(signature.parameters), {})
         for argument in signature.parameters.values():
             kinds.setdefault(argument.name, {})[type_name(argument.annotation)] = None
         kinds.setdefault("return", {})[type_name(signature.return_annotation)] = None
     heads = []
-    for arguments, kinds in found.items():
+    for arguments, kinds in overloads.items():
         spelled = {each: "Any" if "Any" in names else " | ".join(names) for each, names in kinds.items()}
         result = f" -> {spelled['return']}" if spelled["return"] else ""
         heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
@@ -149,9 +151,9 @@ def type_name(annotation: Any) -> str:
 # tasks
 
 
-def tasks(words: str) -> str:
-    """Return a section for each task in ``words``."""
-    return "\n\n".join(map(task_section, words.split()))
+def tasks(text: str) -> str:
+    """Return a section for each task in ``text``."""
+    return "\n\n".join(map(task_section, text.split()))
 
 
 def task_section(name: str) -> str:
@@ -174,10 +176,10 @@ def task_section(name: str) -> str:
     lines += metrics(task)
     rows = parameters(task)
     if rows:
-        known = any(row[2] for row in rows)
-        shown = table(("parameter", "default", "meaning"), rows) if known else table(
+        documented = any(row[2] for row in rows)
+        parameter_lines = table(("parameter", "default", "meaning"), rows) if documented else table(
             ("parameter", "default"), [row[:2] for row in rows])  # fmt: skip
-        lines += shown if len(rows) <= 12 else folded(f"{len(rows)} parameters", shown)
+        lines += parameter_lines if len(rows) <= 12 else folded(f"{len(rows)} parameters", parameter_lines)
     source = Path(sys.modules[cls.__module__].__file__ or "")
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
@@ -198,8 +200,8 @@ def facts(task: BoundTask) -> list[str]:
     if task.functions["success"] is not None:
         rows.append(("success", "yes" if cls.success_steps == 1 else f"after {cls.success_steps} steps in a row"))
     if cls.planning.settings:
-        words = ", ".join(f"{name} {shortened(value)}" for name, value in cls.planning.settings.items())
-        rows.append(("MPPI's settings", words))
+        settings = ", ".join(f"{name} {shortened(value)}" for name, value in cls.planning.settings.items())
+        rows.append(("MPPI's settings", settings))
     return table(("", ""), rows)
 
 
@@ -220,8 +222,8 @@ def actions(task: BoundTask) -> list[str]:
             rows[-1] = ([*rows[-1][0], part], rows[-1][1] + columns.stop - columns.start, text)
         else:
             rows.append(([part], columns.stop - columns.start, text))
-    shown = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
-    return table((f"action, {count(space.size, 'number')}", "size", "bounds"), shown)
+    cells = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
+    return table((f"action, {count(space.size, 'number')}", "size", "bounds"), cells)
 
 
 def metrics(task: BoundTask) -> list[str]:
@@ -253,8 +255,8 @@ def spelled(default: Any, value: Any) -> str:
     if isinstance(default, FromModel):
         return "from the model"
     if elements and all(isinstance(each, Element) for each in elements):
-        given = ", ".join(each.name for each in elements)
-        return f"{given if len(given) < 40 else given[:40] + ' …'}"
+        names = ", ".join(each.name for each in elements)
+        return f"{names if len(names) < 40 else names[:40] + ' …'}"
     numbers = np.asarray(value)
     if numbers.dtype.kind not in "fiub" or numbers.size > 12:
         return f"table, {' x '.join(map(str, numbers.shape))}"

@@ -37,7 +37,7 @@ def functions() -> list[str]:
 
 def written(page: str) -> str:
     """Return the page with up-to-date tables."""
-    return PLACE.sub(lambda found: "\n".join([found[1], *functions(), "", found[2]]), page)
+    return PLACE.sub(lambda match: "\n".join([match[1], *functions(), "", match[2]]), page)
 
 
 if __name__ == "__main__":

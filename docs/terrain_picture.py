@@ -19,7 +19,8 @@ model = spec.compile()
 model.vis.global_.offwidth, model.vis.global_.offheight = 1280, 620
 model.vis.map.zfar = 1000.0
 view = mujoco.MjvCamera()
-view.lookat, view.distance, view.azimuth, view.elevation = [0.0, -2.0, 0.0], 52.0, 90.0, -42.0
+view.lookat = [0.0, -2.0, 0.0]
+view.distance, view.azimuth, view.elevation = 52.0, 90.0, -42.0
 data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 with mujoco.Renderer(model, 620, 1280) as renderer:

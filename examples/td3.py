@@ -94,8 +94,8 @@ class TD3(lw.Learner):
         if self.updates % config.actor_every == 0:
             descend(actor_step, -self.value(obs, self.policy.unit(self.policy.act(obs)))[0].mean())
             with torch.no_grad():
-                own = [*self.policy.parameters(), *self.value.parameters()]
-                for target, parameter in zip(self.targets.parameters(), own, strict=True):
+                parameters = [*self.policy.parameters(), *self.value.parameters()]
+                for target, parameter in zip(self.targets.parameters(), parameters, strict=True):
                     target.lerp_(parameter, config.tau)
         return loss.detach()
 
@@ -103,11 +103,11 @@ class TD3(lw.Learner):
         return torch.randn(like.shape, generator=self.generator, device=like.device)
 
     def state_dict(self) -> dict:
-        own = {
+        entries = {
             "targets": self.targets.state_dict(), "updates": self.updates,
             "optimizers": [optimizer.state_dict() for optimizer in self.optimizers],
         }  # fmt: skip
-        return super().state_dict() | copy.deepcopy(own)
+        return super().state_dict() | copy.deepcopy(entries)
 
     def load_state_dict(self, state: dict) -> None:
         super().load_state_dict(state)

@@ -110,8 +110,8 @@ class Walkthrough:
                 script.write_text(text)
                 runpy.run_path(str(script), run_name=f"block_{i}")
 
-    def command(self, words: list[str]) -> None:
-        match words:
+    def command(self, command_line: list[str]) -> None:
+        match command_line:
             case ["git", "clone", address]:
                 robot = self.folder / Path(address).name / "unitree_go1" / "scene.xml"
                 robot.parent.mkdir(parents=True)
@@ -125,9 +125,9 @@ class Walkthrough:
                 kinds = [f"{command} {option}" for option in ("--resume", "--algorithm") if option in options]
                 kind = kinds[0] if kinds else command
                 more = QUICK.get(kind, []) if self.quick else []
-                assert cli.main([command, *options, *more]) == 0, words
+                assert cli.main([command, *options, *more]) == 0, command_line
             case _:
-                pytest.fail(f"this test does not know the command {words}")
+                pytest.fail(f"this test does not know the command {command_line}")
 
 
 @pytest.fixture(autouse=True)

@@ -30,9 +30,9 @@ def output_of(name: str) -> str:
     """Run an example in a subprocess, because it registers a task of the module ``__main__``."""
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     command = [sys.executable, str(EXAMPLES / name)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    process = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=900)
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
 def numbers(pattern: str, lines: list[str]) -> list[float]:

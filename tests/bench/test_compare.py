@@ -36,16 +36,16 @@ def test_changed_reward_and_broken_tasks_are_reported(tmp_path: Path, capsys: py
     tasks = ("cartpole_swingup", "cartpole", "point_mass")
     copy = str(copied(tmp_path, changes))
     report = compare.run(compare.Options(str(ROOT), copy, tasks=tasks, ignore=("*/masked_step/*",), **QUICK))
-    found = {each.name.removeprefix("env/"): each.text for each in report.differences}
+    reported = {each.name.removeprefix("env/"): each.text for each in report.differences}
     places = ("steps", "of_states", "after_getters", "restored_step", "masked_rand_reset", "fault", "rollout")
-    assert set(found) == {
+    assert set(reported) == {
         *(f"point_mass/mujoco/{place}/reward" for place in places), "cartpole/mujoco", "cartpole_swingup/mujoco",
     }  # fmt: skip
-    steps = found["point_mass/mujoco/steps/reward"]
+    steps = reported["point_mass/mujoco/steps/reward"]
     assert " at step 0, world 0; max |difference| 1; 12 of 12 differ" in steps
-    assert found["point_mass/mujoco/fault/reward"].endswith("2 of 4 differ")
-    assert found["cartpole/mujoco"] == "new failed: RuntimeError: broken on purpose"
-    assert found["cartpole_swingup/mujoco"] == "new failed: the process ended with 3"
+    assert reported["point_mass/mujoco/fault/reward"].endswith("2 of 4 differ")
+    assert reported["cartpole/mujoco"] == "new failed: RuntimeError: broken on purpose"
+    assert reported["cartpole_swingup/mujoco"] == "new failed: the process ended with 3"
     assert "names" in capsys.readouterr().out and report.ignored > 0
 
 
@@ -83,8 +83,8 @@ def test_shapes_types_and_texts_are_compared() -> None:
 
 def test_names_in_only_one_checkout_are_reported_as_added_or_removed() -> None:
     zero = np.zeros(1)
-    found = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
-    assert [(each.name, each.text) for each in found] == [
+    changes = compare.differences("u", {"both": zero, "gone": zero}, {"new": zero, "both": zero}, {})
+    assert [(each.name, each.text) for each in changes] == [
         ("u/gone", "removed: float64 (1,)"), ("u/new", "added: float64 (1,)"),
     ]  # fmt: skip
 
@@ -94,10 +94,10 @@ def test_comparison_of_a_revision_with_itself_finds_no_difference(tmp_path: Path
     if not (ROOT / ".git").exists():
         pytest.skip("needs the repository")
     options = ["--tasks", "point_mass", "--iterations", "4", "--steps", "4"]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, PROGRAM, "HEAD", "HEAD", *options], capture_output=True, text=True, env=environment(tmp_path)
     )
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert process.returncode == 0, process.stdout + process.stderr
     assert not any(tmp_path.iterdir())
 
 

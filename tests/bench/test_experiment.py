@@ -51,14 +51,14 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
     def figure(rows: list[Any]) -> Any:
         from lyceum_warp.viz import new_figure
 
-        drawn = new_figure("a toy", 2, 2)
-        drawn.subplots().plot([row.result["rate"] for row in rows])
-        return drawn
+        plot = new_figure("a toy", 2, 2)
+        plot.subplots().plot([row.result["rate"] for row in rows])
+        return plot
 
-    made = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, "C engine", figure)
+    definition = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, "C engine", figure)
     monkeypatch.setattr(experiment, "NAMES", ("toy",))
-    monkeypatch.setitem(sys.modules, "toy", SimpleNamespace(EXPERIMENT=made))
-    return SimpleNamespace(measured=measured, main=lambda *words: experiment.main(made, [*map(str, words)]))
+    monkeypatch.setitem(sys.modules, "toy", SimpleNamespace(EXPERIMENT=definition))
+    return SimpleNamespace(measured=measured, main=lambda *words: experiment.main(definition, [*map(str, words)]))
 
 
 def lines(path: Path) -> list[dict[str, Any]]:
@@ -142,13 +142,13 @@ def test_figures_and_tables_are_made_from_stored_results(
     toy.main("--out", tmp_path / "toy.jsonl")
     toy.measured.clear()
     assert plot.main(experiment.Stored(("toy",), tmp_path)) == 0
-    drawn = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
-    assert len(drawn) == 1
+    pictures = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
+    assert len(pictures) == 1
     for _ in range(2):
         assert plot.main(experiment.Stored(("toy",), tmp_path)) == tables.main(experiment.Stored((), tmp_path)) == 0
         text = (tmp_path / "toy.md").read_text()
         assert text.startswith("# toy\n") and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1
-    assert drawn == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
+    assert pictures == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
     assert not toy.measured
     with pytest.raises(FileNotFoundError, match="run an experiment first"):
         plot.main(experiment.Stored((), tmp_path / "empty"))
@@ -206,7 +206,7 @@ def test_cases_run_in_subprocesses_on_separate_cores(
     monkeypatch.syspath_prepend(str(tmp_path))
     import parallel_toy
 
-    made = experiment.Experiment(
+    definition = experiment.Experiment(
         "toy",
         "A toy.",
         cases=lambda options: [parallel_toy.Case(i) for i in range(3)],
@@ -217,8 +217,8 @@ def test_cases_run_in_subprocesses_on_separate_cores(
         parallel=True,
     )
     out, before = tmp_path / "toy.jsonl", os.sched_getaffinity(0)
-    assert experiment.main(made, ["--out", str(out), "--threads", "1", "--jobs", "2"]) == 1
+    assert experiment.main(definition, ["--out", str(out), "--threads", "1", "--jobs", "2"]) == 1
     assert "RuntimeError: it broke" in capsys.readouterr().err and os.sched_getaffinity(0) == before
-    results = [found.result for found in experiment.read(out)]
+    results = [row.result for row in experiment.read(out)]
     assert len(results) == 2 and len({result["process"] for result in results} | {os.getpid()}) == 3
     assert all(len(result["cores"]) == 1 for result in results)

@@ -13,20 +13,18 @@ import lyceum_warp as lw
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = lw.PPOConfig(hidden=(4,), value_hidden=(4,), num_steps=4, mean_every=0)
-    made = lw.train(
-        lw.PPO(lw.make("go1_velocity", nworld=2), config=config), tmp_path_factory.mktemp("gate") / "run", iterations=1
-    )
-    return made.folder
+    learner = lw.PPO(lw.make("go1_velocity", nworld=2), config=config)
+    return lw.train(learner, tmp_path_factory.mktemp("gate") / "run", iterations=1).folder
 
 
 def test_experiment_gate_evaluates_each_policy_only_once(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
-    assert experiment.main(gate.EXPERIMENT, words) == 0
+    arguments = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
+    assert experiment.main(gate.EXPERIMENT, arguments) == 0
     out = capsys.readouterr().out
     assert "| mean velocity error, m/s | " in out and "does not pass" in out and "| falls with pushes |" in out
-    assert experiment.main(gate.EXPERIMENT, words) == 0
+    assert experiment.main(gate.EXPERIMENT, arguments) == 0
     assert "1 of 1 cases are stored" in capsys.readouterr().out
 
 

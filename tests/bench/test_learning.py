@@ -28,8 +28,8 @@ def test_standing_robot_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> 
     env = lw.make("go1_velocity", nworld=2)
     policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
     case = learning.Case("go1_velocity", "ppo", 0, 8, 80.0, 1.0, "cpu")
-    found = learning.walk(case, policy)
-    assert 0.1 < found["velocity_error"] < 2.0 and found["falls_per_world_second"] >= 0.0
+    errors = learning.walk(case, policy)
+    assert 0.1 < errors["velocity_error"] < 2.0 and errors["falls_per_world_second"] >= 0.0
 
 
 def test_learning_figure_is_drawn_from_stored_results(tmp_path: Path) -> None:

@@ -51,14 +51,14 @@ def test_stored_training_times_are_medians_of_the_records() -> None:
     assert len(table) == 16
     for task, cells, _ in table:
         target, warm, cold, cores_target, cores = (float(cell.replace(",", "")) for cell in cells.split("|")[:5])
-        for device, cache, wanted, seconds in (
+        for device, cache, level, seconds in (
             ("cuda", "warm", target, warm), ("cuda", "cold", target, cold), ("cpu", "warm", cores_target, cores),
         ):  # fmt: skip
             machine, discount = ("Intel", "--gamma 0.995") if device == "cpu" else ("H200", "none")
             results = [
                 row.result for row in rows
                 if (row.case["task"], row.case["device"], row.case["cache"]) == (task, device, cache)
-                and row.case["target"] == wanted and machine in f"{row.provenance['cpu']} {row.provenance.get('gpu')}"
+                and row.case["target"] == level and machine in f"{row.provenance['cpu']} {row.provenance.get('gpu')}"
                 and discount not in row.case["flags"]
             ]  # fmt: skip
             median = records.censored(results, "seconds", ".1f").split(" (")[0]

@@ -80,14 +80,14 @@ def test_short_run_stores_plausible_results_once(
     check: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    made = experiment.load(check.__name__)
-    words = ["--short", "--out", "out.jsonl", *SHORT[check].split()]
-    assert experiment.main(made, words) == 0
+    definition = experiment.load(check.__name__)
+    arguments = ["--short", "--out", "out.jsonl", *SHORT[check].split()]
+    assert experiment.main(definition, arguments) == 0
     rows = experiment.read(tmp_path / "out.jsonl")
     check(*(row.result for row in rows))
-    assert all(table.rows for table in made.tables(rows))
-    if made.figure is not None:
-        made.figure(rows).savefig("figure.png")
+    assert all(table.rows for table in definition.tables(rows))
+    if definition.figure is not None:
+        definition.figure(rows).savefig("figure.png")
     capsys.readouterr()
-    assert experiment.main(made, words) == 0
-    assert f"{made.name}: {len(rows)} of {len(rows)} cases are stored" in capsys.readouterr().out
+    assert experiment.main(definition, arguments) == 0
+    assert f"{definition.name}: {len(rows)} of {len(rows)} cases are stored" in capsys.readouterr().out

@@ -42,9 +42,9 @@ def test_every_injected_fault_is_found_and_counted(
 
 def test_soak_variant_uses_the_struct_of_its_task(tmp_path: Path) -> None:
     file, _, _ = soak.variant("dm/finger_turn_hard", tmp_path)
-    own = TaskSource(find_task(file), "soak")
-    observe = own.functions["observe"]
-    assert own.world.cls.__name__ == "TurnWorld" and observe and observe.func.__name__ == "soak_observe"
+    variant = TaskSource(find_task(file), "soak")
+    observe = variant.functions["observe"]
+    assert variant.world.cls.__name__ == "TurnWorld" and observe and observe.func.__name__ == "soak_observe"
     assert (
         soak.Faults("dm/finger_turn_hard", 0, 8, 8, "auto", "cpu", False, 0.0, 0).state(tmp_path, 1).parent == tmp_path
     )
@@ -55,11 +55,11 @@ def test_soak_run_reports_missed_faults_and_faults_in_other_worlds(
     work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(soak, "VARIANT", soak.VARIANT.replace("== 4.0", "== 7.0").replace("== 5.0", "== 6.0"))
-    make, made = soak.lw.make, []
+    make, envs = soak.lw.make, []
 
     def other_twin(task: str, **words: Any) -> lw.Env:
-        made.append(make(task, **(words | ({"seed": 1} if len(made) == 2 else {}))))
-        return made[-1]
+        envs.append(make(task, **(words | ({"seed": 1} if len(envs) == 2 else {}))))
+        return envs[-1]
 
     monkeypatch.setattr(soak.lw, "make", other_twin)
     result = run(tmp_path / "soak.jsonl", *FAULTS, "--steps", "4800", "--work", str(work))[0]
