@@ -4,7 +4,6 @@ tests/test_docs.py checks that every public name and every task appears exactly 
 """
 
 import dataclasses
-import importlib
 import inspect
 import re
 import sys
@@ -53,7 +52,7 @@ def modules(text: str) -> str:
     """Return the documentation of the modules in ``text``, such as ``walkers``."""
     lines = ["```{eval-rst}"]
     for word in text.split():
-        module = importlib.import_module(f"lyceum_warp.{word}")
+        module = getattr(lw, word)
         sys.modules[f"lw.{word}"] = module
         public = [
             name for name, value in vars(module).items()
