@@ -10,8 +10,7 @@ from lyceum_warp.algos.common.squashed_policy import SquashedPolicy as SquashedP
 from lyceum_warp.algos.common.transfer import Transfer as Transfer, transfer as transfer
 from lyceum_warp.algos.common.twin_critic import TwinCritic as TwinCritic
 from lyceum_warp.algos.common.value import ValueFunction as ValueFunction
-from lyceum_warp.algos.npg import NPG as NPG
-from lyceum_warp.algos.npg_config import NPGConfig as NPGConfig
+from lyceum_warp.algos.npg import NPG as NPG, NPGConfig as NPGConfig
 from lyceum_warp.algos.planning.config import MPPIConfig as MPPIConfig
 from lyceum_warp.algos.planning.planner import (
     CEM as CEM,
@@ -20,10 +19,8 @@ from lyceum_warp.algos.planning.planner import (
     PredictiveSampling as PredictiveSampling,
 )
 from lyceum_warp.algos.planning.updates import PlanSamples as PlanSamples, PlanUpdate as PlanUpdate
-from lyceum_warp.algos.ppo import PPO as PPO
-from lyceum_warp.algos.ppo_config import PPOConfig as PPOConfig
-from lyceum_warp.algos.sac import SAC as SAC
-from lyceum_warp.algos.sac_config import SACConfig as SACConfig
+from lyceum_warp.algos.ppo import PPO as PPO, PPOConfig as PPOConfig
+from lyceum_warp.algos.sac import SAC as SAC, SACConfig as SACConfig
 from lyceum_warp.binding.registry import register as register, task_names as task_names
 from lyceum_warp.controllers.controller import Controller as Controller, PlanningController as PlanningController
 from lyceum_warp.controllers.episode_collector import ControlProgress as ControlProgress

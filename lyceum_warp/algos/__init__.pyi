@@ -43,8 +43,7 @@ from lyceum_warp.algos.common.value import (
     ValueFunction as ValueFunction,
     value_group as value_group,
 )
-from lyceum_warp.algos.npg import NPG as NPG
-from lyceum_warp.algos.npg_config import NPGConfig as NPGConfig
+from lyceum_warp.algos.npg import NPG as NPG, NPGConfig as NPGConfig
 from lyceum_warp.algos.planning.arguments import task_config as task_config
 from lyceum_warp.algos.planning.config import MPPIConfig as MPPIConfig
 from lyceum_warp.algos.planning.planner import (
@@ -57,7 +56,5 @@ from lyceum_warp.algos.planning.updates import (
     PlanSamples as PlanSamples,
     PlanUpdate as PlanUpdate,
 )
-from lyceum_warp.algos.ppo import PPO as PPO
-from lyceum_warp.algos.ppo_config import PPOConfig as PPOConfig
-from lyceum_warp.algos.sac import SAC as SAC
-from lyceum_warp.algos.sac_config import SACConfig as SACConfig
+from lyceum_warp.algos.ppo import PPO as PPO, PPOConfig as PPOConfig
+from lyceum_warp.algos.sac import SAC as SAC, SACConfig as SACConfig

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.algos.npg_config import enough_samples
+from lyceum_warp.algos.npg import enough_samples
 
 
 @pytest.mark.parametrize(
