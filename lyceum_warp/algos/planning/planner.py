@@ -17,9 +17,9 @@ Returns are divided by the temperature. Summers et al. give inverse temperatures
 With several plants, each plant has its own plan, and the planner rolls out the samples of all plans together. The
 samples of a single plan may leave most of a GPU, or most threads, idle.
 
-``update`` selects how samples are weighted; the formula of step 4 is MPPI's (``mppi.py``). CEM (``cem.py``) weights the
-best samples equally and then fits the noise to them. Predictive sampling takes the best sample. A custom update
-(``plan_update.py``) weights the samples, and may also fit parameters. With knots, the planner shifts, perturbs and
+``update`` selects how samples are weighted (``updates.py``); the formula of step 4 is MPPI's. CEM weights the best
+samples equally and then fits the noise to them. Predictive sampling takes the best sample. A custom update weights the
+samples, and may also fit parameters. With knots, the planner shifts, perturbs and
 averages the knots of a spline, and interpolates actions from them (``kernels/knots.py``).
 """
 
@@ -39,11 +39,15 @@ from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy_check import check_value
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.planning.arguments import plain, planner_arguments, plant_seeds
-from lyceum_warp.algos.planning.cem import CrossEntropy
 from lyceum_warp.algos.planning.config import SETTINGS, MPPIConfig
-from lyceum_warp.algos.planning.mppi import ExponentialWeights
-from lyceum_warp.algos.planning.predictive_sampling import BestSample
-from lyceum_warp.algos.planning.updates import PlanSamples, PlanUpdate, launch_blocks
+from lyceum_warp.algos.planning.updates import (
+    BestSample,
+    CrossEntropy,
+    ExponentialWeights,
+    PlanSamples,
+    PlanUpdate,
+    launch_blocks,
+)
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core.done import Done
 from lyceum_warp.core.options import EnvOptions

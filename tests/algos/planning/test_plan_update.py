@@ -6,8 +6,7 @@ import torch
 from rail_task import Picky
 
 import lyceum_warp as lw
-from lyceum_warp.algos.planning.cem import CrossEntropy, spread
-from lyceum_warp.algos.planning.mppi import ExponentialWeights
+from lyceum_warp.algos.planning.updates import CrossEntropy, ExponentialWeights, spread
 
 POINT: dict[str, Any] = dict(task="point_mass", horizon=6, samples=12, noise=1.0, seed=3)
 
