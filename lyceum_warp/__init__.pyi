@@ -85,8 +85,18 @@ from lyceum_warp.kernels.ground import (
     on_ground as on_ground,
     start_on_terrain as start_on_terrain,
 )
+from lyceum_warp.kernels.put import put as put, put_upright as put_upright
 from lyceum_warp.kernels.random import normal as normal, uniform as uniform
+from lyceum_warp.kernels.rewards import (
+    Sigmoid as Sigmoid,
+    all_inside as all_inside,
+    grasp_terms as grasp_terms,
+    inside as inside,
+    sum_squares as sum_squares,
+    tolerance as tolerance,
+)
 from lyceum_warp.kernels.rotations import (
+    angle_between as angle_between,
     quat_angle as quat_angle,
     quat_difference as quat_difference,
     quat_from_axis_angle as quat_from_axis_angle,
@@ -102,19 +112,7 @@ from lyceum_warp.kernels.rotations import (
     quat_to_mat as quat_to_mat,
     quat_to_rotvec as quat_to_rotvec,
 )
-from lyceum_warp.kernels.task_helpers import (
-    Sigmoid as Sigmoid,
-    all_inside as all_inside,
-    angle_between as angle_between,
-    body_velocity as body_velocity,
-    grasp_terms as grasp_terms,
-    inside as inside,
-    local_velocity as local_velocity,
-    put as put,
-    put_upright as put_upright,
-    sum_squares as sum_squares,
-    tolerance as tolerance,
-)
+from lyceum_warp.kernels.velocities import body_velocity as body_velocity, local_velocity as local_velocity
 from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
 from lyceum_warp.training.loop import train as train

@@ -12,7 +12,7 @@ from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env.arrays import memory_columns, own_parts
 from lyceum_warp.env.env import Env
 from lyceum_warp.graphs.capture import Calls, Phase
-from lyceum_warp.kernels import planning, state
+from lyceum_warp.kernels import rollouts, state
 from lyceum_warp.support.arrays import (
     flat,
     launch_parts,
@@ -188,10 +188,10 @@ class OpenLoop:
 
     def _start(self) -> None:
         worlds, device = self.worlds, self.env.device
-        wp.launch(planning.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
+        wp.launch(rollouts.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
         for name, rows in self._models.items():
             args = [rows, self.env.state_space.parts[name].start, worlds.state]
-            wp.launch(planning.overwrite_rows, (self.env.nworld, rows.shape[1]), args, device=device)
+            wp.launch(rollouts.overwrite_rows, (self.env.nworld, rows.shape[1]), args, device=device)
         rest = worlds.state[:, self.env.engine.state_size :]
         worlds.restore_counters(worlds.everyone, rest)
         if self._keys is not None:
@@ -203,10 +203,10 @@ class OpenLoop:
         for name, buffer in self._dynamics.items():
             columns = worlds.state[:, self.env.state_space.parts[name]]
             rows = flat(buffer).reshape((*buffer.shape[:2], -1))
-            wp.launch(planning.repeat_columns, rows.shape, [columns, rows], device=device)
+            wp.launch(rollouts.repeat_columns, rows.shape, [columns, rows], device=device)
         self._fault.zero_()
         args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
-        wp.launch(planning.controls, self._actions.shape[:2], args, device=device)
+        wp.launch(rollouts.controls, self._actions.shape[:2], args, device=device)
 
     def _transitions(self) -> list[Any]:
         """Get states before and after all transitions, the parameters, and the actions."""
@@ -234,7 +234,7 @@ class OpenLoop:
         launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
-        wp.launch(planning.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
+        wp.launch(rollouts.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
         self._end(self._last)
 
     def _act(self, t: int) -> None:
@@ -252,6 +252,6 @@ class OpenLoop:
     def _end(self, batch: object) -> None:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
-        wp.launch(planning.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
+        wp.launch(rollouts.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
         args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._finite, self._obs, 1]
         launch_parts(self.env.task.kernels.observe_worlds, 1, n, args, device)

@@ -10,7 +10,7 @@ import math
 
 import warp as wp
 
-from lyceum_warp.kernels.planning import plant_of
+from lyceum_warp.kernels.rollouts import plant_of
 
 ORDERS = {"zero": 0, "linear": 1, "cubic": 3}
 """Spline orders by name."""

@@ -1,4 +1,4 @@
-"""Plan by sampling: compute controls of open-loop rollouts, add noise to plans, weigh and average samples.
+"""Plan by sampling: shift plans, add noise, weigh and average samples.
 
 Plans have the shape (horizon, nplant, nact). Actions of samples have the shape (horizon, nsample, nact), with the
 samples of a plant in consecutive rows. With spline knots, the first axis has one entry per knot.
@@ -6,11 +6,10 @@ samples of a plant in consecutive rows. With spline knots, the first axis has on
 
 import warp as wp
 
-from lyceum_warp.core.done import Done
 from lyceum_warp.kernels.faults import is_out_of_range
 from lyceum_warp.kernels.random import stream, world_key
+from lyceum_warp.kernels.rollouts import first_row, plant_of
 
-ACTION = wp.constant(int(Done.ACTION))
 NOISE = wp.constant(-2)
 """Replaces the episode number in the random streams of the noise, so that they differ from all streams of worlds."""
 DRAWS = wp.constant(-3)
@@ -22,86 +21,6 @@ ALL_FAILED, BAD_WEIGHTS, BAD_FIT = 1, 2, 4
 _TILES = f"{__name__}.tiles"
 """The Warp module of the kernels that use tiles. On the CPU, all kernels of a module write the same shared variable,
 which holds the address of the tiles. Therefore ``graphs.capture`` serialises these kernels."""
-
-
-@wp.func
-def plant_of(row: int, rows: int, plants: int) -> int:
-    """Return the plant to which a row belongs.
-
-    A row is a sample or a world, and the rows of a plant are consecutive.
-    """
-    if plants == 1:  # the division would double the time of a small kernel on the CPU
-        return 0
-    return row // (rows // plants)
-
-
-@wp.func
-def first_row(plant: int, rows: int, plants: int) -> int:
-    """Return the index of a plant's first row."""
-    if plant == 0:
-        return 0
-    return plant * (rows // plants)
-
-
-@wp.kernel(enable_backward=False)
-def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64]):
-    """Copy each state to an equal number of consecutive worlds; launched over (nworld, state_size)."""
-    w, i = wp.tid()
-    state_out[w, i] = state_in[plant_of(w, state_out.shape[0], state_in.shape[0]), i]
-
-
-@wp.kernel(enable_backward=False)
-def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy row w % rows into the state of world w, starting at column ``first``; launched over (nworld, size)."""
-    w, i = wp.tid()
-    state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
-
-
-@wp.kernel(enable_backward=False)
-def controls(
-    action_inout: wp.array3d[float],
-    range_in: wp.array2d[float],
-    scale_in: wp.array2d[float],
-    fault_out: wp.array[int],
-    ctrl_out: wp.array3d[float],
-):
-    """Map actions to controls, clipped to their ranges; launched over (steps, nworld).
-
-    An action that is not finite becomes zero, and causes a fault in its world.
-    """
-    t, w = wp.tid()
-    fault = int(0)
-    for i in range(action_inout.shape[2]):
-        if not wp.isfinite(action_inout[t, w, i]):
-            fault = ACTION
-    if fault != 0:
-        fault_out[w] = fault
-        for i in range(action_inout.shape[2]):
-            action_inout[t, w, i] = 0.0
-    for i in range(ctrl_out.shape[2]):
-        ctrl = action_inout[t, w, i] * scale_in[i, 0] + scale_in[i, 1]
-        ctrl_out[t, w, i] = wp.clamp(ctrl, range_in[i, 0], range_in[i, 1])
-
-
-@wp.kernel(enable_backward=False)
-def repeat_columns(columns_in: wp.array2d[wp.float64], rows_out: wp.array3d[float]):
-    """Copy columns of states into a buffer, once for each step; launched over (steps, nworld, columns)."""
-    t, w, i = wp.tid()
-    rows_out[t, w, i] = float(columns_in[w, i])
-
-
-@wp.kernel(enable_backward=False)
-def add_to(number: int, count_inout: wp.array[int]):
-    """Add a number to counters; launched over the number of counters."""
-    w = wp.tid()
-    count_inout[w] = count_inout[w] + number
-
-
-@wp.kernel(enable_backward=False)
-def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
-    """Add the bits of one array of faults to another; launched over (nworld,)."""
-    w = wp.tid()
-    fault_inout[w] = fault_inout[w] | fault_in[w]
 
 
 @wp.kernel(enable_backward=False)

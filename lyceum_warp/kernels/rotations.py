@@ -183,3 +183,9 @@ def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
     s = uniform(rng, 0.0, 2.0 * wp.pi)
     a, b = wp.sqrt(1.0 - u), wp.sqrt(u)
     return wp.vec4(a * wp.sin(t), a * wp.cos(t), b * wp.sin(s), b * wp.cos(s))
+
+
+@wp.func
+def angle_between(a: wp.vec3, b: wp.vec3) -> float:
+    """Return the angle between two vectors that are not zero, from 0 to pi rad: atan2(|a x b|, a . b)."""
+    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))

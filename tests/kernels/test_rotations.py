@@ -164,3 +164,20 @@ def test_random_rotations_are_uniform_and_independent() -> None:
                 np.arctan2(q[:, third], q[:, fourth]) / np.pi,
             ]
         check_uniform(np.stack(columns, axis=1))
+
+
+@wp.kernel
+def angles(a: wp.array[wp.vec3], b: wp.array[wp.vec3], out: wp.array[float]):
+    i = wp.tid()
+    out[i] = lw.angle_between(a[i], b[i])
+
+
+def test_angle_between_two_vectors_is_exact_near_zero_and_pi() -> None:
+    """An arc cosine in float32 would return 0 for angles below 2e-4."""
+    wanted = np.array([0.0, 1e-5, 1e-3, 0.5, np.pi / 2, 3.0, np.pi - 1e-5, np.pi])
+    a = np.tile([2.0, 0.0, 0.0], (len(wanted), 1))
+    b = 0.3 * np.stack([np.cos(wanted), np.sin(wanted), 0.0 * wanted], axis=1)
+    out = wp.zeros(len(wanted), dtype=float, device="cpu")
+    args = [wp.array(values, dtype=wp.vec3, device="cpu") for values in (a, b)]
+    wp.launch(angles, len(wanted), [*args, out], device="cpu")
+    np.testing.assert_allclose(out.numpy(), wanted, atol=5e-7)

@@ -57,7 +57,7 @@ from lyceum_warp.env.arrays import memory_columns
 from lyceum_warp.env.env import Env
 from lyceum_warp.env.openloop import OpenLoop
 from lyceum_warp.graphs.capture import Calls, Phase
-from lyceum_warp.kernels import knots, planning
+from lyceum_warp.kernels import knots, planning, rollouts
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
@@ -460,7 +460,7 @@ class Planner:
         dim = (self._nsample, self._plan.shape[2])
         wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
         wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
-        wp.launch(planning.add_to, self.plants, [1, self._count], device=device)
+        wp.launch(rollouts.add_to, self.plants, [1, self._count], device=device)
         bounds = [self._smoothing, bool(self.config.include_plan), self._low, self._high, self._samples]
         if self._deviation is not None and self._nominal_deviation is not None:
             self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
