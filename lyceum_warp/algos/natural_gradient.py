@@ -10,20 +10,15 @@ from lyceum_warp.algos.common.policy import GaussianPolicy
 
 
 def score_gradient(
-    policy: GaussianPolicy,
-    obs: torch.Tensor,
-    action: torch.Tensor,
-    weight: torch.Tensor,
-    *,
-    dense: DensePolicy | None = None,
+    policy: GaussianPolicy, obs: torch.Tensor, action: torch.Tensor, weight: torch.Tensor
 ) -> torch.Tensor:
     """Compute the gradient (parameters,) of sum(weight * log pi(action | obs))."""
     parameters = [p for p in policy.parameters() if p.requires_grad]
-    if dense is None:
+    if not isinstance(policy, DensePolicy):
         return flatten(torch.autograd.grad((policy.log_prob(obs, action) * weight).sum(), parameters))
     precision = torch.exp(-policy.log_std.detach())
-    z, weight = (action - dense(obs)) * precision, weight.unsqueeze(-1)
-    gradients = dense.passes.pull(z * precision * weight)
+    z, weight = (action - policy(obs)) * precision, weight.unsqueeze(-1)
+    gradients = policy.passes.pull(z * precision * weight)
     if (at := _place(policy.log_std, parameters)) is not None:
         gradients.insert(at, ((z.square() - 1.0) * weight).sum(0))
     return flatten(gradients)
@@ -49,7 +44,6 @@ class FisherProduct:
         count: int | None = None,
         weight: torch.Tensor | None = None,
         team: Team | None = None,
-        dense: DensePolicy | None = None,
     ) -> None:
         self.parameters = [p for p in policy.parameters() if p.requires_grad]
         self.log_std_at = _place(policy.log_std, self.parameters)
@@ -57,9 +51,10 @@ class FisherProduct:
         if weight is not None:
             self.precision = weight.unsqueeze(-1) * self.precision
         self.damping, self.team = damping, team or Team()
-        self.mean = (dense or policy)(obs)
+        self.mean = policy(obs)
         network = [p for p in self.parameters if p is not policy.log_std]
-        self.jacobian = AutogradJacobian(self.mean, network) if dense is None else dense.passes
+        dense = policy.passes if isinstance(policy, DensePolicy) else None
+        self.jacobian = dense or AutogradJacobian(self.mean, network)
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         """Compute (F + damping I) v, (parameters,)."""

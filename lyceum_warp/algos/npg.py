@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import torch
 
-from lyceum_warp.algos.common.dense import DensePolicy, DenseValue
+from lyceum_warp.algos.common.dense import dense_policy, predict
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import LEAST, check_fields
 from lyceum_warp.algos.common.networks import Activation, Normalizer
@@ -253,7 +253,7 @@ class NPG(OnPolicyLearner):
             batch=config.value_batch or max(64, self.count // 256), team=team,
         )  # fmt: skip
         self._fisher_count = max(1, round(config.fisher_fraction * self.count))
-        self._dense: DensePolicy | None = None
+        self._dense = self.policy
         self._skipping = 0
         self.rollout.restart()
         if self.segments:
@@ -281,7 +281,7 @@ class NPG(OnPolicyLearner):
         # 4. Compute the vanilla gradient of E[log pi(a|s) A(s, a)].
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
-        gradient = team.sum(score_gradient(self.policy, obs, action, weight, dense=self._dense))
+        gradient = team.sum(score_gradient(self._dense, obs, action, weight))
         timer.mark()
 
         # 5. Compute the natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
@@ -346,8 +346,8 @@ class NPG(OnPolicyLearner):
         """Fill the rollout buffer with samples of the current policy."""
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self._dense = DensePolicy.of(self.policy)
-            self.rollout.collect(self._dense or self.policy, self.noise[:, self.own_worlds])
+            self._dense = dense_policy(self.policy)
+            self.rollout.collect(self._dense, self.noise[:, self.own_worlds])
             self.env.update_shared(self.team.sum)
 
     @torch.no_grad()
@@ -382,7 +382,7 @@ class NPG(OnPolicyLearner):
 
     def predict(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
         """Predict returns, (...,), and replace non-finite predictions by the mean return of the last fit."""
-        value = (DenseValue.of(self.value) or self.value)(obs, step)
+        value = predict(self.value, obs, step)
         return torch.where(value.isfinite(), value, self.value.shift.float())
 
     @torch.no_grad()
@@ -392,7 +392,7 @@ class NPG(OnPolicyLearner):
         If an update would change the policy by more than a fifth of the desired KL divergence, only a fraction of the
         update is applied. Later iterations apply the rest. The reported KL divergence includes this change.
         """
-        mean, normalizer = self._dense or self.policy, self.policy.normalizer
+        mean, normalizer = self._dense, self.policy.normalizer
         old_mean = mean(obs).clone()
         if isinstance(normalizer, Normalizer):
             before = normalizer.shift.clone(), normalizer.scale.clone()
@@ -421,9 +421,8 @@ class NPG(OnPolicyLearner):
                 places, own = self.team.locate(subset, self.env.nworld)
                 obs, weight = obs[places], own.float()
         return FisherProduct(
-            self.policy, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team,
-            dense=self._dense,
-        )  # fmt: skip
+            self._dense, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team
+        )
 
     @torch.no_grad()
     def move(
@@ -446,7 +445,7 @@ class NPG(OnPolicyLearner):
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
-        mean = self._dense or self.policy
+        mean = self._dense
 
         def measured(fraction: torch.Tensor) -> torch.Tensor:
             for parameter, before, part in zip(parameters, old, steps, strict=True):

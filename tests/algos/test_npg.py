@@ -10,7 +10,7 @@ import torch
 from full_task import Full
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.dense import DensePolicy, DenseValue
+from lyceum_warp.algos.common.dense import DensePasses
 from lyceum_warp.algos.npg import NPGIteration
 
 SMALL = lw.NPGConfig(samples=320, hidden=(8, 8), value_hidden=(16,), mean_every=2, mean_episodes=2)
@@ -305,8 +305,7 @@ def test_optimized_iterations_equal_iterations_with_autograd(monkeypatch: pytest
             # with a KL limit of 1, the line search shortens many steps
             npg = lw.NPG(env, config=lw.NPGConfig(samples=800, mean_every=0, kl_limit=1.0), seed=0)
             if plain:
-                monkeypatch.setattr(DensePolicy, "of", lambda *args: None)
-                monkeypatch.setattr(DenseValue, "of", lambda *args: None)
+                monkeypatch.setattr(DensePasses, "of", lambda network: None)
                 npg._reads_numbers = False
             it = next(npg)
             learned.append((torch.tensor([it.kl, it.step_fraction]), parameters(npg)))

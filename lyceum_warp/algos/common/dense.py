@@ -57,22 +57,20 @@ class DensePasses:
     @staticmethod
     def of(network: nn.Module) -> "DensePasses | None":
         """Wrap a CPU network made by ``mlp``; return None for any other network."""
-        if type(network) is not nn.Sequential or len(network) % 2 == 0:
-            return None
-        layers: list[Any] = list(network)[::2]
-        activations = list(network)[1::2]
+        layers: list[Any] = list(network) if type(network) is nn.Sequential else []
+        linear, activations = layers[::2], layers[1::2]
         kind = type(activations[0]) if activations else nn.Tanh
-        linear = all(type(layer) is nn.Linear and layer.bias is not None for layer in layers)
-        parameters = [p for layer in layers for p in (layer.weight, layer.bias)] if linear else []
-        if [id(p) for p in network.parameters()] != [id(p) for p in parameters] or kind not in _ACTIVATIONS:
-            return None
-        if (
-            any(p.device.type != "cpu" or p.dtype != torch.float32 for p in parameters)
-            or any(type(module) is not kind or getattr(module, "alpha", 1.0) != 1.0 for module in activations)
-            or any(map(_hooked, network.modules()))
-        ):
-            return None
-        return DensePasses(parameters, kind)
+        parameters = list(network.parameters())
+        supported = (
+            len(layers) % 2 == 1
+            and len(parameters) == 2 * len(linear)  # no layers share parameters
+            and all(type(layer) is nn.Linear and layer.bias is not None for layer in linear)
+            and kind in _ACTIVATIONS
+            and all(type(layer) is kind and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
+            and all(p.device.type == "cpu" and p.dtype == torch.float32 for p in parameters)
+            and not any(map(_hooked, network.modules()))
+        )
+        return DensePasses(parameters, kind) if supported else None
 
     def _allocate(self, rows: int) -> None:
         widths = [len(bias) for bias in self.biases]
@@ -131,69 +129,55 @@ class DensePasses:
         return out
 
 
-class DensePolicy:
-    """Evaluates a ``GaussianPolicy`` without autograd."""
+class DensePolicy(GaussianPolicy):
+    """A policy that is evaluated without autograd, and shares the parameters and the normaliser of another policy.
+
+    The next call overwrites the returned actions.
+    """
 
     def __init__(self, policy: GaussianPolicy, passes: DensePasses) -> None:
-        self.policy, self.passes = policy, passes
-        self._x = torch.empty(0, policy.nobs)
+        vars(self).update(vars(policy))
+        self.passes = passes
+        self._normalized = torch.empty(0, policy.nobs)
 
-    @staticmethod
-    def of(policy: GaussianPolicy) -> "DensePolicy | None":
-        """Wrap a policy, or return None if its class or network is not supported."""
-        plain = (
-            type(policy) is GaussianPolicy
-            and policy.mirror is None
-            and type(policy.normalizer) in (Normalizer, nn.Identity)
-        )
-        if not plain or _hooked(policy) or _hooked(policy.normalizer):
-            return None
-        if not all(parameter.requires_grad for parameter in policy.network.parameters()):
-            return None
-        passes = DensePasses.of(policy.network)
-        return None if passes is None else DensePolicy(policy, passes)
-
-    def __call__(self, obs: torch.Tensor) -> torch.Tensor:
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute mean actions, (rows, nact)."""
-        normalizer = self.policy.normalizer
+        normalizer = self.normalizer
         if not isinstance(normalizer, Normalizer):
             return self.passes(obs)
-        if len(obs) > len(self._x):
-            self._x = torch.empty_like(obs)
-        x = self._x[: len(obs)]
-        array = x.numpy()
+        if len(obs) > len(self._normalized):
+            self._normalized = torch.empty_like(obs)
+        rows = self._normalized[: len(obs)]
+        array = rows.numpy()
         np.subtract(obs.numpy(), normalizer.shift.numpy(), out=array)
         np.multiply(array, normalizer.scale.numpy(), out=array)
         np.clip(array, -normalizer.limit, normalizer.limit, out=array)
-        return self.passes(x)
+        return self.passes(rows)
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Sample actions; see ``GaussianPolicy.sample``."""
         action = out.numpy()
-        np.multiply(noise.numpy(), np.exp(self.policy.log_std.detach().numpy()), out=action)
+        np.multiply(noise.numpy(), np.exp(self.log_std.detach().numpy()), out=action)
         np.add(action, self(obs).numpy(), out=action)
         return out
 
 
-class DenseValue:
-    """Evaluates a ``ValueFunction`` without autograd."""
+def dense_policy(policy: GaussianPolicy) -> GaussianPolicy:
+    """Return a ``DensePolicy``, or the policy itself if its class or its network is not supported."""
+    learned = all(parameter.requires_grad for parameter in policy.network.parameters())
+    plain = type(policy) is GaussianPolicy and policy.mirror is None and learned
+    passes = DensePasses.of(policy.network) if plain else None
+    return policy if passes is None else DensePolicy(policy, passes)
 
-    def __init__(self, value: ValueFunction, passes: DensePasses) -> None:
-        self.value, self.passes = value, passes
 
-    @staticmethod
-    def of(value: ValueFunction) -> "DenseValue | None":
-        """Wrap a value function, or return None if its class or network is not supported."""
-        if type(value) is not ValueFunction or _hooked(value):
-            return None
-        passes = DensePasses.of(value.network)
-        return None if passes is None else DenseValue(value, passes)
-
-    def __call__(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict returns, (...,)."""
-        features = self.value.features(obs, step)
-        output = self.passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
-        return output * self.value.scale.float() + self.value.shift.float()
+def predict(value: ValueFunction, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+    """Predict returns, (...,), without gradients, and without autograd if the value function's network allows it."""
+    passes = DensePasses.of(value.network) if type(value) is ValueFunction else None
+    if passes is None:
+        return value(obs, step)
+    features = value.features(obs, step)
+    output = passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
+    return output * value.scale.float() + value.shift.float()
 
 
 def _hooked(module: nn.Module) -> bool:

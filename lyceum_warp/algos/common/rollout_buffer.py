@@ -7,7 +7,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.common.dense import DensePolicy
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.engines.memory import check_fit
@@ -125,7 +124,7 @@ class Rollout:
         return torch_view(rows)
 
     @torch.no_grad()
-    def collect(self, policy: GaussianPolicy | DensePolicy, noise: torch.Tensor) -> None:
+    def collect(self, policy: GaussianPolicy, noise: torch.Tensor) -> None:
         """Fill the buffer by running the policy for ``steps`` steps from the current states.
 
         Args:

@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.dense import DensePasses, DenseValue
+from lyceum_warp.algos.common.dense import DensePasses
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.timing import one_thread
 from lyceum_warp.algos.common.value import BOUND, ValueFunction
@@ -51,8 +51,8 @@ class ValueFit:
             target = target.float().unsqueeze(-1)
         with one_thread():
             self._keep_if_finite()
-            dense = DenseValue.of(self.value)
-            steps = None if dense is None else DenseSteps(self, dense.passes)
+            passes = DensePasses.of(self.value.network)
+            steps = None if passes is None else DenseSteps(self, passes)
             for _ in range(self.epochs):
                 order = torch.randperm(self.samples, generator=generator, device=features.device)
                 if self.cuda and self.team.captures:

@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.dense import DensePasses, DensePolicy, DenseValue
+from lyceum_warp.algos.common.dense import DensePasses, dense_policy, predict
 from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
@@ -27,25 +27,25 @@ def policy_of(activation: str, hidden: tuple[int, ...] = (8, 6), **options: obje
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6), (3, 16, 4)])
 def test_hand_written_derivatives_equal_those_of_autograd(activation: str, hidden: tuple[int, ...]) -> None:
     policy = policy_of(activation, hidden)
-    dense = DensePolicy.of(policy)
-    assert dense is not None
+    dense = dense_policy(policy)
+    assert dense is not policy
     for rows, learned in ((30, True), (7, True), (30, False)):
         policy.log_std.requires_grad_(learned)
         generator = torch.Generator().manual_seed(rows)
         obs, action, weight = (torch.randn(rows, n, generator=generator) for n in (5, 2, 1))
         torch.testing.assert_close(dense(obs), policy(obs).detach())
         weight = weight.squeeze(1)
-        gradients = [score_gradient(policy, obs, action, weight, dense=d) for d in (None, dense)]
+        gradients = [score_gradient(one, obs, action, weight) for one in (policy, dense)]
         torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-5)
         vector = torch.randn(len(gradients[0]), generator=generator)
-        plain, written = (FisherProduct(policy, obs, 0.1, weight=weight.abs(), dense=d) for d in (None, dense))
+        plain, written = (FisherProduct(one, obs, 0.1, weight=weight.abs()) for one in (policy, dense))
         for direction in (vector, vector.flip(0)):
             torch.testing.assert_close(plain(direction), written(direction), rtol=1e-4, atol=1e-5)
 
 
 def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
     policy, generator = policy_of("tanh"), torch.Generator().manual_seed(0)
-    dense = DensePolicy.of(policy)
+    dense = dense_policy(policy)
     obs, noise = torch.randn(6, 5, generator=generator), torch.randn(6, 2, generator=generator)
     torch.testing.assert_close(
         dense.sample(obs, noise, out=torch.empty(6, 2)), policy.sample(obs, noise, out=torch.empty(6, 2))
@@ -54,7 +54,7 @@ def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
     value.observe(obs)
     steps, obs = torch.arange(12.0).view(4, 3), torch.randn(4, 3, 5, generator=generator)
     # returns of about 200 have large rounding errors in float32
-    torch.testing.assert_close(DenseValue.of(value)(obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
+    torch.testing.assert_close(predict(value, obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
 
 
 class Own(nn.Sequential):
@@ -91,7 +91,8 @@ def test_policy_subclass_and_frozen_layers_use_autograd() -> None:
     class Policy(lw.GaussianPolicy):
         pass
 
-    assert DensePolicy.of(Policy(5, 2)) is None
+    own = Policy(5, 2)
+    assert dense_policy(own) is own
     policy = policy_of("tanh")
     policy.network[0].requires_grad_(False)
-    assert DensePolicy.of(policy) is None
+    assert dense_policy(policy) is policy

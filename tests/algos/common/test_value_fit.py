@@ -5,7 +5,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.algos import Team
-from lyceum_warp.algos.common.dense import DenseValue
+from lyceum_warp.algos.common.dense import DensePasses
 from lyceum_warp.algos.common.value_fit import ValueFit
 
 
@@ -38,7 +38,7 @@ def test_value_fit_with_hand_written_gradients_equals_a_fit_with_autograd(activa
 
 def test_user_value_network_is_fitted_by_autograd() -> None:
     value = lw.ValueFunction(5, (8,), activation="gelu", scale=1.0)
-    assert DenseValue.of(value) is None
+    assert DensePasses.of(value.network) is None
     fit = ValueFit(value, 50, 5, rate=1e-2, epochs=20, batch=16, team=Team())
     obs, target = torch.randn(50, 5), torch.ones(50)
     assert fit(obs, torch.zeros(50), target, torch.Generator().manual_seed(0))
