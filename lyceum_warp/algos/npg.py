@@ -16,7 +16,7 @@ import torch
 
 from lyceum_warp.algos.common.dense import dense_policy, predict
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.hyperparameters import LEAST, check_fields
+from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.networks import Activation, Normalizer
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence
@@ -41,7 +41,7 @@ _DRIFT = 0.2
 """Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
 
 
-_BOUNDS: dict[str, float | tuple[float, float]] = {
+_BOUNDS: dict[str, Bound] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
     "mean_episodes": 1, "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": 0.0, "damping": 0.0,
     "fisher_fraction": (0.0, 1.0), "kl_limit": 1.0, "log_std": LEAST, "min_log_std": LEAST, "value_rate": 0.0,
@@ -224,7 +224,8 @@ class NPG(OnPolicyLearner):
         team: Team | None = None,
     ) -> None:
         super().__init__(env, policy, value, config, seed=seed, team=team)
-        config, team, nworld, device = self.config, self.team, env.nworld * self.team.size, env.obs.device
+        config, team, device = self.config, self.team, env.obs.device
+        nworld = env.nworld * team.size
         self._value_is_new = value is None
         scale = 1.0 / max(1.0 - config.gamma, 1e-3)
         self._make_networks(policy, value, scale=scale, time_orders=config.time_orders)
@@ -235,14 +236,13 @@ class NPG(OnPolicyLearner):
         # samples
         samples = enough_samples(config, nworld)
         steps = -(-samples // nworld)
-        whole = 0 < env.horizon <= steps
-        self.segments = config.rollout == "segments" or (config.rollout == "auto" and not whole)
+        reaches_horizon = 0 < env.horizon <= steps
+        self.segments = config.rollout == "segments" or (config.rollout == "auto" and not reaches_horizon)
         self._make_rollout(steps, first_only=not self.segments)
-        if not self.segments and not whole and team.leads:
+        if not self.segments and not reaches_horizon and team.leads:
             log.warning(
                 "%d samples in %d worlds are only %d steps per world, so no episode reaches its horizon of %d: use "
-                "fewer worlds, "
-                "more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
+                "fewer worlds, more samples, or rollout='segments'", samples, nworld, self.rollout.steps, env.horizon,
             )  # fmt: skip
         self._least_restarts = least_restarts(config, nworld, steps, env.horizon) if self.segments else 0
         self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
@@ -303,8 +303,8 @@ class NPG(OnPolicyLearner):
             "kl": kl, "step_norm": step.norm(), "step_fraction": fraction, "gradient_norm": gradient.norm(),
             "std_mean": self.policy.log_std.detach().exp().mean(),
         }  # fmt: skip
-        rest = {"finite": finite, "fitted": fitted, "outliers": outliers, **prediction}
-        statistics, processes = gathered(rollout, team, update | rest)
+        numbers = {"finite": finite, "fitted": fitted, "outliers": outliers, **prediction}
+        statistics, processes = gathered(rollout, team, update | numbers)
         statistics |= {name: processes[0][name] for name in update} | value_statistics(processes, len(obs))
         statistics["outliers"] = round(sum(process["outliers"] for process in processes))
         statistics["skipped_updates"] = self._check_updates(processes[0])
@@ -418,8 +418,8 @@ class NPG(OnPolicyLearner):
             if self.team.size == 1:
                 obs = obs[subset]
             else:  # selection by a mask would synchronise
-                places, own = self.team.locate(subset, self.env.nworld)
-                obs, weight = obs[places], own.float()
+                places, local = self.team.locate(subset, self.env.nworld)
+                obs, weight = obs[places], local.float()
         return FisherProduct(
             self._dense, obs, self.config.damping, count=self._fisher_count, weight=weight, team=self.team
         )
@@ -438,36 +438,36 @@ class NPG(OnPolicyLearner):
             Whether the step and the divergence are finite; the fraction of the step that was applied; and the KL
             divergence from the old to the new policy, averaged over the samples of all processes.
         """
-        wanted = 0.5 * self.config.delta
-        limit = self.config.kl_limit * wanted + 1e-6  # margin for rounding
+        desired = 0.5 * self.config.delta
+        limit = self.config.kl_limit * desired + 1e-6  # margin for rounding
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         old = [p.clone() for p in parameters]
         steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
-        mean = self._dense
 
-        def measured(fraction: torch.Tensor) -> torch.Tensor:
+        def apply(fraction: torch.Tensor) -> torch.Tensor:
+            """Apply a fraction of the step, and return the KL divergence."""
             for parameter, before, part in zip(parameters, old, steps, strict=True):
                 moved = before + fraction * part
                 if parameter is self.policy.log_std:
                     moved = torch.maximum(moved, lowest)
                 parameter.copy_(torch.where(fraction > 0.0, moved, before))
-            kl = divergence(old_mean, old_log_std, mean(obs), self.policy.log_std).mean()
+            kl = divergence(old_mean, old_log_std, self._dense(obs), self.policy.log_std).mean()
             return self.team.sum(kl) / self.team.size
 
         finite = torch.isfinite(step).all()
         fraction = finite.float()
         for _ in range(_SHORTER):
-            kl = measured(fraction)
+            kl = apply(fraction)
             if self._reads_numbers and kl <= limit:
                 break
-            factor = (wanted / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
+            factor = (desired / kl).sqrt().nan_to_num(0.1).clamp(0.01, 0.5)
             fraction = torch.where(kl <= limit, fraction, fraction * factor)
         else:
-            kl = measured(fraction)
+            kl = apply(fraction)
             fraction = torch.where(kl <= limit, fraction, 0.0)
-            kl = measured(fraction)
+            kl = apply(fraction)
         self.team.copy_leader(self.policy.parameters())
         return finite & kl.isfinite(), fraction, kl
 

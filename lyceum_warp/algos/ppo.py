@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.hyperparameters import check_fields
+from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, Activation
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
@@ -42,8 +42,7 @@ _SMALLEST_STD = 1e-6
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 """Limits of the adaptive learning rate, and the factor by which the rate changes."""
 
-
-_BOUNDS: dict[str, float | tuple[float, float]] = {
+_BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
@@ -218,16 +217,17 @@ class PPO(OnPolicyLearner):
         team: Team | None = None,
     ) -> None:
         super().__init__(env, policy, value, config, seed=seed, team=team)
-        config, team, device, steps = self.config, self.team, env.obs.device, self.config.num_steps
-        if config.minibatches > (count := steps * env.nworld * team.size):
+        config, team, device = self.config, self.team, env.obs.device
+        steps, nworld = config.num_steps, env.nworld * team.size
+        if config.minibatches > (count := steps * nworld):
             raise ValueError(
                 f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
                 "worlds or fewer mini-batches"
             )
-        if (rest := count % config.minibatches) and team.leads:
+        if (excess := count % config.minibatches) and team.leads:
             log.warning(
                 "%d mini-batches of equal size hold only %d of %d samples: make the number of mini-batches divide %d",
-                config.minibatches, count - rest, count, count,
+                config.minibatches, count - excess, count, count,
             )  # fmt: skip
         # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
         limit = math.inf if config.normalize else LIMIT
@@ -236,15 +236,15 @@ class PPO(OnPolicyLearner):
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
         self._make_rollout(steps)
-        self.noise = torch.empty(steps, env.nworld * team.size, env.action_space.size, device=device)
+        self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
         self._mean = torch.empty_like(self.rollout.action)
 
         # the update
         log_std = self.policy.log_std
         self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
         self.std.requires_grad_(log_std.requires_grad)
-        own = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
-        self._learned = [[p for p in group if p.requires_grad] for group in (own, self.value.parameters())]
+        acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
+        self._learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
         self._parameters = [p for group in self._learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
@@ -254,7 +254,8 @@ class PPO(OnPolicyLearner):
         self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
         for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
             parameter.grad = part.view_as(parameter)
-        self._losses, self._entropy_coef = torch.zeros(3, device=device), torch.zeros((), device=device)
+        self._losses = torch.zeros(3, device=device)
+        self._entropy_coef = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
         self.minibatches = Minibatches(
             self.learn, steps=steps, nworld=env.nworld, count=config.minibatches, team=team, device=device
@@ -380,7 +381,7 @@ class PPO(OnPolicyLearner):
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
         """Make one step of Adam on a mini-batch."""
         config, clip = self.config, self.config.clip
-        old_mean, own_weight = samples["mean"], weight
+        old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
         mean, log_std = self.policy(samples["obs"]), self._log_std()
@@ -390,8 +391,8 @@ class PPO(OnPolicyLearner):
         value = self.value(samples["value_obs"], samples["step"])
         error = (value - samples["target"]).square()
         if config.clip_value_loss:
-            near = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
-            error = torch.max(error, (near - samples["target"]).square())
+            clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
+            error = torch.max(error, (clipped - samples["target"]).square())
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
         losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
@@ -404,7 +405,7 @@ class PPO(OnPolicyLearner):
 
         with torch.no_grad():
             # an image's old mean is not the policy's: KL divergences of images would measure the policy's asymmetry
-            kl = (own_weight * divergence(old_mean, self._old_log_std, mean[: len(old_mean)], log_std)).sum()
+            kl = (kl_weight * divergence(old_mean, self._old_log_std, mean[: len(old_mean)], log_std)).sum()
             torch.cat([*(part.flatten() for part in gradients), kl[None], losses], out=self._sums)
             self.team.sum(self._sums)
             if config.schedule == "adaptive":
@@ -417,17 +418,15 @@ class PPO(OnPolicyLearner):
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples; an image has the same density as its original."""
         assert self._mirror is not None and self._mirror_value is not None
-        images = dict(samples)
-        for name, image in (("obs", self._mirror.obs), ("value_obs", self._mirror_value),
-                            ("action", self._mirror.action)):  # fmt: skip
-            images[name] = image(samples[name])
-        return {name: torch.cat([part, images[name]]) for name, part in samples.items()}
+        mirrors = {"obs": self._mirror.obs, "value_obs": self._mirror_value, "action": self._mirror.action}
+        images = {name: mirror(samples[name]) for name, mirror in mirrors.items()}
+        return {name: torch.cat([part, images.get(name, part)]) for name, part in samples.items()}
 
     def _adapt(self, kl: torch.Tensor) -> None:
-        wanted = self.config.desired_kl
+        desired = self.config.desired_kl
         lower, higher = (self.rate / _FACTOR).clamp_min(_SLOWEST), (self.rate * _FACTOR).clamp_max(_FASTEST)
-        raised = torch.where((kl < wanted / 2.0) & (kl > 0.0), higher, self.rate)
-        self.rate.copy_(torch.where(kl > wanted * 2.0, lower, raised))
+        rate = torch.where((kl < desired / 2.0) & (kl > 0.0), higher, self.rate)
+        self.rate.copy_(torch.where(kl > desired * 2.0, lower, rate))
 
     def _log_std(self) -> torch.Tensor:
         if self.config.std_type == "log":
@@ -450,19 +449,14 @@ class PPO(OnPolicyLearner):
 
     def _returns(self) -> list[float]:
         """Get the returns of the ended episodes of all processes, ordered by step."""
-        ended = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
-        ended = self.team.gather(ended.T).T
-        found: list[float] = ended[~ended.isnan()].tolist()
-        return found
+        returns = self.rollout.episode_return.masked_fill(~self.rollout.done, torch.nan)
+        returns = self.team.gather(returns.T).T
+        return list(returns[~returns.isnan()].tolist())
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
-        own = {
-            "optimizer": self.optimizer.state_dict(),
-            "std": self.std.detach(),
-            "recent": list(self._recent),
-        }
-        return super().state_dict() | copy.deepcopy(own)
+        state = {"optimizer": self.optimizer.state_dict(), "std": self.std.detach(), "recent": list(self._recent)}
+        return super().state_dict() | copy.deepcopy(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``; see ``Learner``."""

@@ -20,7 +20,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import LEAST, check_fields
+from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision, room
 from lyceum_warp.algos.common.networks import Activation, trainable
@@ -41,7 +41,7 @@ _EPS = 1e-2
 """Constant that is added to the normalisers' standard deviations."""
 
 
-_BOUNDS: dict[str, float | tuple[float, float]] = {
+_BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "quantiles": 1,
     "dropped_quantiles": 0, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0),
     "learning_rate": 0.0, "temperature": 1e-6, "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
@@ -259,68 +259,78 @@ class SAC(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("env of SAC", env, Env, "as lw.make(...) makes it")
         check_kind("config of SAC", config, SACConfig | None, "as lw.SACConfig(hidden=(64, 64))")
         check_kind("policy of SAC", policy, SquashedPolicy | None, "as lw.load(run) returns it for a run of SAC")
         check_kind("value of SAC", value, TwinCritic | None, "as lw.load_value(run) returns it for a run of SAC")
         super().__init__(env, seed=seed, team=team)
-        team, device, nworld = self.team, env.obs.device, env.nworld * self.team.size
-        given: Any = (config or SACConfig()).resolved(nworld)
-        nact, self._warms_up = env.action_space.size, policy is None
-
-        # networks
+        self._all_worlds, self._warms_up = env.nworld * self.team.size, policy is None
+        self.config = (config or SACConfig()).resolved(self._all_worlds)
         init = torch.Generator().manual_seed(self.seed)
-        options: dict[str, Any] = dict(normalize=given.normalize, generator=init)
-        low, high = action_bounds(env, given.action_limit)
-        group = value_group(env, given.value_group) if value is None else value.group
+        self._make_networks(policy, value, init)
+        self._make_replay()
+        self.generator = torch.Generator(env.obs.device).manual_seed(int(torch.randint(2**62, (), generator=init)))
+        self._make_buffers()
+        self._evaluate_mean = MeanPolicyEvaluation(env, self.config, self.team)
+        self.rollout.restart()
+        self.rollout.stagger(self.generator, self.team)
+
+    def _make_networks(
+        self, policy: SquashedPolicy | None, value: TwinCritic | None, generator: torch.Generator
+    ) -> None:
+        """Make the networks that are not given, the target critics and the optimisers."""
+        env, config, device = self.env, self.config, self.env.obs.device
+        nact = env.action_space.size
+        options: dict[str, Any] = dict(normalize=config.normalize, generator=generator)
+        low, high = action_bounds(env, config.action_limit)
+        group = value_group(env, config.value_group) if value is None else value.group
         self.policy = policy or SquashedPolicy(
-            env.obs_space.size, nact, given.hidden, low=low, high=high, activation=given.activation, **options
+            env.obs_space.size, nact, config.hidden, low=low, high=high, activation=config.activation, **options
         )
         self.value = value or TwinCritic(
-            env.obs_spaces[group].size, nact, given.value_hidden, activation=given.value_activation,
-            layer_norm=given.layer_norm, quantiles=given.quantiles, group=group, **options,
+            env.obs_spaces[group].size, nact, config.value_hidden, activation=config.value_activation,
+            layer_norm=config.layer_norm, quantiles=config.quantiles, group=group, **options,
         )  # fmt: skip
         _check_sizes(self.policy, self.value, env, low, high)
-        trainable(self.policy.to(device)), trainable(self.value.to(device))
-        self._mirror, self._mirror_value = apply_symmetry(given.symmetry, env, self.policy, self.value.group)
+        trainable(self.policy.to(device))
+        trainable(self.value.to(device))
+        self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
         self.target = copy.deepcopy(self.value).requires_grad_(False)
         self.target.normalizer = self.value.normalizer
-        self._follow = get_ema_multi_avg_fn(1.0 - given.tau)
-        self.log_temperature = torch.tensor(math.log(given.temperature), device=device, requires_grad=True)
-        rate = given.learning_rate
-        self.actor_step = GradientStep(self.policy.parameters(), rate, team)
-        self.critic_step = GradientStep(self.value.parameters(), rate, team)
-        self.temperature_step = GradientStep([self.log_temperature], rate, team)
-
-        # samples
-        (least,) = team.largest(-default_capacity(env, team.size))
-        capacity = -least * team.size if given.replay is None else given.replay
-        self.replay = Replay(env, -(-capacity // team.size))
-        own, critics = self.policy.shape, self.value.shape
+        self._follow = get_ema_multi_avg_fn(1.0 - config.tau)
+        self.log_temperature = torch.tensor(math.log(config.temperature), device=device, requires_grad=True)
+        self.actor_step = GradientStep(self.policy.parameters(), config.learning_rate, self.team)
+        self.critic_step = GradientStep(self.value.parameters(), config.learning_rate, self.team)
+        self.temperature_step = GradientStep([self.log_temperature], config.learning_rate, self.team)
+        actor, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
-            given, replay=capacity, hidden=tuple(own["hidden"]), activation=own["activation"],
-            normalize=own["normalize"], value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
+            config, hidden=tuple(actor["hidden"]), activation=actor["activation"], normalize=actor["normalize"],
+            value_hidden=tuple(critics["hidden"]), value_activation=critics["activation"],
             layer_norm=critics["layer_norm"], quantiles=critics["quantiles"],
-            symmetry="exact" if self.policy.mirror is not None else given.symmetry,
+            symmetry="exact" if self.policy.mirror is not None else config.symmetry,
         )  # fmt: skip
-        self.rollout = Rollout(env, given.num_steps)
-        self.count = given.num_steps * nworld
-        self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
-        self._all_worlds, self._act_noise = nworld, torch.empty(nworld, nact, device=device)
 
-        # updates
-        share = room(given.batch, team)
-        self._index = torch.zeros(given.updates, share, dtype=torch.long, device=device)
-        self._weight = torch.full((given.updates, share), 1.0 / given.batch, device=device)
-        self._noise = torch.zeros(given.updates, share, 2 * nact, device=device)
+    def _make_replay(self) -> None:
+        env, config, team = self.env, self.config, self.team
+        (least,) = team.largest(-default_capacity(env, team.size))
+        capacity = -least * team.size if config.replay is None else config.replay
+        self.config = dataclasses.replace(config, replay=capacity)
+        self.replay = Replay(env, -(-capacity // team.size))
+        self.rollout = Rollout(env, config.num_steps)
+        self.count = config.num_steps * self._all_worlds
+
+    def _make_buffers(self) -> None:
+        """Allocate the inputs of the updates, and prepare the losses."""
+        config, team, device, nact = self.config, self.team, self.env.obs.device, self.policy.nact
+        share = room(config.batch, team)
+        self._act_noise = torch.empty(self._all_worlds, nact, device=device)
+        self._index = torch.zeros(config.updates, share, dtype=torch.long, device=device)
+        self._weight = torch.full((config.updates, share), 1.0 / config.batch, device=device)
+        self._noise = torch.zeros(config.updates, share, 2 * nact, device=device)
         self._sums = torch.zeros(4, device=device)
         self._losses = [self.critic_loss, self.actor_loss]
-        if given.compiled:
+        if config.compiled:
             self._losses = [torch.compile(loss) for loss in self._losses]
         self._learn = Captured(self.learn, team, device)
-        self._evaluate_mean = MeanPolicyEvaluation(env, given, team)
-        self.rollout.restart()
-        self.rollout.stagger(self.generator, team)
 
     @property
     def title(self) -> str:
@@ -408,10 +418,10 @@ class SAC(Learner):
         noise = torch.randn((*shape, self._noise.shape[-1]), **random)
         # as in Minibatches, put this process's samples first, and drop those that do not fit
         if team.size > 1:
-            index, own = team.locate(index, nworld)
-            first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
+            index, local = team.locate(index, nworld)
+            first = local.byte().argsort(dim=1, descending=True, stable=True)[:, : self._index.shape[1]]
             index, noise = index.gather(1, first), noise.gather(1, first[..., None].expand(-1, -1, noise.shape[-1]))
-            torch.mul(own.gather(1, first), 1.0 / batch, out=self._weight)
+            torch.mul(local.gather(1, first), 1.0 / batch, out=self._weight)
         self._index.copy_(index)
         self._noise.copy_(noise)
 
@@ -445,14 +455,13 @@ class SAC(Learner):
         def both(rows: torch.Tensor, image: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
             return torch.cat([rows, image(rows)])
 
-        obs, next_obs = (
-            {name: both(groups[name], image) for name, image in images.items()}
-            for groups in (batch.obs, batch.next_obs)
-        )
         return Transitions(
-            obs=obs, action=both(batch.action, self._mirror.action), reward=batch.reward.repeat(2),
-            discount=batch.discount.repeat(2), next_obs=next_obs,
-        )  # fmt: skip
+            obs={name: both(batch.obs[name], image) for name, image in images.items()},
+            action=both(batch.action, self._mirror.action),
+            reward=batch.reward.repeat(2),
+            discount=batch.discount.repeat(2),
+            next_obs={name: both(batch.next_obs[name], image) for name, image in images.items()},
+        )
 
     def critic_loss(
         self, batch: Transitions, weight: torch.Tensor, noise: torch.Tensor
@@ -483,9 +492,9 @@ class SAC(Learner):
         loss = self.log_temperature.detach().exp() * log_prob - value
         if self.config.symmetry == "loss":
             assert self._mirror is not None
-            mean, image = (
-                torch.tanh(self.policy(obs)[0]) for obs in (batch.obs["policy"], self._mirror.obs(batch.obs["policy"]))
-            )
+            obs = batch.obs["policy"]
+            mean = torch.tanh(self.policy(obs)[0])
+            image = torch.tanh(self.policy(self._mirror.obs(obs))[0])
             loss = loss + self.config.symmetry_coef * (mean - self._mirror.action(image)).square().mean(-1)
         return (weight * loss).sum(), -(weight * log_prob.detach()).sum()
 
@@ -495,14 +504,14 @@ class SAC(Learner):
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state except ``replay``; see ``Learner``."""
-        own = {
+        state = {
             "target": self.target.state_dict(),
             "temperature": self.log_temperature.detach(),
             "returns": self.team.gather(self.rollout.running_return),
             "optimizers": [step.optimizer.state_dict() for step in self._steps],
             "warms_up": self._warms_up,
         }
-        return super().state_dict() | copy.deepcopy(own)
+        return super().state_dict() | copy.deepcopy(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``; see ``Learner``."""
@@ -513,7 +522,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
-        self._warms_up = state.get("warms_up", self._warms_up)  # missing in old checkpoints
+        self._warms_up = state.get("warms_up", self._warms_up)  # missing in runs of release 0.2.0
         self._learn.forget()  # the graph contains the addresses of Adam's old moments
 
     @property
@@ -555,11 +564,11 @@ def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
 def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[float], high: list[float]) -> None:
     name, nact = env.task.name, env.action_space.size
     for module, space in ((policy, env.obs_space), (value, env.obs_spaces[value_group(env, value.group)])):
-        sizes, wanted = (module.shape["nobs"], module.shape["nact"]), (space.size, nact)
-        if sizes != wanted:
+        sizes = module.shape["nobs"], module.shape["nact"]
+        if sizes != (space.size, nact):
             raise ValueError(
                 f"the {type(module).__name__} takes {sizes[0]} observations and {sizes[1]} actions, but the task "
-                f"{name!r} has {wanted[0]} observations and {wanted[1]} actions"
+                f"{name!r} has {space.size} observations and {nact} actions"
             )
     if (policy.shape["low"], policy.shape["high"]) != (low, high):
         raise ValueError(

@@ -176,19 +176,19 @@ def test_point_mass_learns_to_reach_the_target() -> None:
 
 
 def test_invalid_npg_arguments_raise_an_error(env: lw.Env) -> None:
-    with pytest.raises(ValueError, match=r"env of NPG .* of type Env, as lw.make\(...\) .*, not str 'hopper'"):
+    with pytest.raises(ValueError, match=r"env of NPG .* lw.make\(...\) .* 'hopper'"):
         lw.NPG("hopper")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"config of NPG .* of type NPGConfig .* not dict"):
+    with pytest.raises(ValueError, match="config of NPG .* NPGConfig .* dict"):
         lw.NPG(env, config={"samples": 3})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="value function takes 7 observations, but the group 'policy' .* has 6"):
+    with pytest.raises(ValueError, match="7 observations.* 'policy' .* 6"):
         lw.NPG(env, value=lw.ValueFunction(7))
-    with pytest.raises(ValueError, match=r"value of NPG .* not Linear"):
+    with pytest.raises(ValueError, match="value .* ValueFunction, .* Linear"):
         lw.NPG(env, value=torch.nn.Linear(6, 1))  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="the task 'point_mass' has no group 'critic' of observations: it has policy"):
+    with pytest.raises(ValueError, match="'point_mass' .* 'critic'"):
         lw.NPG(env, value=lw.ValueFunction(6, group="critic"))
     broken = lw.ValueFunction(6)
     broken.scale.fill_(math.nan)
-    with pytest.raises(ValueError, match="the value function's 'scale' is not finite: omit the value function"):
+    with pytest.raises(ValueError, match="'scale' is not finite"):
         lw.NPG(env, value=broken)
 
 

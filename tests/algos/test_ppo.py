@@ -129,25 +129,18 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
     assert ppo.settings()["activation"] == "tanh" and ppo.settings()["num_steps"] == 12
 
 
-@pytest.mark.parametrize("words, message", [
-    ({"final_entropy_coef": -1.0}, "final_entropy_coef must be a finite number of at least 0, not -1.0"),
-    ({"entropy_decay": 7}, r"entropy_decay must be a first and a last iteration, such as \(150, 200\), not 7"),
-    ({"entropy_decay": (5, 5)}, r"entropy_decay must have a last iteration after the first iteration, not \(5, 5\)"),
-    ({"value_group": 3}, "value_group must be the name of a group of observations, not 3"),
-])  # fmt: skip
-def test_invalid_hyperparameters_raise_an_error(words: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        lw.PPOConfig(**words)
+@pytest.mark.parametrize("entropy_decay", [7, (5, 5)])
+def test_invalid_entropy_decay_raises_an_error(entropy_decay: Any) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"not {entropy_decay}")):
+        lw.PPOConfig(entropy_decay=entropy_decay)
 
 
 def test_invalid_ppo_arguments_raise_an_error(env: lw.Env) -> None:
-    with pytest.raises(
-        ValueError, match="200 mini-batches need at least 200 samples, not 48: use more worlds or fewer mini-batches"
-    ):
+    with pytest.raises(ValueError, match="200 mini-batches .* 48: use more worlds or fewer mini-batches"):
         made(env, minibatches=200)
-    with pytest.raises(ValueError, match="'metered' has no group 'actor' of observations: it has policy, critic"):
+    with pytest.raises(ValueError, match="no group 'actor' .* policy, critic"):
         made(env, value_group="actor")
-    with pytest.raises(ValueError, match="seed must be a whole number from 0 to 2147483647, not -1"):
+    with pytest.raises(ValueError, match="seed .* -1"):
         made(env, seed=-1)
 
 
@@ -155,9 +148,8 @@ def test_mini_batches_that_leave_out_samples_print_a_warning(env: lw.Env, caplog
     made(env, minibatches=4)
     assert not caplog.messages
     made(env, minibatches=7)
-    assert caplog.messages == [
-        "7 mini-batches of equal size hold only 42 of 48 samples: make the number of mini-batches divide 48"
-    ]
+    (message,) = caplog.messages
+    assert "42 of 48 samples" in message
 
 
 def test_non_finite_update_ends_learning_and_names_the_largest_samples(env: lw.Env) -> None:

@@ -189,9 +189,9 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
     assert not torch.equal(policy.network[0].weight, sac.policy.network[0].weight)
     assert (other.replay.action[:4].abs() < 1.0).all()
     npg = lw.NPG(env, config=lw.NPGConfig(samples=80, hidden=(8,), value_hidden=(8,), mean_every=0))
-    with pytest.raises(ValueError, match="policy of SAC must be of type SquashedPolicy.* not GaussianPolicy"):
+    with pytest.raises(ValueError, match="policy of SAC .* SquashedPolicy.* GaussianPolicy"):
         lw.SAC(env, npg.policy)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="value of PPO must be of type ValueFunction.* not TwinCritic"):
+    with pytest.raises(ValueError, match="value .* ValueFunction.* TwinCritic"):
         lw.PPO(env, value=value)  # type: ignore[arg-type]
     wide = lw.SquashedPolicy(1, 1, (8,), low=[-2.0], high=[2.0])
     with pytest.raises(

@@ -5,44 +5,50 @@ import math
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
-from lyceum_warp.support.validate import check_flag, check_word, finite_number, layer_sizes, whole_number
+from lyceum_warp.support.validate import check_flag, check_kind, check_word, finite_number, layer_sizes, whole_number
+
+Bound: TypeAlias = float | tuple[float, float]
+"""The minimum of a number, or its minimum and its maximum."""
 
 LEAST = -math.inf
 """Lower bound that admits every finite number."""
 
 
-def check_fields(config: Any, bounds: Mapping[str, float | tuple[float, float]]) -> None:
+def check_fields(config: Any, bounds: Mapping[str, Bound]) -> None:
     """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
 
     The function checks numbers with bounds, bools, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and names
-    of observation groups (``str | None``). The bounds of a number are a minimum, or a minimum and a maximum.
+    of observation groups (``str | None``).
 
     Raises:
         ValueError: A value is of the wrong type, out of range or not finite.
     """
     for field in dataclasses.fields(config):
-        name, value = field.name, getattr(config, field.name)
+        value = getattr(config, field.name)
         kinds = (field.type, *typing.get_args(field.type))
-        words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
-        if value is None and types.NoneType in kinds:
-            continue
-        if bool in kinds:
-            check_flag(name, value)
-        elif tuple[int, ...] in kinds:
-            value = tuple(layer_sizes(value, name))
-        elif field.type == str | None:
-            if not isinstance(value, str):
-                raise ValueError(f"{name} must be the name of a group of observations, not {value!r}")
-        elif name in bounds:
-            bound = bounds[name]
-            low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
-            if int in kinds:
-                limit = {} if high == math.inf else {"high": int(high)}
-                value = whole_number(name, value, low=int(low), **limit)
-            else:
-                value = finite_number(name, value, low=low, high=high)
-        elif words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type))):
-            check_word(name, value, words)
-        object.__setattr__(config, name, value)
+        if value is not None or types.NoneType not in kinds:
+            object.__setattr__(config, field.name, _checked(field.name, value, kinds, bounds.get(field.name)))
+
+
+def _checked(name: str, value: Any, kinds: tuple[Any, ...], bound: Bound | None) -> Any:
+    if bound is not None:
+        return _number(name, value, bound, whole=int in kinds)
+    if tuple[int, ...] in kinds:
+        return tuple(layer_sizes(value, name))
+    if bool in kinds:
+        check_flag(name, value)
+    if kinds[0] == str | None:
+        check_kind(name, value, str, "the name of a group of observations")
+    words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
+    if words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type))):
+        check_word(name, value, words)
+    return value
+
+
+def _number(name: str, value: Any, bound: Bound, *, whole: bool) -> int | float:
+    low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
+    if whole:
+        return whole_number(name, value, low=int(low), high=int(min(high, 2**31 - 1)))
+    return finite_number(name, value, low=low, high=high)

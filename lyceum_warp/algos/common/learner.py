@@ -12,7 +12,7 @@ from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.replay import Replay
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import check_kind, whole_number
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
 """Prefixes of the metrics' columns in metrics.csv: sums over an episode, and means over all samples."""
@@ -73,9 +73,9 @@ class Iteration:
         The metric ``x`` has the columns ``metrics/x`` and ``step_metrics/x``.
         """
         names = [field.name for field in dataclasses.fields(self) if field.name not in NESTED]
-        own = {name: number for name in names if (number := getattr(self, name)) is not None} | dict(self.numbers)
+        row = {name: number for name in names if (number := getattr(self, name)) is not None} | dict(self.numbers)
         columns = ((METRIC_COLUMN, self.metrics), (STEP_METRIC_COLUMN, self.step_metrics))
-        return own | {prefix + name: mean for prefix, means in columns for name, mean in means.items()}
+        return row | {prefix + name: mean for prefix, means in columns for name, mean in means.items()}
 
 
 @document_attributes
@@ -124,6 +124,7 @@ class Learner(abc.ABC):
     """Number of samples in all iterations so far."""
 
     def __init__(self, env: Env, *, seed: int = 0, team: Team | None = None) -> None:
+        check_kind(f"env of {type(self).__name__}", env, Env, "as lw.make(...) makes it")
         self.env, self.seed = env, whole_number("seed", seed, low=0)
         self.team = team = team or Team()
         self.iteration = self.samples = 0
@@ -205,8 +206,7 @@ class Learner(abc.ABC):
             self.value.load_state_dict(state["value"])
         if self.generator is not None:
             self.generator.set_state(state["generator"].cpu())
-        if "shared" in state:  # missing in old checkpoints
-            self.env.set_shared(state["shared"].to(self.env.obs.device))
+        self.env.set_shared(state["shared"].to(self.env.obs.device))
         self.env.set_state(state["env"][self.own_worlds].to(self.env.obs.device))
         self.iteration = whole_number("iteration", state["iteration"], low=0)
         self.samples = whole_number("samples", state["samples"], low=0, high=2**63 - 1)

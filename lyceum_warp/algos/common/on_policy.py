@@ -46,11 +46,8 @@ class OnPolicyLearner(Learner):
         seed: int,
         team: Team | None,
     ) -> None:
-        name, kind = type(self).__name__, self.config_type
-        check_kind(f"env of {name}", env, Env, "as lw.make(...) makes it")
-        check_kind(f"config of {name}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
-        check_kind(f"team of {name}", team, Team | None, "as lyceum_warp.algos.common.distributed.Team() makes it")
-        check_kind(f"value of {name}", value, ValueFunction | None, "as lw.load_value(run) returns it")
+        kind = self.config_type
+        check_kind(f"config of {type(self).__name__}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
         super().__init__(env, seed=seed, team=team)
         if value is not None:
             check_value(trainable(value), env)
@@ -80,9 +77,10 @@ class OnPolicyLearner(Learner):
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
             time_orders=time_orders, group=group, **options,
         )  # fmt: skip
-        for given, module in ((policy, self.policy), (value, self.value)):
-            if given is None and as_torch:
-                initialize_as_torch(module, init)
+        if as_torch and policy is None:
+            initialize_as_torch(self.policy, init)
+        if as_torch and value is None:
+            initialize_as_torch(self.value, init)
         self.value.discount = config.gamma
         self.policy.to(device)
         self.value.to(device)
@@ -91,7 +89,8 @@ class OnPolicyLearner(Learner):
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
         self.count = steps * self.env.nworld * self.team.size
         self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
-        self._advantage, self._return = (torch.empty_like(self.rollout.reward) for _ in range(2))
+        self._advantage = torch.empty_like(self.rollout.reward)
+        self._return = torch.empty_like(self.rollout.reward)
         self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config, self.team)
 
     def _estimate(
@@ -106,13 +105,15 @@ class OnPolicyLearner(Learner):
     def settings(self) -> dict[str, Any]:
         """Return the hyperparameters and the networks' sizes for a run's config.json."""
         policy, value = self.policy.shape, self.value.shape
-        found = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
-        found |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
-        found["time_orders"] = value["time_orders"]
+        settings = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
+        settings |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
+        settings["time_orders"] = value["time_orders"]
         if self.config.value_group is not None or value["group"] != value_group(self.env, None):
-            found["value_group"] = value["group"]
-        own = {name: setting for name, setting in found.items() if setting is not None and hasattr(self.config, name)}
-        return dataclasses.asdict(dataclasses.replace(self.config, **own))
+            settings["value_group"] = value["group"]
+        fields = {
+            name: number for name, number in settings.items() if number is not None and hasattr(self.config, name)
+        }
+        return dataclasses.asdict(dataclasses.replace(self.config, **fields))
 
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""

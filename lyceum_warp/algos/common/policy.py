@@ -62,9 +62,7 @@ class GaussianPolicy(Normalized):
         check_memory([nobs, *layer_sizes(hidden), nact], nobs=nobs, hidden=hidden, nact=nact)
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
-        self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize}
-        if limit != LIMIT:  # missing in old checkpoints
-            self.shape["limit"] = limit
+        self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize, "limit": limit}
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
             # make initial mean actions near zero (as in mjrl)
@@ -96,10 +94,10 @@ class GaussianPolicy(Normalized):
         Raises:
             ValueError: The policy or its network has a custom class.
         """
-        if (own := shape.get("own")) is not None:
+        if "own" in shape:
             normalize = ", normalize=True" if shape["normalize"] else ""
             raise ValueError(
-                f"the policy has the custom class {own}: pass a policy of this class, as in lw.load(run, "
+                f"the policy has the custom class {shape['own']}: pass a policy of this class, as in lw.load(run, "
                 f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
             )
         policy = GaussianPolicy(**{name: value for name, value in shape.items() if name != "mirror"})

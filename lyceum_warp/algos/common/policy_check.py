@@ -9,7 +9,7 @@ from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.validate import check_group, described, first_sentence
+from lyceum_warp.support.validate import check_group, check_kind, described, first_sentence
 
 _ROWS = 4
 
@@ -45,11 +45,11 @@ def check_sizes(policy: Any, env: Env, name: str = "the policy") -> None:
     Raises:
         ValueError: The sizes of the policy and the environment differ.
     """
-    sizes, wanted = (policy.nobs, policy.nact), (env.obs_space.size, env.action_space.size)
-    if sizes != wanted:
+    nobs, nact = env.obs_space.size, env.action_space.size
+    if (policy.nobs, policy.nact) != (nobs, nact):
         raise ValueError(
-            f"{name} takes {sizes[0]} observations and gives {sizes[1]} actions, but the task {env.task.name!r} has "
-            f"{wanted[0]} observations and {wanted[1]} actions"
+            f"{name} takes {policy.nobs} observations and gives {policy.nact} actions, but the task "
+            f"{env.task.name!r} has {nobs} observations and {nact} actions"
         )
 
 
@@ -79,9 +79,9 @@ def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
         reason = f"{type(error).__name__}: {first_sentence(error)}"
         raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
     if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
-        wanted = f"a {str(obs.dtype).removeprefix('torch.')} tensor of shape {shape}"
-        given = described(mean) if isinstance(mean, torch.Tensor) else type(mean).__name__
-        raise ValueError(f"the policy must give {wanted} for observations of shape {tuple(obs.shape)}, not {given}")
+        example = described(obs.new_empty(shape))
+        output = described(mean) if isinstance(mean, torch.Tensor) else type(mean).__name__
+        raise ValueError(f"the policy must give {example} for observations of shape {tuple(obs.shape)}, not {output}")
     return mean
 
 
@@ -117,15 +117,17 @@ def check_value(value: ValueFunction, env: Env) -> None:
     """Check that a value function fits an environment's observations.
 
     Raises:
-        ValueError: The group or the input size does not fit, or a parameter is not finite.
+        ValueError: The value function has the wrong type, its group or its input size does not fit, or a parameter is
+            not finite.
     """
+    check_kind("value", value, ValueFunction, "as lw.load_value(run) returns it for a run of NPG or PPO")
     name = env.task.name
     check_group(value.group, env.obs_groups, name)
-    size, wanted = value.shape["nobs"], env.obs_spaces[value.group].size
-    if size != wanted:
+    size, space = value.shape["nobs"], env.obs_spaces[value.group]
+    if size != space.size:
         raise ValueError(
             f"the value function takes {size} observations, but the group {value.group!r} of the task {name!r} has "
-            f"{wanted} observations"
+            f"{space.size} observations"
         )
     for part, numbers in value.state_dict().items():
         if not numbers.isfinite().all():

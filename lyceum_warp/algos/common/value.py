@@ -35,9 +35,6 @@ class ValueFunction(Normalized):
         ValueError: ``hidden`` is not a sequence of positive whole numbers, or ``activation`` is unknown.
     """
 
-    LATER = ("shift", "scale")
-    """Buffers that old checkpoints may lack."""
-
     group: str
     """The group of observations that the value function uses."""
     shift: torch.Tensor
@@ -72,10 +69,8 @@ class ValueFunction(Normalized):
         self.group = group
         self._shape = {
             "nobs": nobs, "hidden": layer_sizes(hidden), "activation": activation, "scale": scale,
-            "time_orders": time_orders, "normalize": normalize, "group": group,
+            "time_orders": time_orders, "normalize": normalize, "limit": limit, "group": group,
         }  # fmt: skip
-        if limit != LIMIT:  # missing in old checkpoints
-            self._shape["limit"] = limit
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # at first, predict the mean return
         self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
@@ -135,19 +130,14 @@ class ValueFunction(Normalized):
         std = (team.sum((returns - mean).square().sum()) / count).sqrt()
         # ignore float32 rounding
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
-        near = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
-        scale = torch.where(new, scale, near)
+        limited = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
+        scale = torch.where(new, scale, limited)
         last = self.network[-1]
         assert isinstance(last, nn.Linear)
         last.weight.mul_(self.scale / scale)
         last.bias.copy_((last.bias * self.scale + self.shift - mean) / scale)
         self.shift.copy_(mean)
         self.scale.copy_(scale)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        for name in self.LATER:
-            state_dict.setdefault(prefix + name, getattr(self, name))
-        super()._load_from_state_dict(state_dict, prefix, *args)
 
 
 BOUND = 10.0
@@ -158,12 +148,12 @@ is larger than this.
 """
 
 
-def value_group(env: Env, given: str | None) -> str:
+def value_group(env: Env, name: str | None) -> str:
     """Select a value function's observations: by default the group "critic" if it exists, else "policy".
 
     Raises:
         ValueError: The task has no observation group of this name.
     """
-    group = given or ("critic" if "critic" in env.obs_groups else "policy")
+    group = name or ("critic" if "critic" in env.obs_groups else "policy")
     check_group(group, env.obs_groups, env.task.name)
     return group

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import torch
 
-from lyceum_warp.algos.common.hyperparameters import check_fields
+from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.planning.updates import PlanUpdate
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import check_word
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
-_BOUNDS: dict[str, float | tuple[float, float]] = {
+_BOUNDS: dict[str, Bound] = {
     "horizon": 1, "samples": 1, "models": 1, "iterations": (1, 100_000), "elites": 1, "knots": 1,
     "discount": (0.0, 1.0),
     # the smallest normal float32, because kernels compute in float32
