@@ -1,7 +1,8 @@
 """Divide a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.core.task import Planning, Task
 from lyceum_warp.engines.placement import place_samples
-from lyceum_warp.support.validate import check_kind, described, whole_number
+from lyceum_warp.support.validate import check_kind, whole_number
 
 
 def task_config(task: type[Task], value: object = None) -> MPPIConfig:
@@ -31,18 +32,14 @@ def task_config(task: type[Task], value: object = None) -> MPPIConfig:
     Raises:
         ValueError: The task's ``planning`` is not valid.
     """
-    planning = _planning(task)
-    try:
-        config = MPPIConfig(**planning.settings)
-    except ValueError as error:
-        raise ValueError(f"planning.settings of the task {task_name(task)!r}: {error}") from error
+    config, _ = _planning(task)
     return config if getattr(value, "discount", None) is None else dataclasses.replace(config, discount=None)
 
 
 def planner_arguments(
     task: type[Task],
     config: MPPIConfig | None,
-    words: Mapping[str, Any],
+    kwargs: Mapping[str, Any],
     params: Mapping[str, Any] | None,
     value: object,
     plants: int = 1,
@@ -52,8 +49,8 @@ def planner_arguments(
     Args:
         task: The task.
         config: Settings that replace the task's settings.
-        words: Keyword arguments, which are settings, options of the worlds or parameters of the task. A setting of None
-            is ignored.
+        kwargs: Keyword arguments, which are settings, options of the worlds or parameters of the task. A setting of
+            None is ignored.
         params: Parameters of the task.
         value: The value function. With a value function, the parameters in ``planning`` are ignored.
         plants: Number of plants to plan for.
@@ -67,48 +64,47 @@ def planner_arguments(
     """
     check_kind("config", config, MPPIConfig | None, "as lw.MPPIConfig(horizon=16)")
     check_kind("params", params, Mapping | None, "a dict of parameters of the task")
-    name, planning, known = task_name(task), _planning(task), _parameter_names(task)
-    if both := [word for word in words if word in SETTINGS and word in known]:
+    name, names = task_name(task), _parameter_names(task)
+    settings = {key: kwargs[key] for key in kwargs if key in SETTINGS}
+    options = {key: kwargs[key] for key in kwargs if key in OPTIONS and key not in SETTINGS}
+    parameters = {key: kwargs[key] for key in kwargs if key not in settings and key not in options}
+    if ambiguous := [key for key in settings if key in names]:
         raise ValueError(
-            f"{both[0]!r} is a setting of MPPI and a parameter of the task {name!r}: pass the setting as "
-            f"config=lw.MPPIConfig({both[0]}=...), or the parameter as params={{{both[0]!r}: ...}}"
+            f"{ambiguous[0]!r} is a setting of MPPI and a parameter of the task {name!r}: pass the setting as "
+            f"config=lw.MPPIConfig({ambiguous[0]}=...), or the parameter as params={{{ambiguous[0]!r}: ...}}"
         )
     config = config or task_config(task, value)
-    config = config.changed({word: words[word] for word in words if word in SETTINGS and words[word] is not None})
+    config = config.changed({key: setting for key, setting in settings.items() if setting is not None})
     config = config.completed(value)
 
-    given = {word: words[word] for word in words if word in OPTIONS and word not in SETTINGS}
-    _check_options(given)
-    options = EnvOptions().changed(planning.options).changed(given)
-    options = options.changed({"physics": options.physics.resolved(task.physics)})
-
-    rest = {word: words[word] for word in words if word not in SETTINGS and word not in OPTIONS} | dict(params or {})
-    if unknown := [word for word in rest if word not in known]:
-        raise ValueError(f"the task {name!r} has no parameter {unknown[0]!r}: {_hint(unknown[0], known)}")
+    _check_options(options)
+    env_options = _planning(task)[1].changed(options)
+    env_options = env_options.changed({"physics": env_options.physics.resolved(task.physics)})
     place = place_samples(
-        options.engine, options.device, nthread=options.nthread, samples=config.samples * config.models * plants,
-        spec=partial(task_spec, task, options.model), solver=options.physics.solver,
+        env_options.engine, env_options.device, nthread=env_options.nthread,
+        samples=config.samples * config.models * plants, spec=partial(task_spec, task, env_options.model),
+        solver=env_options.physics.solver,
     )  # fmt: skip
-    return config, options.changed(place), dict(planning.params if value is None else {}) | rest
+
+    parameters = {**(task.planning.params if value is None else {}), **parameters, **(params or {})}
+    if unknown := [key for key in parameters if key not in names]:
+        raise ValueError(f"the task {name!r} has no parameter {unknown[0]!r}: {_hint(unknown[0], names)}")
+    return config, env_options.changed(place), parameters
 
 
-def plant_seeds(seed: int | Sequence[int], plants: int) -> Sequence[int]:
+def plant_seeds(seed: Any, plants: int) -> Sequence[int]:
     """Derive each plant's seed from the first plant's seed, or check a list of seeds.
 
     Raises:
         ValueError: A seed is negative or not a whole number, or the list does not contain ``plants`` seeds.
     """
-    given: Any = seed
-    if isinstance(given, (np.ndarray, torch.Tensor)):
-        given = given.tolist()
-    if isinstance(given, Sequence) and not isinstance(given, str):
-        if len(given) != plants:
-            raise ValueError(
-                f"seed must be a number, or a list with a number for each of {plants} plants, not {given!r}"
-            )
-        return [whole_number("seed", one, low=0) for one in given]
-    first = whole_number("seed", given, low=0, high=2**31 - plants)
-    return range(first, first + plants)
+    seeds = seed.tolist() if isinstance(seed, (np.ndarray, torch.Tensor)) else seed
+    if not isinstance(seeds, list | tuple | range):
+        first = whole_number("seed", seeds, low=0, high=2**31 - plants)
+        return range(first, first + plants)
+    if len(seeds) != plants:
+        raise ValueError(f"seed must be a number, or a list with a number for each of {plants} plants, not {seeds!r}")
+    return [whole_number("seed", seed, low=0) for seed in seeds]
 
 
 def plain(value: Any) -> Any:
@@ -139,13 +135,15 @@ def _check_options(options: Mapping[str, Any]) -> None:
     for name in options:
         if name in _OWN_OPTIONS:
             raise ValueError(f"a planner takes no option {name}: {_OWN_OPTIONS[name]}")
+        if name not in OPTIONS:
+            raise ValueError(f"there is no option {name!r}: {suggestion(name)}")
 
 
-def _hint(word: str, known: Sequence[str]) -> str:
-    if word in SETTINGS or word in OPTIONS:  # given in params
-        return f"it is {'a setting of MPPI' if word in SETTINGS else 'an option of its worlds'}: give it outside params"
-    others = [setting for setting in SETTINGS if setting not in OPTIONS]
-    return suggestion(word, [*others, *known]) or f"it has {', '.join(known) or 'none'}"
+def _hint(name: str, names: Sequence[str]) -> str:
+    if name in SETTINGS or name in OPTIONS:  # given in params
+        return "it is a setting of MPPI or an option of its worlds: give it outside params"
+    settings = [setting for setting in SETTINGS if setting not in OPTIONS]
+    return suggestion(name, [*settings, *names]) or f"it has {', '.join(names) or 'none'}"
 
 
 def _parameter_names(task: type[Task]) -> list[str]:
@@ -153,24 +151,21 @@ def _parameter_names(task: type[Task]) -> list[str]:
     return [name for name in (*source.params.vars, *source.terms.weights) if name != "dt"]
 
 
-def _planning(task: type[Task]) -> Planning:
-    """Return a task's ``planning`` after checking that every name in it is known."""
+def _planning(task: type[Task]) -> tuple[MPPIConfig, EnvOptions]:
+    """Make the settings and the options of a task's ``planning``."""
     planning, name = task.planning, task_name(task)
-    if not isinstance(planning, Planning):
-        raise ValueError(
-            f"planning of the task {name!r} must be lw.Planning(settings={{...}}, options={{...}}, params={{...}}), "
-            f"not {described(planning)}"
-        )
-    known = {"settings": SETTINGS, "options": OPTIONS, "params": _parameter_names(task)}
-    for part, names in known.items():
-        if unknown := [word for word in getattr(planning, part) if word not in names]:
-            hints = [f"it belongs to {other}" for other in known if unknown[0] in known[other]]
-            hints += [suggestion(unknown[0], set(names) - set(OPTIONS)), f"there are {', '.join(names) or 'none'}"]
-            hint = next(filter(None, hints))
-            raise ValueError(f"{unknown[0]!r} in planning.{part} of the task {name!r} is unknown: {hint}")
-    try:
+    check_kind(f"planning of the task {name!r}", planning, Planning, "as lw.Planning(settings={'horizon': 16})")
+    with _named(f"planning.settings of the task {name!r}"):
+        config = MPPIConfig(**planning.settings)
+    with _named(f"planning.options of the task {name!r}"):
         _check_options(planning.options)
-        EnvOptions().changed(planning.options).physics.resolved(task.physics)
-    except ValueError as error:
-        raise ValueError(f"planning.options of the task {name!r}: {error}") from error
-    return planning
+        options = EnvOptions().changed(planning.options)
+    return config, options
+
+
+@contextlib.contextmanager
+def _named(part: str) -> Iterator[None]:
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{part}: {error}") from error

@@ -54,29 +54,17 @@ def test_planning_attribute_of_the_task_applies_to_the_planner() -> None:
 @pytest.mark.parametrize(
     ("planning", "message"),
     [
-        ({"horizon": 3}, r"planning of the task 'planned' must be lw.Planning\(settings=\{...\}, options=\{...\}, "
-                         r"params=\{...\}\), not dict \{'horizon': 3\}"),
-        (Planning(settings={"horizont": 3}), "'horizont' in planning.settings of the task 'planned' is unknown: "
-                                             r"did you mean horizon\?"),
-        (Planning(settings={"integrator": "rk4"}), "'integrator' in planning.settings .*: it belongs to options"),
-        (Planning(options={"integratr": "rk4"}), "'integratr' in planning.options .*: did you mean integrator"),
-        (Planning(options={"samples": 3}), "'samples' in planning.options .*: it belongs to settings"),
-        (Planning(params={"limt": 3.0}), "'limt' in planning.params of the task 'planned' .*: did you mean limit"),
-        (Planning(params={"qqq": 3.0}), "'qqq' in planning.params .*: there are limit, wrong"),
-        (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon must be .* not 0"),
-        (Planning(options={"integrator": "rk5"}), "planning.options of the task 'planned': integrator must be"),
-        (Planning(options={"nworld": 3}), "planning.options of the task 'planned': a planner takes no option nworld"),
+        ({"horizon": 3}, r"planning of the task 'planned' .*lw.Planning\(.*\{'horizon': 3\}"),
+        (Planning(settings={"horizont": 3}), "planning.settings .* 'planned': .*'horizont': did you mean horizon"),
+        (Planning(options={"integratr": "rk4"}), "planning.options .*'integratr': did you mean integrator"),
+        (Planning(params={"limt": 3.0}), "'planned' .*'limt': did you mean limit"),
+        (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon .* 0"),
+        (Planning(options={"nworld": 3}), "planning.options of the task 'planned': .*nworld"),
     ],
 )  # fmt: skip
 def test_invalid_planning_raises_an_error_that_names_the_task_and_the_entry(planning: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message) as raised:
+    with pytest.raises(ValueError, match=message):
         MPPI(type("Planned", (Picky,), {"planning": planning}))
-    assert "\n" not in str(raised.value)
-
-
-def test_planning_settings_that_are_not_a_dict_raise_an_error() -> None:
-    with pytest.raises(ValueError, match=r"settings of lw.Planning must be a dict, not \['horizon'\]"):
-        Planning(settings=["horizon"])  # type: ignore[arg-type]
 
 
 REACH = task_config(find_task("reach"))
@@ -110,11 +98,7 @@ def test_arguments_are_sorted_into_settings_options_and_parameters() -> None:
 
 
 def test_ambiguous_argument_name_raises_an_error_that_names_config_and_params() -> None:
-    message = (
-        r"'noise' is a setting of MPPI and a parameter of the task 'noisy': pass the setting as "
-        r"config=lw.MPPIConfig\(noise=...\), or the parameter as params=\{'noise': ...\}"
-    )
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=r"config=lw.MPPIConfig\(noise=...\), .* params=\{'noise'"):
         MPPI(Noisy, noise=0.3)
     plan = MPPI(Noisy, MPPIConfig(horizon=2, samples=2, noise=0.25), params={"noise": 3.0}, size=4.0)
     assert plan.config.noise == 0.25
@@ -125,27 +109,24 @@ def test_ambiguous_argument_name_raises_an_error_that_names_config_and_params() 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"sample": 3}, "the task 'reach' has no parameter 'sample': did you mean samples"),
-        ({"sucess_distance": 1.0}, "no parameter 'sucess_distance': did you mean success_distance"),
-        ({"integratr": "rk4"}, "no parameter 'integratr': did you mean integrator"),
-        ({"record": False}, "no parameter 'record': did you mean graphs"),
-        ({"qqqqq": 3}, "no parameter 'qqqqq': it has .*success_distance"),
-        ({"params": {"samples": 3}}, "no parameter 'samples': it is a setting of MPPI: give it outside params"),
-        ({"params": {"nthread": 3}}, "no parameter 'nthread': it is an option of its worlds: give it outside params"),
-        ({"params": [3]}, r"params must be .* a dict of parameters of the task, not list \[3\]"),
-        ({"config": {"samples": 3}}, r"config must be .* MPPIConfig.*, as .*, not dict \{'samples': 3\}"),
-        ({"nworld": 1}, "a planner takes no option nworld: samples is the number of its worlds"),
-        ({"elites": 4}, "elites=4 is a setting of update='cem', not of update='mppi'"),
-        ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 is a setting of update='cem', not of"),
-        ({"update": "cem", "noise": np.eye(7)}, "must be standard deviations; a covariance was given"),
-        ({"update": "cem", "min_noise": [0.1, 0.1]}, "min_noise must be one standard deviation, or one for each"),
-        ({"models": 4}, "models=4 needs a task that draws model fields, but 'reach' draws none: write model"),
+        ({"sample": 3}, "'reach' .* 'sample': did you mean samples"),
+        ({"sucess_distance": 1.0}, "'sucess_distance': did you mean success_distance"),
+        ({"integratr": "rk4"}, "'integratr': did you mean integrator"),
+        ({"qqqqq": 3}, "'qqqqq': it has .*success_distance"),
+        ({"params": {"samples": 3}}, "'samples': .* give it outside params"),
+        ({"params": [3]}, r"params .* \[3\]"),
+        ({"config": {"samples": 3}}, r"config .* MPPIConfig.* \{'samples': 3\}"),
+        ({"nworld": 1}, "no option nworld: samples"),
+        ({"elites": 4}, "elites=4 .* update='cem'"),
+        ({"update": "predictive_sampling", "min_noise": 0.1}, "min_noise=0.1 .* update='cem'"),
+        ({"update": "cem", "noise": np.eye(7)}, "noise of update='cem' .* standard deviations"),
+        ({"update": "cem", "min_noise": [0.1, 0.1]}, r"min_noise .* \(0.1, 0.1\)"),
+        ({"models": 4}, "models=4 .* 'reach'"),
     ],
 )  # fmt: skip
-def test_invalid_planner_arguments_raise_a_one_line_error(words: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message) as raised:
+def test_invalid_planner_arguments_raise_an_error(words: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         MPPI("reach", **words)
-    assert "\n" not in str(raised.value)
 
 
 def test_planning_params_are_ignored_if_there_is_a_value_function() -> None:
@@ -197,7 +178,7 @@ def test_cem_and_predictive_sampling_equal_mppi_with_another_update(planner: typ
     one, other = planner("reach", config, seed=1), MPPI("reach", config, update=update, seed=1)
     assert one.config == other.config and one.config.update == update
     assert torch.equal(one(one.state_of()), other(other.state_of()))
-    with pytest.raises(ValueError, match=f"update='mppi' is not the update of this planner, '{update}': use lw.MPPI"):
+    with pytest.raises(ValueError, match=f"update='mppi' .* '{update}' .* lw.MPPI"):
         planner("reach", update="mppi")
 
 
