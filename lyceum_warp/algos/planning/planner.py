@@ -39,7 +39,8 @@ from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy_check import check_value
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.planning.arguments import plain, planner_arguments, plant_seeds
-from lyceum_warp.algos.planning.config import SETTINGS, MPPIConfig
+from lyceum_warp.algos.planning.config import MPPIConfig
+from lyceum_warp.algos.planning.plans import Plans
 from lyceum_warp.algos.planning.updates import (
     BestSample,
     CrossEntropy,
@@ -57,17 +58,13 @@ from lyceum_warp.env.arrays import memory_columns
 from lyceum_warp.env.env import Env
 from lyceum_warp.env.openloop import OpenLoop
 from lyceum_warp.graphs.capture import Calls, Phase
-from lyceum_warp.kernels import knots, planning, rollouts
+from lyceum_warp.kernels import planning
 from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
 
 log = logging.getLogger(__name__)
 
-_BUFFERS = (
-    "actions", "nominal", "knot_actions", "standard_noise", "adapted_noise", "sampled", "model_returns", "returns",
-    "weights", "model_fields",
-)  # fmt: skip
 _MODELS = 0x6D6F64656C73  # seed for drawing models, in addition to the planner's seed ("models" in ASCII)
 _DRAWING = ("startup", "initialize", "randomize")
 """Task functions that can randomize a planner's model fields."""
@@ -107,7 +104,7 @@ class Planner:
             per plant.
         plants: Number of plants to plan for.
         params: Parameters of the task. A parameter that has the same name as a setting must be given here.
-        words: Settings, options of the planner's worlds, and parameters of the task, by name. Settings are the fields
+        kwargs: Settings, options of the planner's worlds, and parameters of the task, by name. Settings are the fields
             of ``lw.MPPIConfig``; None keeps the default. The setting ``update`` may be a custom ``lw.PlanUpdate``.
             Options are those of ``lw.make``. Parameters with one value per world are ordered by plant, then by sample,
             then by model. With few samples, engine="auto" selects the C engine even if there is a CUDA device, because
@@ -160,40 +157,41 @@ class Planner:
         seed: int | Sequence[int] = 0,
         plants: int = 1,
         params: Mapping[str, Any] | None = None,
-        **words: Any,
+        **kwargs: Any,
     ) -> None:
         if value is not None and not callable(value):
             raise ValueError(f"value must be a function of observations, or None, not {described(value)}")
         self.plants = whole_number("plants", plants, low=1)
         seeds = plant_seeds(seed, self.plants)
         task = find_task(task)
-        if (only := self._only_update) is not None and words.setdefault("update", only) != only:
+        if (only := self._only_update) is not None and kwargs.setdefault("update", only) != only:
             raise ValueError(
-                f"update={words['update']!r} is not the update of this planner, {only!r}: use lw.MPPI for other updates"
+                f"update={kwargs['update']!r} is not the update {only!r} of this planner: use lw.MPPI for other updates"
             )
-        self.config, options, own_params = planner_arguments(task, config, words, params, value, self.plants)
+        self.config, options, parameters = planner_arguments(task, config, kwargs, params, value, self.plants)
         self.horizon, self.samples = self.config.horizon, self.config.samples
-        settings = options.given() | own_params | vars(self.config)
+        settings = options.given() | parameters | vars(self.config)
         self.settings = json.loads(json.dumps(settings, default=plain))
         try:
-            self._make_worlds(task, options, own_params)
+            self._make_worlds(task, options, parameters)
         except NotEnoughMemoryError as error:
             product = f"{self.plants} * {self.samples} * {self.config.models}"
             raise NotEnoughMemoryError(f"{error}, where nworld is plants * samples * models, {product}") from error
         self._update = _update_of(self.config)
+        actions: Any = wp.from_torch(self._loop.actions)
+        self._plans = Plans(
+            self.config, self.env.action_space, self.plants, actions, adapts_noise=self._update.adapts_noise
+        )
         self._allocate()
-        self._update.prepare(self._arrays)
         self._take_value(value)
-        first, others = self._program(first=True), self._program(first=False)
-        self._calls = first + others * (self.config.iterations - 1)
+        self._calls = self._program(first=True) + self._program(first=False) * (self.config.iterations - 1)
         self.reset(seeds)
         self._warned = False
-        self._made = True
 
     def _make_worlds(self, task: type[Task], options: EnvOptions, params: Mapping[str, Any]) -> None:
         nworld = self.plants * self.samples * self.config.models
         self.env = Env(task, options, nworld=nworld, autoreset=False, horizon=0, **params)
-        drawn, parts = self._drawn_fields(), self.env.state_space.parts
+        names, parts = self._random_fields(), self.env.state_space.parts
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
@@ -204,7 +202,7 @@ class Planner:
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(nworld, dtype=wp.uint32)
-            sizes = {name: parts[name].stop - parts[name].start for name in drawn}
+            sizes = {name: parts[name].stop - parts[name].start for name in names}
             fields = {name: wp.zeros((self.config.models, n), dtype=wp.float64) for name, n in sizes.items()}
         self.model_fields = {name: torch_view(rows) for name, rows in fields.items()}
         self._loop = OpenLoop(
@@ -212,30 +210,28 @@ class Planner:
             states=self.plants,
         )  # fmt: skip
 
-    def _drawn_fields(self) -> list[str]:
-        if self.config.models == 1:
-            return []
-        bound = self.env.task
-        written = frozenset().union(*(bound.writes.get(name, frozenset()) for name in _DRAWING))
-        if not (drawn := [field.name for field in bound.dynamics if field.name in written]):
+    def _random_fields(self) -> list[str]:
+        """List the model fields that the task's functions randomize; with one model, list none."""
+        task = self.env.task
+        written = frozenset().union(*(task.writes.get(name, frozenset()) for name in _DRAWING))
+        names = [field.name for field in task.dynamics if field.name in written] if self.config.models > 1 else []
+        if self.config.models > 1 and not names:
             raise ValueError(
-                f"models={self.config.models} needs a task that draws model fields, but {bound.name!r} draws none: "
+                f"models={self.config.models} needs a task that draws model fields, but {task.name!r} draws none: "
                 "write model fields in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * "
                 "lw.uniform(rng, 0.8, 1.2)"
             )
-        return drawn
+        return names
 
     def _take_value(self, value: Value | None) -> None:
         self.value, group = value, "policy"
-        self._value_kernel, self._value_in_torch = None, False
+        self._value_in_torch = value is not None and not isinstance(value, wp.Function)
+        self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
         if isinstance(value, ValueFunction):
             check_value(value, self.env)
             self.value, group = moved(value, self.env), value.group
         self._value_obs = self._loop.final_obs_groups[group]
-        if isinstance(value, wp.Function):
-            self._value_kernel = planning.value_kernel(value)
-        elif value is not None:
-            self._value_in_torch = True
+        if self._value_in_torch:
             try:
                 self._torch_values()
             # for example missing weights, another input size, or a critic that also takes actions
@@ -243,86 +239,44 @@ class Planner:
                 observations = described(self._value_obs)
                 raise ValueError(f"value cannot take observations {observations}: {error}") from error
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        made = "_made" in self.__dict__
-        if made and name in (*SETTINGS, "config", "value", "seed", "plants"):
-            raise AttributeError(
-                f"{name} is part of the planner's graphs: make a new {type(self).__name__} with {name}={value!r}"
-            )
-        if made and name in _BUFFERS:
-            raise AttributeError(
-                f"plan.{name} is a buffer at a fixed address: write into the buffer, as plan.{name}.copy_(...)"
-            )
-        super().__setattr__(name, value)
-
     def _allocate(self) -> None:
-        config, space, loop = self.config, self.env.action_space, self._loop
-        nact, nworld, plants = space.size, self.env.nworld, self.plants
-        self._nsample = plants * self.samples
-        factor = config.noise_factor(nact)
-        self._diagonal = not np.tril(factor, -1).any()
-        self._repeat = config.fill == "repeat"
-        self._smoothing = wp.vec3(*config.noise_smoothing)
+        config, loop, plans = self.config, self._loop, self._plans
+        nsample, by_plant = self.plants * self.samples, (self.plants, self.samples)
         with wp.ScopedDevice(self.env.device):
-            self._low: wp.array = wp.array(space.low, dtype=float)
-            self._high: wp.array = wp.array(space.high, dtype=float)
-            self._fill: wp.array = wp.array(config.fill_action(space), dtype=float)
-            self._scale: wp.array = wp.array(factor, dtype=float)
-            self._first_deviation: wp.array = wp.array(np.diag(factor), dtype=float)
-            self._terminal, self._world_return = (wp.zeros(nworld, dtype=float) for _ in range(2))
-            self._weight: Any = wp.zeros(self._nsample, dtype=float)
-            self._summary: Any = wp.zeros((plants, 4), dtype=float)
-            self._valid, self._problem = wp.zeros(plants, dtype=bool), wp.zeros(plants, dtype=int)
-            self._seed, self._count, self._shift, self._phase = (wp.zeros(plants, dtype=int) for _ in range(4))
-            shape = (self.horizon, plants, nact)
-            self._actions, self._nominal_actions = (wp.zeros(shape, dtype=float) for _ in range(2))
-            self._world_actions: Any = wp.from_torch(loop.actions)
-            # rows of plans and samples are knots or, without knots, actions
-            if config.knots:
-                self._spline = config.knots, knots.ORDERS[config.spline]
-                rows = knots.knot_count(self.horizon, config.knots, config.spline)
-                self._plan: Any = wp.zeros((rows, plants, nact), dtype=float)
-                self._nominal: Any = wp.zeros_like(self._plan)
-                self._passed = wp.zeros(plants, dtype=int)
-            else:
-                self._spline, rows = (self.horizon, 0), self.horizon
-                self._plan, self._nominal, self._passed = self._actions, self._nominal_actions, self._shift
-            self._noise = wp.zeros((rows, self._nsample, nact), dtype=float)
-            self._samples: Any = self._world_actions
-            if config.knots or config.models > 1:
-                self._samples = wp.zeros((rows, self._nsample, nact), dtype=float)
-            self._return: Any = self._world_return if config.models == 1 else wp.zeros(self._nsample, dtype=float)
-            self._deviation, self._nominal_deviation = (
-                wp.zeros_like(self._plan) if self._update.adapts_noise else None for _ in range(2)
-            )
-        self._earned = [wp.from_torch(buffer) for buffer in (loop.reward, loop.terminated, loop.fault)]
-        by_plant = plants, self.samples
+            self._terminal = wp.zeros(self.env.nworld, dtype=float)
+            self._world_return = wp.zeros(self.env.nworld, dtype=float)
+            self._return: Any = self._world_return if config.models == 1 else wp.zeros(nsample, dtype=float)
+            self._weight = wp.zeros(nsample, dtype=float)
+            self._summary: Any = wp.zeros((self.plants, 4), dtype=float)
+            self._valid = wp.zeros(self.plants, dtype=bool)
+            self._problem = wp.zeros(self.plants, dtype=int)
+        self._rewards = [wp.from_torch(rows) for rows in (loop.reward, loop.terminated, loop.fault)]
         self._arrays = PlanSamples(
-            returns=torch_view(self._return).view(by_plant), weights=torch_view(self._weight).view(by_plant),
-            actions=torch_view(self._samples).unflatten(1, by_plant), nominal=torch_view(self._nominal),
-            plan=torch_view(self._plan), summary=torch_view(self._summary),
-            nominal_deviation=_view(self._nominal_deviation), deviation=_view(self._deviation),
-        )  # fmt: skip
-        self.actions, self.nominal, self.knot_actions = (
-            self._by_plant(torch_view(plan), 1) for plan in (self._actions, self._nominal_actions, self._plan)
+            returns=torch_view(self._return).view(by_plant),
+            weights=torch_view(self._weight).view(by_plant),
+            actions=torch_view(plans.samples).unflatten(1, by_plant),
+            nominal=torch_view(plans.nominal),
+            plan=torch_view(plans.plan),
+            nominal_deviation=None if plans.nominal_deviation is None else torch_view(plans.nominal_deviation),
+            deviation=None if plans.deviation is None else torch_view(plans.deviation),
+            summary=torch_view(self._summary),
         )
-        self.standard_noise = self._by_plant(torch_view(self._noise).unflatten(1, by_plant), 1)
-        self.sampled = self._by_plant(loop.actions[:, :: config.models].unflatten(1, by_plant), 1)
-        deviation = self._arrays.deviation
-        self.adapted_noise = None if deviation is None else self._by_plant(deviation, 1)
-        model_returns = torch_view(self._world_return).view(*by_plant, config.models)
-        self.returns, self.weights, self.model_returns = (
-            self._by_plant(rows, 0) for rows in (self._arrays.returns, self._arrays.weights, model_returns)
-        )
-        self._action = self.actions[0]
-        self._terminal_view, self._shift_view = torch_view(self._terminal), torch_view(self._shift)
+        self._update.prepare(self._arrays)
+        # with one plant, the public buffers have no axis for plants
+        self.actions = torch_view(plans.actions).squeeze(1)
+        self.nominal = torch_view(plans.nominal_actions).squeeze(1)
+        self.knot_actions = self._arrays.plan.squeeze(1)
+        self.standard_noise = torch_view(plans.noise).unflatten(1, by_plant).squeeze(1)
+        self.adapted_noise = None if plans.deviation is None else torch_view(plans.deviation).squeeze(1)
+        self.sampled = loop.actions[:, :: config.models].unflatten(1, by_plant).squeeze(1)
+        self.returns = self._arrays.returns.squeeze(0)
+        self.weights = self._arrays.weights.squeeze(0)
+        self.model_returns = torch_view(self._world_return).view(*by_plant, config.models).squeeze(0)
+        self._action, self._shift = self.actions[0], torch_view(plans.shift)
         self._problems = torch_view(self._problem)
         if self._problems.is_cuda:
-            self._copied_problems = torch.zeros(plants, dtype=torch.int32, pin_memory=True)
+            self._copied_problems = torch.zeros(self.plants, dtype=torch.int32, pin_memory=True)
             self._copied = torch.cuda.Event()
-
-    def _by_plant(self, rows: torch.Tensor, axis: int) -> torch.Tensor:
-        return rows.squeeze(axis) if self.plants == 1 else rows
 
     @torch.no_grad()
     def __call__(self, state: torch.Tensor, obs: torch.Tensor | None = None, *, shift: int = 1) -> torch.Tensor:
@@ -344,7 +298,7 @@ class Planner:
         """
         self.env.check_process()
         self._loop.state.copy_(self._checked(state))
-        self._shift_view.fill_(whole_number("shift", shift, low=0))
+        self._shift.fill_(whole_number("shift", shift, low=0))
         for call in self._calls:
             call()
         action = self._action.to(state.device, copy=True)
@@ -354,17 +308,14 @@ class Planner:
     def _checked(self, state: torch.Tensor) -> torch.Tensor:
         """Check the state of each plant; with one plant, return a state without the axis for plants."""
         like = self._loop.state
-        if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == 1 and like.ndim == 1:
+        if isinstance(state, torch.Tensor) and state.ndim == 2 and len(state) == self.plants == 1:
             state = state[0]
         if not isinstance(state, torch.Tensor) or state.shape != like.shape or state.dtype != like.dtype:
-            call = "plan.state_of(qpos=..., qvel=...)"
-            if like.ndim == 1:
-                which, hint = "a state", f"make it from its parts with {call}"
-            else:
-                which, hint = "the states", f"stack one {call} for each plant"
             raise ValueError(
-                f"{which} to plan from must be {described(like)}, not {described(state)}: call env.get_state() of the "
-                f"same task, or {hint}. (With fields=[...], an environment's states may be longer.)"
+                f"{'a state' if self.plants == 1 else 'the states'} to plan from must be {described(like)}, not "
+                f"{described(state)}: call env.get_state() of the same task, or make the state of each plant from its "
+                "parts with plan.state_of(qpos=..., qvel=...). (With fields=[...], an environment's states may be "
+                "longer.)"
             )
         # a check on a GPU would wait for the device; without it, a non-finite state makes every sample fail
         if state.device.type != "cpu":
@@ -372,13 +323,17 @@ class Planner:
         values = state.numpy().ravel()
         # a plan may take only a millisecond, so check with a fast dot product first
         if not np.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
-            where = int(np.flatnonzero(~finite)[0])
-            plant, column = divmod(where, self.env.state_space.size)
+            index = int(np.flatnonzero(~finite)[0])
+            plant, column = divmod(index, self.env.state_space.size)
             parts = self.env.state_space.parts.items()
             part = next(name for name, part in parts if part.start <= column < part.stop)
-            which = "the state" if like.ndim == 1 else f"the state of plant {plant}"
-            raise ValueError(f"{which} has {values[where]} in its {part!r}: pass finite states to the planner")
+            raise ValueError(
+                f"the state{self._of(plant)} has {values[index]} in its {part!r}: pass finite states to the planner"
+            )
         return state
+
+    def _of(self, plant: int) -> str:
+        return "" if self.plants == 1 else f" of plant {plant}"
 
     def _report_problems(self, *, waited: bool) -> None:
         """Report the problems of plans; without waiting for a GPU, those of earlier calls."""
@@ -402,7 +357,7 @@ class Planner:
 
     def _refuse_update(self, bits: torch.Tensor) -> None:
         name, plant = type(self._update).__name__, int(bits.argmax())
-        of = "" if self.plants == 1 else f" of plant {plant}"
+        of = self._of(plant)
         if not bits[plant] & planning.BAD_WEIGHTS:
             raise ValueError(f"fit of {name} wrote a plan or a deviation{of} that is not finite")
         weights, returns = self._arrays.weights[plant].cpu(), self._arrays.returns[plant].cpu()
@@ -433,68 +388,32 @@ class Planner:
 
     def _program(self, *, first: bool) -> Calls:
         """Return the calls of one iteration. If ``first`` is set, they also shift the plan in time."""
-        parts: list[Phase | Callable[[], None]] = [Phase("perturb", partial(self._perturb, first)), *self._loop.phases]
+        perturb = Phase("perturb", partial(self._plans.perturb, self._keys, first=first))
+        parts: list[Phase | Callable[[], None]] = [perturb, *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
         if self._update.capturable:
             parts += [Phase("weigh", self._weigh), Phase("average", self._average)]
         else:
-            parts += [
-                Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples),
-                self._fit,
-            ]  # fmt: skip
+            parts += [Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples)]
+            parts.append(self._fit)
         # combine phases into as few graphs as possible; functions that use torch run between the graphs
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
-            some: Any = list(group)
-            calls += self._loop.sequence(some) if is_phase else some
+            members: Any = list(group)
+            calls += self._loop.sequence(members) if is_phase else members
         return tuple(calls)
-
-    def _perturb(self, first: bool) -> None:
-        device = self.env.device
-        if first and self._passed is not self._shift:
-            passed = [self._shift, self.horizon, self._spline[0], self._phase, self._passed]
-            wp.launch(knots.pass_knots, self.plants, passed, device=device)
-        self._shifted(first, self._plan, self._fill, self._repeat, self._nominal)
-        self._interpolate(self._nominal, self._nominal_actions)
-        dim = (self._nsample, self._plan.shape[2])
-        wp.launch(planning.draw_noise, dim, [self._seed, self._count, self._noise], device=device)
-        wp.launch(planning.draw_keys, self.env.nworld, [self._seed, self._count, self._keys], device=device)
-        wp.launch(rollouts.add_to, self.plants, [1, self._count], device=device)
-        bounds = [self._smoothing, bool(self.config.include_plan), self._low, self._high, self._samples]
-        if self._deviation is not None and self._nominal_deviation is not None:
-            self._shifted(first, self._deviation, self._first_deviation, False, self._nominal_deviation)
-            around = [self._nominal, self._noise, self._nominal_deviation, *bounds]
-            wp.launch(planning.perturb_adapted, dim, around, device=device)
-        else:
-            around = [self._nominal, self._noise, self._scale, self._diagonal, *bounds]
-            wp.launch(planning.perturb, dim, around, device=device)
-        self._interpolate(self._samples, self._world_actions)
-
-    def _shifted(self, first: bool, rows: wp.array, fill: wp.array, repeat: bool, target: wp.array) -> None:
-        """Copy the rows of a plan. If ``first`` is set, also shift them in time."""
-        if first:
-            shifted = [rows, self._passed, fill, repeat, target]
-            wp.launch(planning.shift_plan, rows.shape, shifted, device=self.env.device)
-        else:
-            wp.copy(target, rows)
-
-    def _interpolate(self, rows: wp.array, actions: wp.array) -> None:
-        """Interpolate actions from knots; without knots, do nothing."""
-        if rows is not actions:
-            args = [rows, self._phase, *self._spline, self._low, self._high, actions]
-            wp.launch(knots.interpolate, actions.shape, args, device=self.env.device)
 
     def _add_up(self) -> None:
         config, device = self.config, self.env.device
         if self._value_kernel is not None:
             values = [wp.from_torch(self._value_obs), self._terminal]
             wp.launch(self._value_kernel, self.env.nworld, values, device=device)
-        returns = [*self._earned, self._terminal, config.discount, config.termination == "stop", self._world_return]
+        returns = [*self._rewards, self._terminal, config.discount, config.termination == "stop", self._world_return]
         wp.launch(planning.add_up, self.env.nworld, returns, device=device)
         if config.models > 1:
-            combined = [self._world_return, config.risk == "worst", self._return]
-            wp.launch(planning.combine_models, self._nsample, combined, device=device)
+            models = [self._world_return, config.risk == "worst", self._return]
+            wp.launch(planning.combine_models, len(self._return), models, device=device)
 
     def _weigh(self) -> None:
         self._add_up()
@@ -502,8 +421,9 @@ class Planner:
 
     def _average_samples(self) -> None:
         launch_blocks(planning.check_weights, self.plants, [self._return, self._weight, self._valid, self._problem])
-        plan = [self._weight, self._samples, self._nominal, self._valid, self._plan]
-        launch_blocks(planning.average, self._plan.size, plan)
+        plans = self._plans
+        args = [self._weight, plans.samples, plans.nominal, self._valid, plans.plan]
+        launch_blocks(planning.average, plans.plan.size, args)
 
     def _average(self) -> None:
         self._average_samples()
@@ -512,27 +432,27 @@ class Planner:
     def _fit(self) -> None:
         self._update.fit(self._arrays)
         if isinstance(self.config.update, PlanUpdate):
-            for before, after in ((self._nominal, self._plan), (self._nominal_deviation, self._deviation)):
+            plans = self._plans
+            for before, after in ((plans.nominal, plans.plan), (plans.nominal_deviation, plans.deviation)):
                 if after is not None:
                     args = [self._valid, before, self._problem, after]
                     wp.launch(planning.undo_bad_fit, after.shape, args, device=self.env.device)
-        self._interpolate(self._plan, self._actions)
+        self._plans.interpolate()
 
     def _weigh_in_torch(self) -> None:
         arrays = self._arrays
-        if (returned := self._update.weigh(arrays)) is not None:
+        if (result := self._update.weigh(arrays)) is not None:
             raise ValueError(
                 f"weigh of {type(self._update).__name__} must write into samples.weights and return None, not "
-                f"{described(returned)}"
+                f"{described(result)}"
             )
         good = torch.isfinite(arrays.returns)
-        earned = torch.where(good, arrays.returns, 0.0).sum(1) / good.sum(1)
+        mean = torch.where(good, arrays.returns, 0.0).sum(1) / good.sum(1)
         effective = 1 / arrays.weights.square().sum(1)
-        columns = arrays.returns.amax(1), earned, effective, (~good).sum(1).float()
-        torch.stack(columns, 1, out=arrays.summary)
+        torch.stack([arrays.returns.amax(1), mean, effective, (~good).sum(1).float()], 1, out=arrays.summary)
 
     def _evaluate(self) -> None:
-        self._terminal_view.copy_(self._torch_values())
+        torch_view(self._terminal).copy_(self._torch_values())
 
     def _torch_values(self) -> torch.Tensor:
         obs, nworld = self._value_obs, self.env.nworld
@@ -563,23 +483,15 @@ class Planner:
             if not isinstance(where, torch.Tensor) or (where.shape, where.dtype) != ((self.plants,), torch.bool):
                 raise ValueError(f"where must be a bool tensor of shape ({self.plants},), not {described(where)}")
             where = where.to(self.actions.device)
-        if seed is not None:
-            seeds = plant_seeds(seed, self.plants)
-            _put(torch_view(self._seed), torch.tensor(seeds, dtype=torch.int32, device=self.actions.device), where)
-            if where is None and self.model_fields:
-                self._draw_models(seeds[0])
-        for counter in (torch_view(self._count), torch_view(self._phase)):
-            _put(counter, torch.zeros_like(counter), where)
-        rows = None if where is None else where[:, None]
-        for plan in (self._plan, self._actions):
-            _put(torch_view(plan), torch_view(self._fill), rows)
-        if self._arrays.deviation is not None:
-            _put(self._arrays.deviation, torch_view(self._first_deviation), rows)
+        seeds = None if seed is None else plant_seeds(seed, self.plants)
+        if seeds is not None and where is None and self.model_fields:
+            self._draw_models(seeds[0])
+        self._plans.reset(seeds, where)
 
     @property
     def seeds(self) -> list[int]:
         """Return the seed of each plant's noise."""
-        return [int(seed) for seed in self._seed.numpy()]
+        return [int(seed) for seed in self._plans.seed.numpy()]
 
     def _draw_models(self, seed: int) -> None:
         """Randomize the planner's models with the task's functions. Plants use other random streams."""
@@ -635,14 +547,6 @@ class Planner:
         if self.plants == 1:
             return dict(zip(names, columns[:, 0].tolist(), strict=True))
         return {name: torch.tensor(column) for name, column in zip(names, columns, strict=True)}
-
-
-def _view(array: Any) -> torch.Tensor | None:
-    return None if array is None else torch_view(array)
-
-
-def _put(target: torch.Tensor, values: torch.Tensor, where: torch.Tensor | None) -> None:
-    target.copy_(values.expand_as(target) if where is None else torch.where(where, values, target))
 
 
 def _update_of(config: MPPIConfig) -> PlanUpdate:

@@ -117,7 +117,7 @@ def test_invalid_weights_raise_an_error_and_keep_the_plan(how: str, reason: str,
     states = plan.state_of() if plants == 1 else torch.stack([plan.state_of()] * plants)
     plan.actions.fill_(0.25)
     reason = reason.format(of="" if plants == 1 else " of plant 1")
-    with pytest.raises(ValueError, match=rf"^weigh of Wrong must .* and are 0 for failed samples: {reason}$"):
+    with pytest.raises(ValueError, match=rf"^weigh of Wrong .*: {reason}$"):
         plan(states, shift=0)
     actions = plan.actions.view(4, plants)
     assert (actions[:, -1] == 0.25).all()
@@ -127,7 +127,7 @@ def test_invalid_weights_raise_an_error_and_keep_the_plan(how: str, reason: str,
 
 def test_invalid_weights_of_an_update_in_warp_raise_an_error() -> None:
     plan = lw.Planner(update=ExponentialWeights(temperature=math.nan), **POINT)
-    with pytest.raises(ValueError, match="^weigh of ExponentialWeights must .*: the weight of sample 0 is nan"):
+    with pytest.raises(ValueError, match="^weigh of ExponentialWeights .* sample 0 is nan"):
         plan(plan.state_of())
     assert not plan.actions.any()
 
@@ -168,7 +168,7 @@ class Exploding(TorchCEM):
 
 def test_deviation_that_is_not_finite_raises_an_error_and_is_not_used() -> None:
     plan = lw.Planner(update=Exploding(3, 0.1, (1, 0, 0)), **POINT)
-    with pytest.raises(ValueError, match="^fit of Exploding wrote a plan or a deviation that is not finite$"):
+    with pytest.raises(ValueError, match="fit of Exploding .* not finite"):
         plan(plan.state_of())
     assert plan.adapted_noise is not None and (plan.adapted_noise == 1.0).all()
 
@@ -201,16 +201,16 @@ class Returning(EliteMean):
 
 def test_update_that_returns_weights_raises_an_error() -> None:
     plan = lw.Planner(update=Returning(3), **POINT)
-    with pytest.raises(ValueError, match=r"weigh of Returning must write into samples.weights and return None, not a "):
+    with pytest.raises(ValueError, match="weigh of Returning .* samples.weights"):
         plan(plan.state_of())
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ({"update": EliteMean}, "update must be 'mppi', 'cem' or 'predictive_sampling', or an object of a subclass of"),
-        ({"update": EliteMean(3), "elites": 4}, r"a setting of update='cem', not of .*EliteMean\(elites=3\)"),
-        ({"update": TorchCEM(3, 0.1, (1, 0, 0)), "noise": [[1, 0], [0, 1]]}, "must be standard deviations;"),
+        ({"update": EliteMean}, "update .* lw.PlanUpdate, not .*EliteMean"),
+        ({"update": EliteMean(3), "elites": 4}, r"update='cem', not of .*EliteMean\(elites=3\)"),
+        ({"update": TorchCEM(3, 0.1, (1, 0, 0)), "noise": [[1, 0], [0, 1]]}, "noise .* standard deviations"),
     ],
 )  # fmt: skip
 def test_invalid_user_written_update_raises_an_error(words: dict[str, Any], message: str) -> None:

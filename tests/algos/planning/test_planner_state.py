@@ -44,10 +44,9 @@ def test_state_of_computes_the_step_count_from_the_time(reach: lw.MPPI) -> None:
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"qpoz": [0.0] * 7}, "a state of 'reach' has no part 'qpoz': it has .*'qpos'"),
-        ({"qpos": [0.0] * 6}, "the part 'qpos' of a state has 7 numbers, not 6"),
-        ({"qpos": "zero"}, "the part 'qpos' of a state must be numbers, not 'zero'"),
-        ({"time": "now"}, "the part 'time' of a state must be numbers, not 'now'"),
+        ({"qpoz": [0.0] * 7}, "'qpoz': it has .*'qpos'"),
+        ({"qpos": [0.0] * 6}, "'qpos' .* 7 numbers, not 6"),
+        ({"time": "now"}, "'time' .* 'now'"),
     ],
 )
 def test_making_a_state_from_invalid_parts_raises_an_error(
@@ -76,7 +75,7 @@ def test_planning_from_a_state_of_wrong_shape_or_type_raises_an_error(point: lw.
 def test_error_of_a_non_finite_state_names_the_part(part: str, number: float, point: lw.MPPI) -> None:
     broken, before = point.state_of(), point.actions.clone()
     broken[point.env.state_space.parts[part]] = number
-    with pytest.raises(ValueError, match=f"the state has {number} in its '{part}': pass finite states"):
+    with pytest.raises(ValueError, match=f"{number} in its '{part}'"):
         point(broken)
     assert torch.equal(point.actions, before)
 
