@@ -178,61 +178,83 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         if names := _differing_names([getattr(episode, name) for episode in episodes]):
             raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
-    seconds = _joined(episode.plan_times[1:] for episode in episodes)
-    times, misses = 1000 * seconds, int((seconds > deadline).sum())
-    failed, effective = (_joined(getattr(e, name) for e in episodes) for name in ("plan_failed", "plan_effective"))
-    failed, effective = failed[np.isfinite(failed)], effective[np.isfinite(effective)]
-    samples = first.controller.get("samples")
-    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
-    ages, age_steps = (_joined(getattr(e, name) for e in episodes) for name in ("ages", "age_steps"))
-    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
-    timed = first.mode == "async"
-    returns = np.array([episode.episode_return for episode in episodes])
-    wall, steps = sum(episode.wall_seconds for episode in episodes), sum(episode.steps for episode in episodes)
-    successes = sum(episode.succeeded for episode in episodes)
-    low, high = wilson(successes, len(episodes))
     return ControlReport(
         task=first.task,
         engine=first.engine,
         mode=first.mode,
         episodes=len(episodes),
-        steps=steps,
-        plans=len(times),
-        first_plan_ms=1000 * max(float(episode.plan_times[0]) for episode in episodes),
-        plan_mean_ms=float(times.mean()) if len(times) else None,
-        plan_p50_ms=_quantile(times, 0.5, least=2),
-        plan_p90_ms=_quantile(times, 0.9, least=10),
-        plan_p99_ms=_quantile(times, 0.99, least=100),
-        plan_p99_9_ms=_quantile(times, 0.999, least=1000),
-        plan_max_ms=float(times.max()) if len(times) else None,
-        plan_jitter_ms=_std(times),
-        plans_per_second=_plans_per_second(episodes),
-        deadline_ms=1000 * deadline,
-        misses=misses,
-        miss_share=misses / len(times) if len(times) else None,
-        blind_plans=int((failed >= samples).sum()) if known else None,
-        known_plans=len(failed) if known else 0,
-        failed_share=float(failed.mean() / samples) if known else None,
-        effective_samples_mean=float(effective.mean()) if len(effective) else None,
-        tick_jitter_ms=_std(delays) if timed else None,
-        tick_delay_max_ms=float(delays.max()) if timed else None,
-        late_ticks=sum(int(episode.late.sum()) for episode in episodes) if timed else None,
-        age_mean_ms=1000 * float(ages.mean()),
-        age_max_ms=1000 * float(ages.max()),
-        age_steps_mean=float(age_steps.mean()),
-        age_steps_max=int(age_steps.max()),
-        real_time_factor=steps * first.timestep / wall,
-        episode_seconds_mean=wall / len(episodes),
-        return_mean=float(returns.mean()),
-        return_std=_std(returns),
-        eval_mean=float(np.mean([float(episode.evals[-1]) for episode in episodes])),
-        success=successes / len(episodes),
-        success_low=low,
-        success_high=high,
+        steps=sum(episode.steps for episode in episodes),
         params=first.params,
         controller=first.controller,
         versions=first.versions,
+        **_planning_times(episodes, deadline),
+        **_plan_quality(episodes),
+        **_step_times(episodes),
+        **_results(episodes),
     )
+
+
+def _planning_times(episodes: Sequence[Trajectory], deadline: float) -> dict[str, Any]:
+    times = _joined(episode.plan_times[1:] for episode in episodes)
+    milliseconds, misses = 1000 * times, int((times > deadline).sum())
+    quantiles = {"p50": (0.5, 2), "p90": (0.9, 10), "p99": (0.99, 100), "p99_9": (0.999, 1000), "max": (1.0, 1)}
+    return {
+        "plans": len(times),
+        "first_plan_ms": 1000 * max(float(episode.plan_times[0]) for episode in episodes),
+        "plan_mean_ms": _mean(milliseconds),
+        **{f"plan_{name}_ms": _quantile(milliseconds, q, least) for name, (q, least) in quantiles.items()},
+        "plan_jitter_ms": _std(milliseconds),
+        "plans_per_second": _plans_per_second(episodes),
+        "deadline_ms": 1000 * deadline,
+        "misses": misses,
+        "miss_share": misses / len(times) if len(times) else None,
+    }
+
+
+def _plan_quality(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    failed = _joined(episode.plan_failed for episode in episodes)
+    effective = _joined(episode.plan_effective for episode in episodes)
+    failed, samples = failed[np.isfinite(failed)], episodes[0].controller.get("samples")
+    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
+    return {
+        "blind_plans": int((failed >= samples).sum()) if known else None,
+        "known_plans": len(failed) if known else 0,
+        "failed_share": float(failed.mean() / samples) if known else None,
+        "effective_samples_mean": _mean(effective[np.isfinite(effective)]),
+    }
+
+
+def _step_times(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    ages, age_steps = _joined(e.ages for e in episodes), _joined(e.age_steps for e in episodes)
+    delays = 1000 * _joined(episode.times - episode.period * torch.arange(episode.steps) for episode in episodes)
+    timed = episodes[0].mode == "async"
+    return {
+        "tick_jitter_ms": _std(delays) if timed else None,
+        "tick_delay_max_ms": float(delays.max()) if timed else None,
+        "late_ticks": sum(int(episode.late.sum()) for episode in episodes) if timed else None,
+        "age_mean_ms": 1000 * float(ages.mean()),
+        "age_max_ms": 1000 * float(ages.max()),
+        "age_steps_mean": float(age_steps.mean()),
+        "age_steps_max": int(age_steps.max()),
+    }
+
+
+def _results(episodes: Sequence[Trajectory]) -> dict[str, Any]:
+    wall_seconds = sum(episode.wall_seconds for episode in episodes)
+    seconds = sum(episode.steps for episode in episodes) * episodes[0].timestep
+    returns = np.array([episode.episode_return for episode in episodes])
+    successes = sum(episode.succeeded for episode in episodes)
+    low, high = wilson(successes, len(episodes))
+    return {
+        "real_time_factor": seconds / wall_seconds,
+        "episode_seconds_mean": wall_seconds / len(episodes),
+        "return_mean": float(returns.mean()),
+        "return_std": _std(returns),
+        "eval_mean": float(np.mean([float(episode.evals[-1]) for episode in episodes])),
+        "success": successes / len(episodes),
+        "success_low": low,
+        "success_high": high,
+    }
 
 
 def _text(value: float | None, form: str, around: str = "{}", missing: str = "-") -> str:
@@ -271,8 +293,12 @@ def _std(values: np.ndarray) -> float | None:
     return float(values.std(ddof=1)) if len(values) > 1 and np.isfinite(values).all() else None
 
 
-def _quantile(times: np.ndarray, q: float, *, least: int) -> float | None:
-    return float(np.quantile(times, q)) if len(times) >= least else None
+def _mean(values: np.ndarray) -> float | None:
+    return float(values.mean()) if len(values) else None
+
+
+def _quantile(values: np.ndarray, q: float, least: int) -> float | None:
+    return float(np.quantile(values, q)) if len(values) >= least else None
 
 
 def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
