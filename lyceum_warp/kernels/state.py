@@ -5,123 +5,88 @@ other world would round that world's state to float32. Most masks are nearly emp
 ``launch_rows`` uses a single thread per world on the CPU, and at most 32 threads per world on a GPU.
 """
 
+from typing import Any
+
 import warp as wp
 
 
-@wp.kernel(enable_backward=False)
-def widen(
-    mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[wp.float64], lanes: int, first: int
-):
-    """Copy the masked rows of a float32 array into a float64 array; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = wp.float64(source_in[w, i])
+def _casts(name: str, source: Any, target: Any) -> wp.Kernel:
+    """Make a kernel that copies the masked rows of an array, cast to the target's type; launched over (nworld, lanes).
+
+    A generic kernel cannot replace these kernels, because a CPU graph confuses the overloads of a kernel.
+    """
+
+    def cast(
+        mask_in: wp.array[bool], source_in: wp.array2d[source], target_out: wp.array2d[target], lanes: int, first: int
+    ):
+        k, lane = wp.tid()
+        w = first + k
+        if mask_in[w]:
+            for i in range(lane, target_out.shape[1], lanes):
+                target_out[w, i] = target_out.dtype(source_in[w, i])
+
+    cast.__qualname__ = name
+    return wp.kernel(cast, enable_backward=False)
 
 
-@wp.kernel(enable_backward=False)
-def narrow(
-    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[float], lanes: int, first: int
-):
-    """Round the masked rows of a float64 array to float32; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = float(source_in[w, i])
+def _fills(name: str, dtype: Any) -> wp.Kernel:
+    """Make a kernel that copies one row into all masked rows; launched over (nworld, lanes)."""
+
+    def fill(
+        mask_in: wp.array[bool], source_in: wp.array[dtype], target_out: wp.array2d[dtype], lanes: int, first: int
+    ):
+        k, lane = wp.tid()
+        w = first + k
+        if mask_in[w]:
+            for i in range(lane, target_out.shape[1], lanes):
+                target_out[w, i] = source_in[i]
+
+    fill.__qualname__ = name
+    return wp.kernel(fill, enable_backward=False)
 
 
 @wp.func
-def narrow_row(source: wp.array2d[wp.float64], target: wp.array2d[float], w: int):
+def cast_row(source: wp.array2d[Any], target: wp.array2d[Any], w: int):
     for i in range(target.shape[1]):
-        target[w, i] = float(source[w, i])
+        target[w, i] = target.dtype(source[w, i])
 
 
-@wp.func
-def widen_row(source: wp.array2d[float], target: wp.array2d[wp.float64], w: int):
-    for i in range(target.shape[1]):
-        target[w, i] = wp.float64(source[w, i])
+def _casts_four(name: str, source: Any, target: Any) -> wp.Kernel:
+    """Make a kernel that copies the masked rows of four arrays, as ``_casts`` does; launched over (nworld,)."""
+
+    def cast_four(
+        mask_in: wp.array[bool],
+        source0_in: wp.array2d[source],
+        target0_out: wp.array2d[target],
+        source1_in: wp.array2d[source],
+        target1_out: wp.array2d[target],
+        source2_in: wp.array2d[source],
+        target2_out: wp.array2d[target],
+        source3_in: wp.array2d[source],
+        target3_out: wp.array2d[target],
+        first: int,
+    ):
+        w = first + wp.tid()
+        if mask_in[w]:
+            cast_row(source0_in, target0_out, w)
+            cast_row(source1_in, target1_out, w)
+            cast_row(source2_in, target2_out, w)
+            cast_row(source3_in, target3_out, w)
+
+    cast_four.__qualname__ = name
+    return wp.kernel(cast_four, enable_backward=False)
 
 
-@wp.kernel(enable_backward=False)
-def narrow_four(
-    mask_in: wp.array[bool],
-    source0_in: wp.array2d[wp.float64],
-    target0_out: wp.array2d[float],
-    source1_in: wp.array2d[wp.float64],
-    target1_out: wp.array2d[float],
-    source2_in: wp.array2d[wp.float64],
-    target2_out: wp.array2d[float],
-    source3_in: wp.array2d[wp.float64],
-    target3_out: wp.array2d[float],
-    first: int,
-):
-    """Round the masked rows of four float64 arrays to float32; launched over (nworld,) on the CPU."""
-    w = first + wp.tid()
-    if mask_in[w]:
-        narrow_row(source0_in, target0_out, w)
-        narrow_row(source1_in, target1_out, w)
-        narrow_row(source2_in, target2_out, w)
-        narrow_row(source3_in, target3_out, w)
-
-
-@wp.kernel(enable_backward=False)
-def widen_four(
-    mask_in: wp.array[bool],
-    source0_in: wp.array2d[float],
-    target0_out: wp.array2d[wp.float64],
-    source1_in: wp.array2d[float],
-    target1_out: wp.array2d[wp.float64],
-    source2_in: wp.array2d[float],
-    target2_out: wp.array2d[wp.float64],
-    source3_in: wp.array2d[float],
-    target3_out: wp.array2d[wp.float64],
-    first: int,
-):
-    """Copy the masked rows of four float32 arrays into float64 arrays; launched over (nworld,) on the CPU."""
-    w = first + wp.tid()
-    if mask_in[w]:
-        widen_row(source0_in, target0_out, w)
-        widen_row(source1_in, target1_out, w)
-        widen_row(source2_in, target2_out, w)
-        widen_row(source3_in, target3_out, w)
-
-
-@wp.kernel(enable_backward=False)
-def widen_bool(
-    mask_in: wp.array[bool], source_in: wp.array2d[bool], target_out: wp.array2d[wp.float64], lanes: int, first: int
-):
-    """Write the masked rows of booleans as 0 and 1; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = wp.where(source_in[w, i], wp.float64(1.0), wp.float64(0.0))
-
-
-@wp.kernel(enable_backward=False)
-def narrow_bool(
-    mask_in: wp.array[bool], source_in: wp.array2d[wp.float64], target_out: wp.array2d[bool], lanes: int, first: int
-):
-    """Convert masked rows of 0 and 1, which ``widen_bool`` writes, to booleans; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[w, i] != wp.float64(0.0)
-
-
-@wp.kernel(enable_backward=False)
-def copy_rows(
-    mask_in: wp.array[bool], source_in: wp.array2d[float], target_out: wp.array2d[float], lanes: int, first: int
-):
-    """Copy the masked rows of a float32 array; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[w, i]
+copy_rows = _casts("copy_rows", wp.float32, wp.float32)
+copy_rows64 = _casts("copy_rows64", wp.float64, wp.float64)
+narrow = _casts("narrow", wp.float64, wp.float32)
+narrow_bool = _casts("narrow_bool", wp.float64, wp.bool)
+narrow_four = _casts_four("narrow_four", wp.float64, wp.float32)
+widen = _casts("widen", wp.float32, wp.float64)
+widen_bool = _casts("widen_bool", wp.bool, wp.float64)
+widen_four = _casts_four("widen_four", wp.float32, wp.float64)
+fill_rows = _fills("fill_rows", wp.float32)
+fill_rows64 = _fills("fill_rows64", wp.float64)
 
 
 @wp.kernel(enable_backward=False)
@@ -140,46 +105,6 @@ def zero_columns(column_in: wp.array[int], target_out: wp.array2d[float]):
     """Set some columns to zero; launched over (nworld, columns)."""
     w, i = wp.tid()
     target_out[w, column_in[i]] = 0.0
-
-
-@wp.kernel(enable_backward=False)
-def copy_rows64(
-    mask_in: wp.array[bool],
-    source_in: wp.array2d[wp.float64],
-    target_out: wp.array2d[wp.float64],
-    lanes: int,
-    first: int,
-):
-    """Copy the masked rows of a float64 array; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[w, i]
-
-
-@wp.kernel(enable_backward=False)
-def fill_rows64(
-    mask_in: wp.array[bool], source_in: wp.array[wp.float64], target_out: wp.array2d[wp.float64], lanes: int, first: int
-):
-    """Copy one float64 row into all masked rows; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[i]
-
-
-@wp.kernel(enable_backward=False)
-def fill_rows(
-    mask_in: wp.array[bool], source_in: wp.array[float], target_out: wp.array2d[float], lanes: int, first: int
-):
-    """Copy one float32 row into all masked rows; launched over (nworld, lanes)."""
-    k, lane = wp.tid()
-    w = first + k
-    if mask_in[w]:
-        for i in range(lane, target_out.shape[1], lanes):
-            target_out[w, i] = source_in[i]
 
 
 @wp.kernel(enable_backward=False)
