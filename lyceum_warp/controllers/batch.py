@@ -49,10 +49,11 @@ def policy_episodes(
         actions: list[torch.Tensor] = []
         outcomes: list[torch.Tensor] = []
         times: list[tuple[float, float, float]] = []  # action's time, duration of the policy's call, step's end
-        lengths, reasons = (torch.zeros(env.nworld, dtype=torch.long) for _ in range(2))
+        lengths = torch.zeros(env.nworld, dtype=torch.long)
+        reasons = torch.zeros(env.nworld, dtype=torch.long)
         start = time.perf_counter()
         while not (lengths > 0).all():
-            begun = time.perf_counter()
+            called = time.perf_counter()
             env.action.copy_(policy(env.obs) if number or actions else memoryless_action(policy, env.obs))
             actions.append(env.action.cpu().clone())
             applied = time.perf_counter()
@@ -60,7 +61,7 @@ def policy_episodes(
             states.append(env.get_state().cpu())
             obs.append(env.final_obs.cpu().clone())
             outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
-            times.append((applied - start, applied - begun, time.perf_counter() - start))
+            times.append((applied - start, applied - called, time.perf_counter() - start))
             over = env.done.cpu() & (lengths == 0)
             lengths[over] = len(actions)
             reasons[over] = env.done_reason.cpu()[over].long()
@@ -68,7 +69,7 @@ def policy_episodes(
                 progress(number * env.horizon + len(actions), rounds * env.horizon)
         for world in range(min(env.nworld, episodes - number * env.nworld)):
             steps = int(lengths[world])
-            own = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
+            params = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
             rewards, evals, success = torch.stack([row[:, world] for row in outcomes[:steps]], 1)
             applied_at, policy_times, ends = torch.tensor(times[:steps], dtype=torch.float64).unbind(1)
             yield Trajectory(
@@ -83,5 +84,5 @@ def policy_episodes(
                 timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
                 done_reason=int(reasons[world]), seed=seed,
                 controller=named | {"world": env.first_world + world, "episode": number},
-                **origin | {"params": origin["params"] | own},
+                **origin | {"params": origin["params"] | params},
             )  # fmt: skip

@@ -54,7 +54,8 @@ class CheckedController:
         summary = getattr(self._controller, "summary", None)
         if not isinstance(summary, Mapping):
             return math.nan, math.nan
-        failed, effective = (float(summary.get(name, math.nan)) for name in ("failed_samples", "effective_samples"))
+        failed = float(summary.get("failed_samples", math.nan))
+        effective = float(summary.get("effective_samples", math.nan))
         # weights are undefined if all samples failed
         return failed, 0.0 if failed == getattr(self._controller, "samples", None) else effective
 
@@ -72,9 +73,9 @@ class CheckedController:
         An action is held until the controller's next step, or interpolated towards the next action if the controller
         has ``between="linear"``.
         """
-        index, rest = self.steps(plant_steps), plant_steps * self._plan_steps % self._plant_steps
-        if rest and self._linear and index < len(plan) - 1:
-            return torch.lerp(plan[index], plan[index + 1], rest / self._plant_steps)
+        index, remainder = divmod(plant_steps * self._plan_steps, self._plant_steps)
+        if remainder and self._linear and index < len(plan) - 1:
+            return torch.lerp(plan[index], plan[index + 1], remainder / self._plant_steps)
         return plan[min(index, len(plan) - 1)]
 
     def check_horizon(self, horizon: int, steps: int) -> None:
@@ -91,21 +92,21 @@ class CheckedController:
     def description(self) -> dict[str, Any]:
         """Describe the controller's name, settings, engine and device; see ``Trajectory.controller``."""
         controller = self._controller
-        found: dict[str, Any] = {"name": getattr(controller, "__name__", type(controller).__name__)}
+        description: dict[str, Any] = {"name": getattr(controller, "__name__", type(controller).__name__)}
         if (samples := getattr(controller, "samples", None)) is not None:
-            found["samples"] = samples
+            description["samples"] = samples
         if isinstance(settings := getattr(controller, "settings", None), Mapping):
-            found |= settings
+            description |= settings
         if isinstance(env := getattr(controller, "env", None), Env):
-            found |= {"engine": env.engine.name, "device": env.device.alias}
+            description |= {"engine": env.engine.name, "device": env.device.alias}
         # make the types equal to those in a loaded file
-        return dict(json.loads(json.dumps(found, default=str)))
+        return dict(json.loads(json.dumps(description, default=str)))
 
     def _checked(self, value: Any, ndim: int, step: int) -> torch.Tensor:
         nu, axes = len(self._names), tuple(value.shape) if isinstance(value, torch.Tensor) else ()
         if len(axes) != ndim or axes[-1] != nu or axes[0] == 0:
-            wanted = f"return an action of shape ({nu},)" if ndim == 1 else f"have actions of shape (horizon, {nu})"
-            raise ValueError(f"a controller must {wanted}, not {described(value)}")
+            rule = f"return an action of shape ({nu},)" if ndim == 1 else f"have actions of shape (horizon, {nu})"
+            raise ValueError(f"a controller must {rule}, not {described(value)}")
         plan: torch.Tensor = value.detach().to("cpu", torch.float32, copy=True)  # the next call may overwrite the plan
         if not (finite := torch.isfinite(plan)).all():
             where = (~finite).nonzero()[0].tolist()

@@ -97,7 +97,8 @@ class EpisodeCollector:
         self, env: Env, controller: CheckedController, *, mode: str, period: float, seed: int | None,
         now: Callable[[], float] = time.perf_counter,
     ) -> None:  # fmt: skip
-        self.env, self.mode, self.period, self.seed = env, mode, period, seed
+        self.env, self.seed = env, seed
+        self.mode, self.period = mode, period
         self.controller = controller.description()
         self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
         self.times: list[float] = []
@@ -132,8 +133,8 @@ class EpisodeCollector:
         self.obs.append(env.final_obs[0].clone())
         self._outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
         if on_step is not None:
-            _, plan, age, _ = self._applied[-1]
             step, outcome = len(self._outcomes), self._outcomes[-1]
+            plan, age = self._applied[-1][1:3]
             on_step(ControlProgress(step, self.elapsed(), *outcome, plan.seconds, age, plan.index + 1))
 
     def abort(self, on_abort: OnAbort | None, wall_seconds: float) -> None:
@@ -145,16 +146,16 @@ class EpisodeCollector:
         """Return a trajectory with all complete steps."""
         steps = len(self._outcomes)  # an interrupted step has no outcome, so omit it
         rewards, evals, success = zip(*self._outcomes, strict=True)
-        actions, applied, ages, late = zip(*self._applied[:steps], strict=True)
-        plan_steps, *plans = zip(*self._plans, strict=True)
-        plan_starts, plan_times, failed, effective = (torch.tensor(column, dtype=torch.float64) for column in plans)
+        actions, plans, ages, late = zip(*self._applied[:steps], strict=True)
+        plan_steps, *columns = zip(*self._plans, strict=True)
+        times = torch.tensor(columns, dtype=torch.float64)
         return Trajectory(
             states=torch.stack(self.states[: steps + 1]).cpu(), obs=torch.stack(self.obs[: steps + 1]).cpu(),
             actions=torch.stack(actions).cpu(), rewards=torch.tensor(rewards), evals=torch.tensor(evals),
             success=torch.tensor(success), times=torch.tensor(self.times[:steps], dtype=torch.float64),
             ages=torch.tensor(ages, dtype=torch.float64), late=torch.tensor(late),
-            plan_of=torch.tensor([plan.index for plan in applied]), plan_steps=torch.tensor(plan_steps),
-            plan_starts=plan_starts, plan_times=plan_times, plan_failed=failed, plan_effective=effective,
+            plan_of=torch.tensor([plan.index for plan in plans]), plan_steps=torch.tensor(plan_steps),
+            plan_starts=times[0], plan_times=times[1], plan_failed=times[2], plan_effective=times[3],
             timestep=self.env.timestep, period=self.period, wall_seconds=wall_seconds, mode=self.mode,
             done_reason=done_reason, seed=self.seed, controller=self.controller, **provenance(self.env),
         )  # fmt: skip

@@ -242,8 +242,8 @@ class PlannerThread:
         self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool,
         predictor: Predictor | None = None,
     ) -> None:  # fmt: skip
-        self._predictor = predictor
-        self._controller, self._clock, self._seed, self._first, self._reset = controller, clock, seed, first, reset
+        self._controller, self._predictor, self._clock = controller, predictor, clock
+        self._seed, self._first, self._reset = seed, first, reset
         self._plans: list[TimedPlan] = []
         self._qualities: dict[int, tuple[float, float]] = {}
         self._error: BaseException | None = None

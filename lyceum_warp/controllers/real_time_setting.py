@@ -53,11 +53,11 @@ class RealTimeChoice:
         return max(1, math.ceil(self.planning_time / (SHARE * self.deadline)))
 
     def __str__(self) -> str:
-        found = f"{self.setting}: {_ms(self.planning_time)} of {_ms(self.deadline)}"
+        text = f"{self.setting}: {_ms(self.planning_time)} of {_ms(self.deadline)}"
         if self.replan_every > 1:
             every = _ms(self.replan_every * self.deadline)
-            return f"no setting meets the deadline; {found}, so there is a plan every {every}"
-        return found if self.larger is None else f"{found}; {self.larger[0]} would take {_ms(self.larger[1])}"
+            return f"no setting meets the deadline; {text}, so there is a plan every {every}"
+        return text if self.larger is None else f"{text}; {self.larger[0]} would take {_ms(self.larger[1])}"
 
 
 def choose_setting(
@@ -72,27 +72,27 @@ def choose_setting(
 
     If even the smallest number of samples is too slow, try shorter horizons, and then other physics options.
     """
-    budget, missed = SHARE * deadline, []
+    budget, misses = SHARE * deadline, []
     for name in physics:
         for horizon in horizons:
             times: dict[int, float] = {}
-            low, high, tried = -1, len(samples), 0  # samples[low] meets the deadline, samples[high] does not
+            low, high, index = -1, len(samples), 0  # samples[low] meets the deadline, samples[high] does not
             while high - low > 1:
-                setting = RealTimeSetting(samples[tried], horizon, name)
-                found = times[samples[tried]] = measure(setting)
-                if found > budget:
-                    high = tried
-                    missed.append(RealTimeChoice(setting, found, deadline, None))
+                setting = RealTimeSetting(samples[index], horizon, name)
+                seconds = times[samples[index]] = measure(setting)
+                if seconds > budget:
+                    high = index
+                    misses.append(RealTimeChoice(setting, seconds, deadline, None))
                 else:
-                    low = tried
+                    low = index
                 # the planning time grows at most in proportion to the number of samples
-                reachable = bisect.bisect(samples, samples[tried] * budget / found) - 1
-                tried = min(max(reachable, low + 1), high - 1)
+                reachable = bisect.bisect(samples, samples[index] * budget / seconds) - 1
+                index = min(max(reachable, low + 1), high - 1)
             if low >= 0:
                 larger = None if high == len(samples) else (samples[high], times[samples[high]])
                 setting = RealTimeSetting(samples[low], horizon, name)
                 return RealTimeChoice(setting, times[setting.samples], deadline, larger)
-    return min(missed, key=lambda choice: choice.planning_time)
+    return min(misses, key=lambda choice: choice.planning_time)
 
 
 def planning_time(plant: Env, planner: Controller) -> float:

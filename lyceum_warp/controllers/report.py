@@ -215,11 +215,11 @@ def _plan_quality(episodes: Sequence[Trajectory]) -> dict[str, Any]:
     failed = _joined(episode.plan_failed for episode in episodes)
     effective = _joined(episode.plan_effective for episode in episodes)
     failed, samples = failed[np.isfinite(failed)], episodes[0].controller.get("samples")
-    known = isinstance(samples, int) and samples > 0 and len(failed) > 0
+    counts = isinstance(samples, int) and samples > 0 and len(failed) > 0
     return {
-        "blind_plans": int((failed >= samples).sum()) if known else None,
-        "known_plans": len(failed) if known else 0,
-        "failed_share": float(failed.mean() / samples) if known else None,
+        "blind_plans": int((failed >= samples).sum()) if counts else None,
+        "known_plans": len(failed) if counts else 0,
+        "failed_share": float(failed.mean() / samples) if counts else None,
         "effective_samples_mean": _mean(effective[np.isfinite(effective)]),
     }
 
@@ -281,8 +281,8 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     share = successes / trials
     middle = share + z * z / (2 * trials)
     spread = z * math.sqrt(share * (1 - share) / trials + z * z / (4 * trials * trials))
-    low, high = ((middle + sign * spread) / (1 + z * z / trials) for sign in (-1, 1))
-    return max(0.0, low), min(1.0, high)
+    width = 1 + z * z / trials
+    return max(0.0, (middle - spread) / width), min(1.0, (middle + spread) / width)
 
 
 def _joined(parts: Iterable[torch.Tensor]) -> np.ndarray:

@@ -27,15 +27,15 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
-        episodes[path] = other = Trajectory.load(path)
-        first, one = next(iter(episodes.items()))
-        if other.task != one.task:
+        episodes[path] = episode = Trajectory.load(path)
+        first_path, first = next(iter(episodes.items()))
+        if episode.task != first.task:
             raise ValueError(
-                f"{path} is an episode of the task {other.task!r}, but {first} is an episode of the task {one.task!r}: "
-                "load the files separately"
+                f"{path} is an episode of the task {episode.task!r}, but {first_path} is an episode of the task "
+                f"{first.task!r}: load the files separately"
             )
-        if difference := _difference(one.state_parts, other.state_parts):
-            raise ValueError(f"{path} has a different model than {first}: its states have {difference}")
+        if difference := _difference(first.state_parts, episode.state_parts):
+            raise ValueError(f"{path} has a different model than {first_path}: its states have {difference}")
     if not episodes:
         raise ValueError("there is no episode to load: pass at least one file")
     return episodes
@@ -67,11 +67,11 @@ def episode_env(
     if isinstance(episodes, Trajectory):
         episodes = {Path("the episode"): episodes}
     path, first = next(iter(episodes.items()))
-    chosen = _task(path, first, task)
-    words = {"autoreset": False, "nthread": 1, **first.source.get("options", {})}
-    words |= {name: first.params[name] for name in first.source.get("params", ())}
+    definition = _task(path, first, task)
+    kwargs = {"autoreset": False, "nthread": 1, **first.source.get("options", {})}
+    kwargs |= {name: first.params[name] for name in first.source.get("params", ())}
     try:
-        env = Env(chosen, **words | changes)
+        env = Env(definition, **kwargs | changes)
     except (ValueError, TypeError, FileNotFoundError) as error:
         kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
         raise kind(f"{path} cannot be shown: {error}") from error
@@ -85,8 +85,8 @@ def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode
     """Check that an environment accepts the states of an episode."""
     if episode.task != env.task.name:
         raise ValueError(f"{name} is an episode of the task {episode.task!r}, not of the task {env.task.name!r}")
-    now = {part: [place.start, place.stop] for part, place in env.state_space.parts.items()}
-    if difference := _difference(episode.state_parts, now):
+    parts = {part: [place.start, place.stop] for part, place in env.state_space.parts.items()}
+    if difference := _difference(episode.state_parts, parts):
         raise ValueError(
             f"{name} does not fit the current task {episode.task!r}, whose states have {difference}: the task or its "
             "model has changed, or options such as dynamics are missing"
@@ -94,34 +94,29 @@ def check_episode(env: Env, episode: Trajectory, name: str | Path = "the episode
 
 
 def _files(paths: Iterable[str | Path]) -> list[Path]:
-    found: list[Path] = []
+    files: list[Path] = []
     for path in map(Path, paths):
-        if path.is_dir():
-            inside = sorted(path.glob("*.npz"))
-            if not inside:
-                raise FileNotFoundError(f"there is no episode in the folder {path}: it contains no .npz file")
-            found += inside
-        elif not path.exists():
+        if not path.exists():
             raise FileNotFoundError(f"there is no file {path}")
-        else:
-            found.append(path)
-    return found
+        members = sorted(path.glob("*.npz")) if path.is_dir() else [path]
+        if not members:
+            raise FileNotFoundError(f"there is no episode in the folder {path}: it contains no .npz file")
+        files += members
+    return files
 
 
-def _difference(wanted: Mapping[str, Sequence[int]], found: Mapping[str, Sequence[int]]) -> str:
-    """Describe how two state layouts differ, such as "qpos of 7 numbers, not 9", or return ""."""
-    for name in {**wanted, **found}:
-        one, other = (parts[name][1] - parts[name][0] if name in parts else None for parts in (wanted, found))
-        if one != other:
-            return f"no {name}" if other is None else f"{name} of {other} numbers, not {one or 0}"
-    if list(wanted) != list(found) or any(list(wanted[name]) != list(found[name]) for name in wanted):
-        return "their parts in another order"
-    return ""
+def _difference(first: Mapping[str, Sequence[int]], second: Mapping[str, Sequence[int]]) -> str:
+    """Describe how a second state layout differs from the first, such as "qpos of 7 numbers, not 9", or return ""."""
+    for name in {**first, **second}:
+        sizes = [parts[name][1] - parts[name][0] if name in parts else None for parts in (first, second)]
+        if sizes[0] != sizes[1]:
+            return f"no {name}" if sizes[1] is None else f"{name} of {sizes[1]} numbers, not {sizes[0] or 0}"
+    return "" if list(first.items()) == list(second.items()) else "their parts in another order"
 
 
-def _task(path: Path, episode: Trajectory, given: str | Path | type[Task] | None) -> type[Task]:
-    if given is not None:
-        return find_task(given)
+def _task(path: Path, episode: Trajectory, task: str | Path | type[Task] | None) -> type[Task]:
+    if task is not None:
+        return find_task(task)
     spelled = episode.source.get("task", episode.task if "task" not in episode.source else None)
     advice = f"pass a file that defines the task of {path}"
     if spelled is None:

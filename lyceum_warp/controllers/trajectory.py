@@ -186,8 +186,7 @@ class Trajectory:
         path = Path(path)
         try:
             with np.load(path, allow_pickle=False) as file:
-                # earlier releases have no "source"
-                info = {"source": {}, **json.loads(str(file["info"]))}
+                info = json.loads(str(file["info"]))
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
@@ -217,8 +216,8 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
 def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
     for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
         for part, place in scalars[name].items():
-            whole = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
-            if not whole or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
+            pair = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
+            if not pair or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
                 raise ValueError(f"{name} has {place!r} as the columns of {part!r}")
     source = scalars["source"]
     for name, kind in {"task": str | None, "params": list, "options": dict}.items():

@@ -54,18 +54,6 @@ def test_episode_env_restores_and_continues_episodes(folder: Path) -> None:
     assert episode_env(loaded, horizon=7).horizon == 7
 
 
-def test_episode_files_of_earlier_releases_are_loaded(folder: Path, tmp_path: Path) -> None:
-    path = lw.control(lw.make("point_mass", autoreset=False, horizon=5), towards).save(tmp_path / "old.npz")
-    with np.load(path) as file:
-        arrays = dict(file)
-    info = json.loads(str(arrays.pop("info")))
-    del info["source"]
-    np.savez(path, **arrays, info=np.array(json.dumps(info)))
-    old = load_episodes(path)
-    assert old[path].source == {}
-    check_episode(episode_env(old), old[path])
-
-
 def test_episode_env_finds_the_task_file(task_file: TaskFile, tmp_path: Path) -> None:
     file = task_file("tiny_of_episodes.py", TINY)
     env = lw.make(f"{file}:Tiny", autoreset=False, horizon=3)
