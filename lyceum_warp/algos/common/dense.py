@@ -22,9 +22,9 @@ def _elu_(x: _Array) -> None:
     np.copyto(x, np.expm1(x), where=x < 0.0)
 
 
-_tanh_slope, _relu_slope, _elu_slope = (
-    getattr(torch.ops.aten, f"{name}_backward").grad_input for name in ("tanh", "threshold", "elu")
-)
+_tanh_slope = torch.ops.aten.tanh_backward.grad_input
+_relu_slope = torch.ops.aten.threshold_backward.grad_input
+_elu_slope = torch.ops.aten.elu_backward.grad_input
 
 # NumPy's tanh is several times as fast as torch's on some processors
 _ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[torch.Tensor, torch.Tensor], Any]]] = {
@@ -164,8 +164,8 @@ class DensePolicy(GaussianPolicy):
 
 def dense_policy(policy: GaussianPolicy) -> GaussianPolicy:
     """Return a ``DensePolicy``, or the policy itself if its class or its network is not supported."""
-    learned = all(parameter.requires_grad for parameter in policy.network.parameters())
-    plain = type(policy) is GaussianPolicy and policy.mirror is None and learned
+    trainable = all(parameter.requires_grad for parameter in policy.network.parameters())
+    plain = type(policy) is GaussianPolicy and policy.mirror is None and trainable
     passes = DensePasses.of(policy.network) if plain else None
     return policy if passes is None else DensePolicy(policy, passes)
 

@@ -22,7 +22,8 @@ class Team:
     """
 
     def __init__(self, rank: int = 0, size: int = 1, device: str | None = None, neighbours: int = 1) -> None:
-        self.rank, self.size, self.device, self.neighbours = rank, size, device, neighbours
+        self.rank, self.size = rank, size
+        self.device, self.neighbours = device, neighbours
         self._graphs: weakref.WeakSet[torch.cuda.CUDAGraph] = weakref.WeakSet()
 
     @property
@@ -70,8 +71,8 @@ class Team:
             The indices, and a mask of this process's samples. Samples of other processes get the index 0.
         """
         step, world = index // (nworld * self.size), index % (nworld * self.size) - self.rank * nworld
-        own = (world >= 0) & (world < nworld)
-        return (step * nworld + world).masked_fill(~own, 0), own
+        local = (world >= 0) & (world < nworld)
+        return (step * nworld + world).masked_fill(~local, 0), local
 
     def sum(self, tensor: torch.Tensor) -> torch.Tensor:
         """Sum a tensor over the processes, in place."""
@@ -83,17 +84,17 @@ class Team:
         """Compute the elementwise maximum over the processes."""
         if self.size == 1:
             return numbers
-        whole = torch.tensor(numbers, device=self.device)
-        distributed.all_reduce(whole, distributed.ReduceOp.MAX)
-        return tuple(whole.tolist())
+        maxima = torch.tensor(numbers, device=self.device)
+        distributed.all_reduce(maxima, distributed.ReduceOp.MAX)
+        return tuple(maxima.tolist())
 
     def gather(self, part: torch.Tensor) -> torch.Tensor:
         """Concatenate the tensors (n, ...) of all processes into a tensor (size * n, ...)."""
         if self.size == 1:
             return part
-        whole = part.new_empty(self.size * part.shape[0], *part.shape[1:])
-        distributed.all_gather(list(whole.chunk(self.size)), part.contiguous())
-        return whole
+        rows = part.new_empty(self.size * part.shape[0], *part.shape[1:])
+        distributed.all_gather(list(rows.chunk(self.size)), part.contiguous())
+        return rows
 
     @torch.no_grad()
     def copy_leader(self, tensors: Iterable[torch.Tensor]) -> None:

@@ -53,13 +53,13 @@ class Episodes:
 
     def select(self, rows: Any) -> "Episodes":
         """Select episodes by an index, a slice or a mask, (episodes,) bool."""
-        parts = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        curriculum = dataclasses.replace(
-            self.curriculum, lasting={name: values[rows] for name, values in self.curriculum.lasting.items()}
+        lasting = {name: values[rows] for name, values in self.curriculum.lasting.items()}
+        tensors = {name: part[rows] for name, part in vars(self).items() if isinstance(part, torch.Tensor)}
+        return Episodes(
+            **tensors,
+            metrics={name: sums[rows] for name, sums in self.metrics.items()},
+            curriculum=dataclasses.replace(self.curriculum, lasting=lasting),
         )
-        metrics = {name: sums[rows] for name, sums in self.metrics.items()}
-        tensors = {name: part[rows] for name, part in parts.items() if isinstance(part, torch.Tensor)}
-        return Episodes(**tensors, metrics=metrics, curriculum=curriculum)
 
     @property
     def step_metrics(self) -> dict[str, torch.Tensor]:
@@ -125,11 +125,12 @@ def evaluate(
         for t in _play(env, act, part):
             if progress is not None:
                 progress(number * env.horizon + t, each * env.horizon)
-    returns, lengths, rewards, evals, success, terminated, *sums = results.flatten(1).cpu()
-    named = dict(zip(env.episode_metrics, sums, strict=True))
+    columns = results.flatten(1).cpu()
+    metrics = dict(zip(env.episode_metrics, columns[6:], strict=True))
     lasting = {name: torch.cat([start[name] for start in starts]) for name in env.task.curriculum}
-    begun = Curriculum(shared={name: memory.cpu().clone() for name, memory in env.shared.items()}, lasting=lasting)
-    return Episodes(returns, lengths, rewards, evals, success, terminated, named, begun)
+    start = Curriculum(shared={name: memory.cpu().clone() for name, memory in env.shared.items()}, lasting=lasting)
+    names = ("returns", "lengths", "rewards", "evals", "success", "terminated")
+    return Episodes(**dict(zip(names, columns[:6], strict=True)), metrics=metrics, curriculum=start)
 
 
 def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.Tensor) -> Iterator[int]:
@@ -181,14 +182,15 @@ class MeanPolicyEvaluation:
     """
 
     def __init__(self, env: Env, config: Any, team: Team) -> None:
-        self.env, self.every, self.episodes, self.team = env, config.mean_every, config.mean_episodes, team
+        self.env, self.team = env, team
+        self.every, self.episodes = config.mean_every, config.mean_episodes
         self._few: Env | None = None
 
     def added(self, statistics: Mapping[str, Any], policy: torch.nn.Module, iteration: int) -> dict[str, Any]:
         """Evaluate the policy if due, and add the results to the statistics; otherwise, the results are None."""
-        found: dict[str, Any] = dict.fromkeys(_MEAN_STATISTICS)
+        results: dict[str, Any] = dict.fromkeys(_MEAN_STATISTICS)
         if self.every > 0 and iteration % self.every == 0:
-            means = torch.zeros(len(found), dtype=torch.float64, device=self.env.obs.device)
+            means = torch.zeros(len(results), dtype=torch.float64, device=self.env.obs.device)
             if self.team.leads:
                 if self._few is None:
                     self._few = evaluation_worlds(self.env, self.episodes)
@@ -200,6 +202,6 @@ class MeanPolicyEvaluation:
                 parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
                 means.copy_(torch.stack([part.mean() for part in parts]))
             self.team.copy_leader([means])
-            found = dict(zip(found, means.tolist(), strict=True))
+            results = dict(zip(results, means.tolist(), strict=True))
         success = self.env.task.functions["success"] is not None
-        return {**statistics, **found} | ({} if success else {"success": math.nan, "mean_success": None})
+        return {**statistics, **results} | ({} if success else {"success": math.nan, "mean_success": None})

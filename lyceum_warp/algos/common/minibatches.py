@@ -35,7 +35,8 @@ class Minibatches:
         self, learn: Callable[[Samples, torch.Tensor], None], *, steps: int, nworld: int, count: int, team: Team,
         device: torch.device,
     ) -> None:  # fmt: skip
-        self.learn, self.nworld, self.count, self.team = learn, nworld, count, team
+        self.learn, self.team = learn, team
+        self.nworld, self.count = nworld, count
         self.samples = steps * nworld * team.size
         self.batch = self.samples // count
         self.room = room(self.batch, team)
@@ -52,12 +53,12 @@ class Minibatches:
         have the same state in every process.
         """
         order = torch.randperm(self.samples, generator=generator, device=self.weight.device)
-        places, own = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
+        places, local = self.team.locate(order[: self.count * self.batch].view(self.count, self.batch), self.nworld)
         if self.room < self.batch:  # put this process's samples first
-            first = own.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
-            places, own = places.gather(1, first), own.gather(1, first)
+            first = local.byte().argsort(dim=1, descending=True, stable=True)[:, : self.room]
+            places, local = places.gather(1, first), local.gather(1, first)
         self.order.copy_(places.flatten())
-        torch.mul(own, 1.0 / self.batch, out=self.weight)
+        torch.mul(local, 1.0 / self.batch, out=self.weight)
         for name, part in samples.items():
             rows = part.flatten(0, 1)
             if name not in self._parts:

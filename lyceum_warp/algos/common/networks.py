@@ -33,8 +33,8 @@ def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
     """
     needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and needed > free:
-        given = ", ".join(f"{name}={value}" for name, value in arguments.items())
-        raise ValueError(f"a network of {given} needs {needed / 1e9:.3g} GB, but only {free / 1e9:.3g} GB are free")
+        network = ", ".join(f"{name}={value}" for name, value in arguments.items())
+        raise ValueError(f"a network of {network} needs {needed / 1e9:.3g} GB, but only {free / 1e9:.3g} GB are free")
 
 
 def mlp(
@@ -144,7 +144,8 @@ class Normalizer(nn.Module):
         if not count:
             ordered, count = obs.sort(0).values, len(obs)
             trimmed = min(max(1, int(_TRIMMED * count)), (count - 1) // 2)
-            low, high = (team.sum(ordered[i].clone()) / team.size for i in (trimmed, count - 1 - trimmed))
+            low = team.sum(ordered[trimmed].clone()) / team.size
+            high = team.sum(ordered[count - 1 - trimmed].clone()) / team.size
             mean, square = (low + high) / 2.0, count * ((high - low) / 4.0).square()
         reach = _OUTLIER * ((square + _PRIOR) * (1.0 / (count + _PRIOR))).sqrt()
         return mean - reach, mean + reach

@@ -126,9 +126,9 @@ class Replay:
         torch.cat([*env.obs_groups.values(), env.action.nan_to_num(0.0, 0.0, 0.0)], dim=1, out=self._before[row])
         env.step()
         torch.cat(list(env.final_obs_groups.values()), dim=1, out=self._after[row])
-        for own, source in ((self.reward, env.reward), (self.terminated, env.terminated),
-                            (self.truncated, env.truncated)):  # fmt: skip
-            own[row].copy_(source)
+        self.reward[row].copy_(env.reward)
+        self.terminated[row].copy_(env.terminated)
+        self.truncated[row].copy_(env.truncated)
         self._set_stored(self.stored + 1)
 
     def sample(
@@ -175,10 +175,11 @@ class Replay:
             last = torch.where(going, (self._oldest + age + k) % self.steps * n + world, last)
             reward = reward + torch.where(going, gamma**k * self.reward.view(-1)[last], 0.0)
             discount = torch.where(going, gamma ** (k + 1), discount)
-        before, after = (rows.flatten(0, 1)[place] for rows, place in ((self._before, first), (self._after, last)))
+        before = self._before.flatten(0, 1)[first]
         return Transitions(
             obs=self._groups(before), action=before[:, sum(self._sizes) :], reward=reward,
-            discount=discount.masked_fill(self.terminated.view(-1)[last], 0.0), next_obs=self._groups(after),
+            discount=discount.masked_fill(self.terminated.view(-1)[last], 0.0),
+            next_obs=self._groups(self._after.flatten(0, 1)[last]),
         )  # fmt: skip
 
     def _groups(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -215,13 +216,9 @@ class Replay:
             ValueError: The state belongs to a buffer of a different size.
         """
         rows, stored = state["rows"], state["stored"]
-        sizes = {name: tuple(part.shape[1:]) for name, part in rows.items()}
-        own = {name: tuple(array.shape[1:]) for name, array in self._arrays().items()}
-        if sizes != own or len(rows["reward"]) != min(stored, self.steps):
-            raise ValueError(
-                f"the state has {len(rows['reward'])} steps of the sizes {sizes}, but this replay buffer holds "
-                f"{min(stored, self.steps)} steps of the sizes {own}"
-            )
+        shapes = {name: (min(stored, self.steps), *array.shape[1:]) for name, array in self._arrays().items()}
+        if (state_shapes := {name: tuple(part.shape) for name, part in rows.items()}) != shapes:
+            raise ValueError(f"the state's rows have the shapes {state_shapes}, but this replay buffer needs {shapes}")
         self.set_rows(stored - len(rows["reward"]), rows)
         self.restore(stored)
 
@@ -237,8 +234,10 @@ class Replay:
 
 def default_capacity(env: Env, processes: int = 1) -> int:
     """Compute the default capacity, in transitions, of each process's replay buffer."""
-    wanted, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
-    return wanted if free is None else max(min(wanted, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
+    capacity, free = max(-(-_TRANSITIONS // processes), _STEPS * env.nworld), free_memory(env.device)
+    if free is None:
+        return capacity
+    return max(min(capacity, int(_SHARE * free) // _transition_bytes(env)), env.nworld)
 
 
 def _transition_bytes(env: Env) -> int:

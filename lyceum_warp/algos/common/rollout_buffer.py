@@ -107,10 +107,10 @@ class Rollout:
                 self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
         self.metrics, self.episode_metrics = {}, {}
         if env.metrics:
-            self.metrics, self.episode_metrics = (
-                dict(zip(env.metrics, self._stored(source, self._rows_after).unbind(-1), strict=True))
-                for source in (torch_view(env.worlds.metrics), env.episode_metric_sums)
-            )
+            steps_of = self._stored(torch_view(env.worlds.metrics), self._rows_after)
+            sums_of = self._stored(env.episode_metric_sums, self._rows_after)
+            self.metrics = dict(zip(env.metrics, steps_of.unbind(-1), strict=True))
+            self.episode_metrics = dict(zip(env.metrics, sums_of.unbind(-1), strict=True))
         inputs = (env.obs, env.action, env.episode_step)
         outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
@@ -195,8 +195,8 @@ class Rollout:
         began = team.gather((env.episode_step < self.steps).int())
         order = torch.rand(len(began), generator=generator, device=began.device) + 2.0 * began
         rank = order.argsort(stable=True).argsort()
-        chosen = (rank < least - began.sum()) & (began == 0)
-        mask = chosen[team.rank * env.nworld :][: env.nworld]
+        restarts = (rank < least - began.sum()) & (began == 0)
+        mask = restarts[team.rank * env.nworld :][: env.nworld]
         env.rand_reset(mask=mask)
         self.running_return.masked_fill_(mask, 0.0)
 
@@ -208,7 +208,7 @@ class Rollout:
             rows[name] = obs, self.env.obs_spaces[group].parts
         texts = []
         for name, (values, parts) in rows.items():
-            t, world, column = (int(i) for i in np.unravel_index(int(values.abs().argmax()), values.shape))
+            t, world, column = map(int, np.unravel_index(int(values.abs().argmax()), values.shape))
             part = "".join(f" in {part!r}" for part, columns in parts.items() if columns.start <= column < columns.stop)
             where = f"in step {t + 1} of world {self.env.first_world + world}"
             texts.append(f"the largest {name} is {values[t, world, column]:g}{part} {where}")

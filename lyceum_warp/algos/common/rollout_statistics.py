@@ -123,4 +123,4 @@ def pooled(parts: Sequence[Mapping[str, float]], *names: str) -> tuple[float, fl
     sets = [[part[name] for name in names] for part in parts]
     n = sum(size for size, _, _ in sets)
     mean = sum(size * mean for size, mean, _ in sets) / n if n else 0.0
-    return n, mean, sum(square + size * (own - mean) ** 2 for size, own, square in sets)
+    return n, mean, sum(square + size * (set_mean - mean) ** 2 for size, set_mean, square in sets)

@@ -80,9 +80,9 @@ def apply_symmetry(
     """
     if symmetry == "none" or policy.mirror is not None:
         return None, None
-    found, device = reflections(env), env.obs.device
+    device = env.obs.device
     if symmetry == "exact":
-        policy.use_mirror(found)
+        policy.use_mirror(reflections(env))
         return None, None
     images = Reflected(reflections(env, group=value_group)["obs"]).to(device) if symmetry == "augment" else None
-    return PolicyMirror(found).to(device), images
+    return PolicyMirror(reflections(env)).to(device), images

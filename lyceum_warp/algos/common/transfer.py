@@ -107,20 +107,20 @@ class Transfer:
     @property
     def line(self) -> str:
         """Format all verdicts in one line."""
-        found = []
+        texts = []
         for comparison in self.comparisons:
-            shown = ", ".join(difference.text for difference in comparison.differences)
-            found.append(f"{comparison.second} against {comparison.first}: {comparison.verdict} ({shown})")
-        return "; ".join(found) + (f"; begun at {self.memory}" if self.memory else "")
+            differences = ", ".join(difference.text for difference in comparison.differences)
+            texts.append(f"{comparison.second} against {comparison.first}: {comparison.verdict} ({differences})")
+        return "; ".join(texts) + (f"; begun at {self.memory}" if self.memory else "")
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to values that JSON supports."""
-        made = dataclasses.asdict(self) | {"line": self.line}
-        for comparison, entry in zip(self.comparisons, made["comparisons"], strict=True):
+        content = dataclasses.asdict(self) | {"line": self.line}
+        for comparison, entry in zip(self.comparisons, content["comparisons"], strict=True):
             entry["verdict"] = comparison.verdict
-            for difference, inner in zip(comparison.differences, entry["differences"], strict=True):
-                inner["verdict"] = difference.verdict
-        return made
+            for difference, numbers in zip(comparison.differences, entry["differences"], strict=True):
+                numbers["verdict"] = difference.verdict
+        return content
 
 
 @torch.no_grad()
@@ -171,35 +171,36 @@ def transfer(
     check_kind("env of transfer", env, Env, "as lw.make(...) makes it")
     episodes, margin = whole_number("episodes", episodes, low=2), finite_number("margin", margin, low=0.0)
     curriculum = curriculum or Curriculum.of(env)
-    named, own = task_physics(env)
+    named, current = task_physics(env)
     if not physics:
-        named = {name: named[name] for name in dict.fromkeys((EXACT, own))}
+        named = {name: named[name] for name in dict.fromkeys((EXACT, current))}
     device = device or (env.device.alias if env.device.is_cuda else "cuda" if wp.is_cuda_available() else "cpu")
-    on_c = options_on_cores()
-    plays = {f"{name} physics": on_c | {"physics": options} for name, options in named.items()}
+    simulations = {f"{name} physics": options_on_cores() | {"physics": options} for name, options in named.items()}
     warp_name = f"Warp engine on {device}"
     if warp:
-        plays[warp_name] = {"engine": "warp", "device": device, "nthread": None, "physics": env.options.physics}
-    played: dict[str, tuple[Episodes, int]] = {}
-    for number, (name, changes) in enumerate(plays.items()):
+        simulations[warp_name] = {"engine": "warp", "device": device, "nthread": None, "physics": env.options.physics}
+    results: dict[str, tuple[Episodes, int]] = {}
+    for number, (name, changes) in enumerate(simulations.items()):
         worlds = evaluation_worlds(env, episodes, **changes)
-        own_policy = moved(policy, worlds) if isinstance(policy, torch.nn.Module) else policy
-        shown = functools.partial(_show, progress, number, len(plays))
-        result = evaluate(worlds, own_policy, episodes, seed=seed, curriculum=curriculum, progress=shown)
-        played[name] = result, sum(worlds.fault_counts.values())
+        local = moved(policy, worlds) if isinstance(policy, torch.nn.Module) else policy
+        report = functools.partial(_report, progress, number, len(simulations))
+        result = evaluate(worlds, local, episodes, seed=seed, curriculum=curriculum, progress=report)
+        results[name] = result, sum(worlds.fault_counts.values())
         memory = result.curriculum.text
     exact = f"{EXACT} physics"
-    pairs = [(exact, name) for name in plays if name not in (exact, warp_name)]
-    compared = functools.partial(_compared, margin=margin, terminates=env.task.ends_by("terminated"))
-    found = [compared(*pair, played[pair[0]], played[pair[1]]) for pair in pairs]
+    compare = functools.partial(_compared, margin=margin, terminates=env.task.ends_by("terminated"))
+    comparisons = []
     if warp:
-        found.insert(0, compared("C engine", warp_name, played[f"{own} physics"], played[warp_name]))
-    return Transfer(task=env.task.name, episodes=episodes, seed=seed, memory=memory, comparisons=tuple(found))
+        comparisons.append(compare("C engine", warp_name, results[f"{current} physics"], results[warp_name]))
+    for name in simulations:
+        if name not in (exact, warp_name):
+            comparisons.append(compare(exact, name, results[exact], results[name]))
+    return Transfer(task=env.task.name, episodes=episodes, seed=seed, memory=memory, comparisons=tuple(comparisons))
 
 
-def _show(progress: Callable[[int, int], object] | None, play: int, plays: int, step: int, steps: int) -> None:
+def _report(progress: Callable[[int, int], object] | None, number: int, count: int, step: int, steps: int) -> None:
     if progress is not None:
-        progress(play * steps + step, plays * steps)
+        progress(number * steps + step, count * steps)
 
 
 def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
@@ -208,9 +209,9 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
     Options that only the Warp engine has are ignored.
     """
     named = {EXACT: PhysicsOptions(), **env.task.task.physics}
-    given = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
-    own = next((name for name, options in named.items() if options == given), "own")
-    return named | {own: given}, own
+    current = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
+    name = next((name for name, options in named.items() if options == current), "own")
+    return named | {name: current}, name
 
 
 def simulation(env: Env) -> str:
@@ -227,19 +228,27 @@ def _compared(
     first: str, second: str, one: tuple[Episodes, int], other: tuple[Episodes, int], *, margin: float, terminates: bool
 ) -> Comparison:
     (a, faults), (b, other_faults) = one, other
-    measured: list[Any] = []
-    for name, kind in (("return", "returns"), ("length", "lengths")):
-        x, y = (getattr(episodes, kind).double().numpy() for episodes in (a, b))
-        mean, half = mean_interval(y - x)
-        measured.append((name, x, y, (mean - half, mean + half), margin * np.abs(x).mean()))
+    x, y = a.returns.double().numpy(), b.returns.double().numpy()
+    returns = _mean_difference("return", x, y, margin)
+    lengths = _mean_difference("length", a.lengths.double().numpy(), b.lengths.double().numpy(), margin)
     if terminates:
         name, failures = "terminated", (a.terminated.numpy() > 0, b.terminated.numpy() > 0)
     else:
-        _, x, y, _, most = measured[0]
-        name, failures = "clearly worse", clear_losses(x, y, most)
-    measured.append((name, *failures, share_interval(*failures), margin))
-    differences = tuple(
-        Difference(quantity=name, first=float(x.mean()), second=float(y.mean()), low=low, high=high, margin=float(most))
-        for name, x, y, (low, high), most in measured
-    )
-    return Comparison(first=first, second=second, faults=(faults, other_faults), differences=differences)
+        name, failures = "clearly worse", clear_losses(x, y, returns.margin)
+    shares = _difference(name, *failures, share_interval(*failures), margin)
+    return Comparison(first=first, second=second, faults=(faults, other_faults), differences=(returns, lengths, shares))
+
+
+def _mean_difference(quantity: str, first: np.ndarray, second: np.ndarray, margin: float) -> Difference:
+    mean, half = mean_interval(second - first)
+    return _difference(quantity, first, second, (mean - half, mean + half), margin * np.abs(first).mean())
+
+
+def _difference(
+    quantity: str, first: np.ndarray, second: np.ndarray, interval: tuple[float, float], margin: float
+) -> Difference:
+    low, high = interval
+    return Difference(
+        quantity=quantity, first=float(first.mean()), second=float(second.mean()), low=low, high=high,
+        margin=float(margin),
+    )  # fmt: skip

@@ -108,10 +108,8 @@ class TwinLinear(nn.Module):
     def __init__(self, n: int, m: int, generator: torch.Generator | None) -> None:
         super().__init__()
         bound = 1.0 / math.sqrt(n)
-        self.weight, self.bias = (
-            nn.Parameter(torch.empty(shape).uniform_(-bound, bound, generator=generator))
-            for shape in ((2, n, m), (2, 1, m))
-        )
+        self.weight = nn.Parameter(torch.empty(2, n, m).uniform_(-bound, bound, generator=generator))
+        self.bias = nn.Parameter(torch.empty(2, 1, m).uniform_(-bound, bound, generator=generator))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Apply both layers."""

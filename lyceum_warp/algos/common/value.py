@@ -121,8 +121,9 @@ class ValueFunction(Normalized):
         beyond = team.sum(((returns < low) | (returns > high)).double().sum())
         new = (beyond > 0.25 * count) | first
         ordered = team.gather(returns).nan_to_num().sort().values
-        quartile, median, other = (ordered[i * (len(ordered) - 1) // 4] for i in (1, 2, 3))
-        width = 20.0 * (other - quartile)
+        last = len(ordered) - 1
+        quartile, median, third = ordered[last // 4], ordered[2 * last // 4], ordered[3 * last // 4]
+        width = 20.0 * (third - quartile)
         width.masked_fill_(width == 0.0, torch.inf)  # quartiles may be equal, for example with sparse rewards
         low, high = torch.where(new, median - width, low), torch.where(new, median + width, high)
         returns = torch.minimum(torch.maximum(returns, low), high).nan_to_num()
@@ -132,10 +133,10 @@ class ValueFunction(Normalized):
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
         limited = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
         scale = torch.where(new, scale, limited)
-        last = self.network[-1]
-        assert isinstance(last, nn.Linear)
-        last.weight.mul_(self.scale / scale)
-        last.bias.copy_((last.bias * self.scale + self.shift - mean) / scale)
+        layer = self.network[-1]
+        assert isinstance(layer, nn.Linear)
+        layer.weight.mul_(self.scale / scale)
+        layer.bias.copy_((layer.bias * self.scale + self.shift - mean) / scale)
         self.shift.copy_(mean)
         self.scale.copy_(scale)
 

@@ -22,7 +22,8 @@ class ValueFit:
     def __init__(
         self, value: ValueFunction, samples: int, nworld: int, *, rate: float, epochs: int, batch: int, team: Team
     ) -> None:
-        self.value, self.samples, self.nworld, self.team = value, samples, nworld, team
+        self.value, self.team = value, team
+        self.samples, self.nworld = samples, nworld
         self.epochs, self.batch = epochs, batch
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
@@ -62,7 +63,7 @@ class ValueFit:
                     steps(features, target, order)
                 else:
                     for part in order.split(self.batch):
-                        places, weight = self._own(part)
+                        places, weight = self._local(part)
                         self.learn(features[places], target[places], weight)
             if steps is not None:
                 steps.store()
@@ -91,14 +92,15 @@ class ValueFit:
         for tensor, part in zip(numbers, self._good.split([tensor.numel() for tensor in numbers]), strict=True):
             tensor.copy_(part.view_as(tensor))
 
-    def _own(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
+    def _local(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
+        """Get the places and the weights of this process's samples among the samples of a mini-batch."""
         if self.team.size == 1:
             return index, 1.0 / len(index)
-        places, own = self.team.locate(index, self.nworld)
+        places, local = self.team.locate(index, self.nworld)
         # on a GPU, selection by a mask would synchronise
         if self.cuda:
-            return places, own.unsqueeze(-1) / len(index)
-        return places[own], 1.0 / len(index)
+            return places, local.unsqueeze(-1) / len(index)
+        return places[local], 1.0 / len(index)
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor | float) -> None:
         """Make one step of Adam on a weighted sum of squared errors."""
@@ -124,19 +126,17 @@ class DenseSteps:
 
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
         self.fit, self.team = fit, fit.team
-        state = [fit.optimizer.state.get(p) or {} for p in fit.parameters]
-        first, second = (
-            [s.get(name, torch.zeros_like(p)) for s, p in zip(state, fit.parameters, strict=True)]
-            for name in ("exp_avg", "exp_avg_sq")
-        )
-        self.count = int(state[0].get("step", 0))
-        self.parameters, self.first, self.second = (
-            torch.cat([tensor.detach().reshape(-1) for tensor in tensors])
-            for tensors in (passes.parameters, first, second)
-        )
+        self.count = int((fit.optimizer.state.get(fit.parameters[0]) or {}).get("step", 0))
+        self.parameters = torch.cat([parameter.reshape(-1) for parameter in passes.parameters])
+        self.first, self.second = self._moments("exp_avg"), self._moments("exp_avg_sq")
         self.gradient, self.root = fit.gradient, torch.empty_like(self.parameters)
         self.passes = DensePasses(self._shaped(self.parameters), passes.activation)
         self.gradients = self._shaped(self.gradient)
+
+    def _moments(self, name: str) -> torch.Tensor:
+        state = self.fit.optimizer.state
+        moments = [(state.get(p) or {}).get(name, torch.zeros_like(p)) for p in self.fit.parameters]
+        return torch.cat([moment.detach().reshape(-1) for moment in moments])
 
     def _shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
         sizes = [p.numel() for p in self.fit.parameters]
@@ -144,10 +144,10 @@ class DenseSteps:
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
         """Run an epoch with a permutation of all processes' samples."""
-        places, own = self.team.locate(order, self.fit.nworld)
+        places, local = self.team.locate(order, self.fit.nworld)
         sizes = [len(part) for part in order.split(self.fit.batch)]
-        counts = [int(part.sum()) for part in own.split(self.fit.batch)]
-        features, target = features[places[own]], target[places[own]]
+        counts = [int(part.sum()) for part in local.split(self.fit.batch)]
+        features, target = features[places[local]], target[places[local]]
         for x, y, size in zip(features.split(counts), target.split(counts), sizes, strict=True):
             self.learn(x, y, 1.0 / size)
 
@@ -199,10 +199,10 @@ class CapturedStep:
         """Run an epoch with a permutation of all processes' samples."""
         self.features.copy_(features)
         self.target.copy_(target)
-        filled = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
-        places, own = self.fit.team.locate(filled, self.fit.nworld)
+        padded = torch.nn.functional.pad(order, (0, self.places.numel() - len(order))).view_as(self.places)
+        places, local = self.fit.team.locate(padded, self.fit.nworld)
         self.places.copy_(places)
-        torch.mul(self.inside, own, out=self.weight)
+        torch.mul(self.inside, local, out=self.weight)
         self.at.zero_()
         for _ in range(self.count):
             self.step()

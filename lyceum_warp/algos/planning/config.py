@@ -95,11 +95,11 @@ class MPPIConfig:
             updates = ("mppi", "cem", "predictive_sampling")
             check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
         check_fields(self, _BOUNDS)
-        checked = {"noise": _noise(self.noise), "smoothing": _smoothing(self.smoothing), "fill": _fill(self.fill)}
+        object.__setattr__(self, "noise", _noise(self.noise))
+        object.__setattr__(self, "smoothing", _smoothing(self.smoothing))
+        object.__setattr__(self, "fill", _fill(self.fill))
         if self.min_noise is not None:
-            checked["min_noise"] = _deviations("min_noise", self.min_noise)
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, "min_noise", _deviations("min_noise", self.min_noise))
         for name, most in (("elites", "samples"), ("knots", "horizon")):
             if (value := getattr(self, name)) is not None and value > getattr(self, most):
                 raise ValueError(f"{name}={value} must be at most {most}, which is {getattr(self, most)}")
@@ -123,9 +123,10 @@ class MPPIConfig:
         Raises:
             ValueError: A value is of the wrong type or out of range.
         """
-        other = settings.get("update", self.update) != self.update
-        words: dict[str, Any] = {**(dict.fromkeys((*_OF_CEM, "include_plan")) if other else {}), **settings}
-        return dataclasses.replace(self, **words)
+        changes: dict[str, Any] = {}
+        if settings.get("update", self.update) != self.update:
+            changes = dict.fromkeys((*_OF_CEM, "include_plan"))
+        return dataclasses.replace(self, **{**changes, **settings})
 
     def completed(self, value: object = None) -> "MPPIConfig":
         """Replace None by defaults, except in ``knots`` and in settings that the update ignores.
@@ -138,7 +139,7 @@ class MPPIConfig:
         """
         discount = getattr(value, "discount", None)
         adapts = self.update.adapts_noise if isinstance(self.update, PlanUpdate) else self.update == "cem"
-        chosen: dict[str, Any] = {
+        defaults: dict[str, Any] = {
             "discount": 1.0 if discount is None else discount,
             "include_plan": not adapts and self.samples > 1,
         }
@@ -147,14 +148,14 @@ class MPPIConfig:
                 f"noise of update={self.update!r} must be standard deviations; a covariance was given: {self.noise!r}"
             )
         if self.update == "cem":
-            chosen["elites"] = min(self.samples, max(2, self.samples // 10))
-            chosen["min_noise"] = _tuples(0.1 * np.asarray(self.noise))
+            defaults["elites"] = min(self.samples, max(2, self.samples // 10))
+            defaults["min_noise"] = _tuples(0.1 * np.asarray(self.noise))
         else:
             for name in _OF_CEM:
-                if (given := getattr(self, name)) is not None:
-                    raise ValueError(f"{name}={given!r} is a setting of update='cem', not of update={self.update!r}")
+                if (value := getattr(self, name)) is not None:
+                    raise ValueError(f"{name}={value!r} is a setting of update='cem', not of update={self.update!r}")
         return dataclasses.replace(
-            self, **{name: default for name, default in chosen.items() if getattr(self, name) is None}
+            self, **{name: default for name, default in defaults.items() if getattr(self, name) is None}
         )
 
     def noise_factor(self, nact: int) -> np.ndarray:

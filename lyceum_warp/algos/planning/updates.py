@@ -78,8 +78,8 @@ class PlanUpdate(abc.ABC):
 
     def __repr__(self) -> str:
         """Format the public attributes, for the planner's ``settings``."""
-        given = (f"{name}={value!r}" for name, value in vars(self).items() if not name.startswith("_"))
-        return f"{type(self).__name__}({', '.join(given)})"
+        attributes = (f"{name}={value!r}" for name, value in vars(self).items() if not name.startswith("_"))
+        return f"{type(self).__name__}({', '.join(attributes)})"
 
 
 def by_sample(tensor: torch.Tensor) -> Any:
@@ -133,10 +133,10 @@ class EliteWeights(PlanUpdate):
 
     def weigh(self, samples: PlanSamples) -> None:
         """Give equal weights to the best samples that did not fail."""
-        returns, weights, rank = (by_sample(rows) for rows in (samples.returns, samples.weights, self._rank))
+        returns, rank = by_sample(samples.returns), by_sample(self._rank)
         plants, count = samples.returns.shape
         wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
-        args = [returns, rank, self.elites, weights, wp.from_torch(samples.summary)]
+        args = [returns, rank, self.elites, by_sample(samples.weights), wp.from_torch(samples.summary)]
         launch_blocks(planning.weigh_elites, plants, args)
 
 
@@ -186,18 +186,16 @@ class CrossEntropy(EliteWeights):
                 f"min_noise must be one standard deviation, or one for each of the {nact} actions, not "
                 f"{self.min_noise!r}"
             )
-        self._smallest, self._spread = (
-            torch.as_tensor(row, dtype=torch.float32, device=samples.plan.device)
-            for row in (np.full(nact, smallest), spread(self.smoothing, count))
-        )
+        self._smallest = torch.as_tensor(np.full(nact, smallest)).to(samples.plan)
+        self._spread = torch.as_tensor(spread(self.smoothing, count)).to(samples.plan)
 
     def fit(self, samples: PlanSamples) -> None:
         """Fit the noise to the elites."""
-        weights, actions = by_sample(samples.weights), by_sample(samples.actions)
         plan, before, after = samples.plan, samples.nominal_deviation, samples.deviation
         assert before is not None and after is not None
-        rest = [wp.from_torch(t) for t in (plan, self._spread, self._smallest, before, samples.summary, after)]
-        launch_blocks(planning.fit_deviation, plan.numel(), [weights, actions, *rest])
+        args = [wp.from_torch(t) for t in (plan, self._spread, self._smallest, before, samples.summary, after)]
+        rows = [by_sample(samples.weights), by_sample(samples.actions)]
+        launch_blocks(planning.fit_deviation, plan.numel(), [*rows, *args])
 
 
 def spread(smoothing: tuple[float, float, float], count: int) -> np.ndarray:
