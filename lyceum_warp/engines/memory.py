@@ -7,7 +7,7 @@ import warp as wp
 
 from lyceum_warp.support.machine import free_memory
 
-_KEPT_FREE = 0.1
+_FREE_SHARE = 0.1
 
 
 class NotEnoughMemoryError(ValueError):
@@ -39,4 +39,4 @@ def check_fit(bytes_per_world: float, nworld: int, device: wp.Device, *, model: 
 
 
 def _most(bytes_per_world: float, free: int) -> int:
-    return int((1 - _KEPT_FREE) * free / max(bytes_per_world, 1))
+    return int((1 - _FREE_SHARE) * free / max(bytes_per_world, 1))

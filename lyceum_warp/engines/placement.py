@@ -45,16 +45,16 @@ def find_device(device: str | None) -> wp.Device:
     name, error, remarks = str(device or "cpu"), None, start_warp()
     if wp.is_cuda_available() or not name.startswith("cuda"):  # without a driver, Warp would print a message
         try:
-            found = wp.get_device(name)
+            warp_device = wp.get_device(name)
         except (ValueError, RuntimeError) as cause:
             error = cause
         else:
-            if found.is_cuda and not torch.cuda.is_available():
+            if warp_device.is_cuda and not torch.cuda.is_available():
                 raise ValueError(
                     f"Warp has the device {name!r}, but torch {torch.__version__} is built without CUDA or does not "
                     "find the device: install a CUDA build of torch"
                 )
-            return found
+            return warp_device
     names = ", ".join(repr(d.alias) for d in wp.get_devices())
     reason = f"; {remarks[0]}" if remarks and name.startswith("cuda") else ""
     raise ValueError(
@@ -95,11 +95,11 @@ def open_engine(
             model, the device, an option, or model fields that differ between worlds.
     """
     fields, dynamics = list(fields), list(dynamics)
-    factory, given = _resolved(engine, device, options)
+    factory, kwargs = _resolved(engine, device, options)
     if hasattr(factory, "bytes_per_world"):
-        needed = int(factory.bytes_per_world(model, fields, dynamics, **given)) + reserved
+        needed = int(factory.bytes_per_world(model, fields, dynamics, **kwargs)) + reserved
         check_fit(needed, nworld, device, model=_model_name(model))
-    return factory(model, nworld, device, fields, dynamics, initial, **given)
+    return factory(model, nworld, device, fields, dynamics, initial, **kwargs)
 
 
 def bytes_per_world(
@@ -107,9 +107,9 @@ def bytes_per_world(
     dynamics: Iterable[ModelField] = (), **options: Any,
 ) -> int:  # fmt: skip
     """Estimate the bytes of memory per world for the engine that ``open_engine`` makes; 0 if unknown."""
-    factory, given = _resolved(engine, device, options)
+    factory, kwargs = _resolved(engine, device, options)
     estimate = getattr(factory, "bytes_per_world", None)
-    return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **given))
+    return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **kwargs))
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:
@@ -145,8 +145,8 @@ def place_samples(
         return {}
 
     def has_noslip() -> bool:
-        given = (solver or {}).get("noslip_iterations")
-        return (spec().option.noslip_iterations if given is None else given) > 0
+        iterations = (solver or {}).get("noslip_iterations")
+        return (spec().option.noslip_iterations if iterations is None else iterations) > 0
 
     enough = _SAMPLES_PER_CORE * min(_MOST_CORES, nthread or cpu_cores())
     if samples >= enough and (samples >= _NOSLIP * enough or not has_noslip()):
@@ -156,10 +156,10 @@ def place_samples(
 
 def options_on_cores() -> dict[str, Any]:
     """Return the options that move an environment to the C engine. Options that the C engine lacks become None."""
-    known = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
+    names = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
-    others = {name: None for name, default in defaults.items() if default is None and name not in known}
-    return {"engine": "mujoco", "device": "cpu", **others}
+    unused = {name: None for name, default in defaults.items() if default is None and name not in names}
+    return {"engine": "mujoco", "device": "cpu", **unused}
 
 
 def _resolved(
@@ -167,14 +167,14 @@ def _resolved(
 ) -> tuple[EngineFactory, dict[str, Any]]:
     name = engine_name(engine, device.alias)
     factory = engine if callable(engine) else _engine_class(name, device, bool(options.get("deterministic")))
-    given = {key: value for key, value in options.items() if value is not None and value is not False}
-    known = _options_of(factory)
-    if known is None:
-        return factory, given
-    if unknown := sorted(key for key, value in given.items() if key not in known and value is not True):
-        takes = f"it takes {', '.join(known)}" if known else "it takes no options"
+    kwargs = {key: value for key, value in options.items() if value is not None and value is not False}
+    names = _options_of(factory)
+    if names is None:
+        return factory, kwargs
+    if unknown := sorted(key for key, value in kwargs.items() if key not in names and value is not True):
+        takes = f"it takes {', '.join(names)}" if names else "it takes no options"
         raise ValueError(f"the {name} engine takes no {', '.join(unknown)}; {takes}")
-    return factory, {key: value for key, value in given.items() if key in known}
+    return factory, {key: value for key, value in kwargs.items() if key in names}
 
 
 def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Engine]:
@@ -183,8 +183,8 @@ def _engine_class(name: str, device: wp.Device, deterministic: bool) -> type[Eng
     module, attribute = _ENGINES[name]
     if name == "warp" and deterministic and device.is_cuda:
         module, attribute = _DETERMINISTIC
-    found: type[Engine] = getattr(importlib.import_module(module), attribute)
-    return found
+    engine: type[Engine] = getattr(importlib.import_module(module), attribute)
+    return engine
 
 
 def _options_of(factory: EngineFactory) -> list[str] | None:

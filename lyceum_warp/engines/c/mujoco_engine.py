@@ -93,26 +93,7 @@ class MujocoEngine(Engine):
         for field in self.fields.values():
             self._bind(field)
         self.ctrl = self.arrays["ctrl"]
-        kept = list(self.fields.values())
-        self._state_fields = [field for field in kept if field.name in STATE_FIELDS]
-        self._derived = [field for field in kept if field.name not in STATE_FIELDS]
-        computed = [field for field in self._derived if field.refresh > Stage.NONE]
-        positions = all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in computed)
-        self._apart = bool(computed) and (positions or any(field.lagged for field in kept))
-        """Whether a separate call of ``forward`` computes derived fields."""
-        shown = [field for field in kept if field.name != "ctrl"]  # an input
-        late = [field for field in shown if field not in computed or field.snapshot] if self._apart else []
-        self._before_stage = [field for field in late if field.name not in STATE_FIELDS]
-        """The fields to copy before the call of ``forward``. The call may replace them by values of another world."""
-        self._after_stage = [field for field in self._before_stage if field in computed]
-        """The fields of ``_before_stage`` to copy again after ``forward``, which updates some of their elements."""
-        self._last = [field for field in shown if field not in self._before_stage]
-        # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
-        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions and computed else 0
-        self._disabled = self.batch.expand("opt.disableflags") if without else np.zeros(0, dtype=int)
-        self._step_flags, self._stage_flags = self._disabled.copy(), self._disabled | without
-        self._early_columns = np.isin(np.arange(model.nsensordata), early_sensor_columns(model))
-        self._written = [field for field in kept if field.written]
+        self._order_copies()
         self._graphs = Graphs(device, capture_engine=False)
         self._steps: dict[int, Calls] = {}
         self._rollouts: dict[Any, NativeRollout | None] = {}
@@ -124,14 +105,35 @@ class MujocoEngine(Engine):
         self._models = WorldModels(self.batch, self.dynamics.values())
         self._models.apply(self._values)
 
+    def _order_copies(self) -> None:
+        """Decide whether derived fields need a ``forward`` after the substeps, and when to copy each field."""
+        fields = list(self.fields.values())
+        self._inputs = [field for field in fields if field.written]
+        self._state_fields = [field for field in fields if field.name in STATE_FIELDS]
+        self._derived = [field for field in fields if field.name not in STATE_FIELDS]
+        current = [field for field in self._derived if field.refresh > Stage.NONE]
+        positions = bool(current) and all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in current)
+        self._apart = positions or (bool(current) and any(field.lagged for field in fields))
+        """Whether a separate call of ``forward`` computes derived fields."""
+        # `forward` may replace other fields by values of another world
+        before = [field for field in self._derived if field not in current or field.snapshot]
+        self._before_forward = before if self._apart else []
+        # `forward` updates some of their elements
+        self._after_forward = [field for field in self._before_forward if field in current]
+        self._after_step = [field for field in fields if field.name != "ctrl" and field not in self._before_forward]
+        # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
+        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions else 0
+        self._disabled = self.batch.expand("opt.disableflags") if positions else np.zeros(0, dtype=int)
+        self._step_flags, self._forward_flags = self._disabled.copy(), self._disabled | without
+        self._early_columns = np.isin(np.arange(self.model.nsensordata), early_sensor_columns(self.model))
+
     def _on_host(self, mask: wp.array) -> np.ndarray:
         """Return a NumPy view of a mask. Views are cached, because creating a view takes longer than reading it."""
-        if (kept := self._masks.get(id(mask))) is not None:  # the dict keeps the mask alive, so its id stays unique
-            return kept[1]
-        view: np.ndarray = mask.numpy()
-        if len(self._masks) < _MOST_MASKS:
-            self._masks[id(mask)] = mask, view
-        return view
+        if (pair := self._masks.get(id(mask))) is None:
+            pair = mask, mask.numpy()
+            if len(self._masks) < _MOST_MASKS:
+                self._masks[id(mask)] = pair  # the dict keeps the mask alive, so its id stays unique
+        return pair[1]
 
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
@@ -179,23 +181,23 @@ class MujocoEngine(Engine):
         return [
             Phase("inputs", self._take_inputs, by_world=True),
             Phase("physics", partial(self._advance, nstep), engine=True),
-            Phase("fields", partial(self._read, self._last, self._everyone), by_world=True),
+            Phase("fields", partial(self._read, self._after_step, self._everyone), by_world=True),
         ]
 
     def _take_inputs(self) -> None:
-        for field in self._written:
+        for field in self._inputs:
             launch_rows(widen, self._everyone, flat(self.arrays[field.name]), self._sources[field.name])
 
     def _advance(self, nstep: int) -> None:
         call_batch(self.batch, self.batch.step, nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
         if self._apart:
-            self._copy(self._before_stage)
-            self._disabled[...] = self._stage_flags
+            self._copy(self._before_forward)
+            self._disabled[...] = self._forward_flags
             try:
                 call_batch(self.batch, self.batch.forward, stage=self.stage)
             finally:
                 self._disabled[...] = self._step_flags
-            self._copy(self._after_stage, early=True)
+            self._copy(self._after_forward, early=True)
 
     def _copy(self, fields: list[Field], mask: np.ndarray | None = None, *, early: bool = False) -> None:
         """Copy the masked worlds' fields into float32 arrays.
@@ -240,12 +242,12 @@ class MujocoEngine(Engine):
         self._models.apply(self._values, self._on_host(mask))
 
     def settle(self, mask: wp.array, nstep: int) -> None:
-        chosen = self._on_host(mask)
-        if nstep == 0 or not chosen.any():
+        worlds = self._on_host(mask)
+        if nstep == 0 or not worlds.any():
             return
-        call_batch(self.batch, self.batch.step, ids=chosen, nstep=nstep)
-        self.batch.state[chosen, state_columns(self.model, "time")] = 0.0
-        self._copy(self._state_fields, chosen)
+        call_batch(self.batch, self.batch.step, ids=worlds, nstep=nstep)
+        self.batch.state[worlds, state_columns(self.model, "time")] = 0.0
+        self._copy(self._state_fields, worlds)
 
     def find_faults(self, mask: wp.array) -> None:
         nphysics = 1 + self.model.nq + self.model.nv + self.model.na
@@ -279,8 +281,7 @@ class MujocoEngine(Engine):
         launch_several_rows(widen_four, mask, numbers)
 
     def refresh(self, mask: wp.array) -> None:
-        computed = [field for field in self._derived if field.reset > Stage.NONE]
-        self._forward(mask, self.reset_stage, computed)
+        self._forward(mask, self.reset_stage, [field for field in self._derived if field.reset > Stage.NONE])
 
     def refresh_current(self, mask: wp.array) -> None:
         current = [field for field in self._derived if field.refresh > Stage.NONE]
@@ -288,10 +289,10 @@ class MujocoEngine(Engine):
         self._read(self._state_fields, mask)
 
     def _forward(self, mask: wp.array, stage: Stage, fields: list[Field], *, early: bool = False) -> None:
-        chosen = self._on_host(mask)
-        if stage > Stage.NONE and chosen.any():
-            call_batch(self.batch, self.batch.forward, ids=chosen, stage=stage)
-            self._copy(fields, chosen, early=early)
+        worlds = self._on_host(mask)
+        if stage > Stage.NONE and worlds.any():
+            call_batch(self.batch, self.batch.forward, ids=worlds, stage=stage)
+            self._copy(fields, worlds, early=early)
 
     # state
 

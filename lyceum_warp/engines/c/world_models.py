@@ -21,14 +21,14 @@ class WorldModels:
         self.fields = [field for field in fields if field.size]
         self._follows = {field.name for field in self.fields if field.constants}
         self._rows: dict[str, np.ndarray] = {}
-        self._own: dict[str, np.ndarray] = {}
+        self._nominal: dict[str, np.ndarray] = {}
         self._rounded: dict[str, np.ndarray] = {}
         self._applied: dict[str, np.ndarray] = {}
         for field in self.fields:
             rows = batch.expand(f"opt.{field.name}" if field.option else field.name)
             self._rows[field.name] = rows.reshape(batch.nsim, field.size)
-            self._own[field.name] = field.value(batch.model).reshape(field.size).copy()
-            self._rounded[field.name] = self._own[field.name].astype(np.float32)
+            self._nominal[field.name] = field.value(batch.model).reshape(field.size).copy()
+            self._rounded[field.name] = self._nominal[field.name].astype(np.float32)
             if field.name in self._follows:
                 self._applied[field.name] = self._rows[field.name].astype(np.float32)
         # the first call recomputes every world's constants, so that worlds with equal values have equal constants
@@ -39,25 +39,25 @@ class WorldModels:
         if mask is not None and 1 not in mask.tobytes():  # faster than mask.any()
             return
         worlds = np.arange(self.batch.nsim) if mask is None else np.flatnonzero(mask)
-        derive = self._stale[worlds]
+        changed = self._stale[worlds]
         for name, rows in self._rows.items():
-            given, own = values[name][worlds], self._own[name]
-            rows[worlds] = np.where(given == self._rounded[name], own, given)
+            numbers = values[name][worlds]
+            rows[worlds] = np.where(numbers == self._rounded[name], self._nominal[name], numbers)
             if name in self._follows:
                 applied = self._applied[name]
                 # compare bits, so that NaN equals itself
-                derive = derive | (given.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
-                applied[worlds] = given
-        if derive.any():
-            chosen = np.zeros(self.batch.nsim, dtype=bool)
-            chosen[worlds[derive]] = True
-            self._set_const(chosen)
+                changed = changed | (numbers.view(np.int32) != applied[worlds].view(np.int32)).any(axis=1)
+                applied[worlds] = numbers
+        if changed.any():
+            ids = np.zeros(self.batch.nsim, dtype=bool)
+            ids[worlds[changed]] = True
+            self._set_const(ids)
 
     def _set_const(self, worlds: np.ndarray) -> None:
         """Recompute constants. If MuJoCo rejects a world's values, the next call tries again."""
-        counted = self.batch.warning[:, :, 1].sum(axis=1)
+        before = self.batch.warning[:, :, 1].sum(axis=1)
         call_batch(self.batch, self.batch.set_const, worlds)
-        self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > counted)[worlds]
+        self._stale[worlds] = (self.batch.warning[:, :, 1].sum(axis=1) > before)[worlds]
 
 
 def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
@@ -65,7 +65,7 @@ def bytes_per_world(model: mujoco.MjModel, fields: Iterable[ModelField]) -> int:
     fields = list(fields)
     batch = Batch(model, 1, 1)
     models = WorldModels(batch, fields)
-    moved = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
-    models.apply(moved)  # constants take memory only if they differ between worlds
+    values = {field.name: 1.001 * field.value(model).reshape(1, -1).astype(np.float32) for field in models.fields}
+    models.apply(values)  # constants take memory only if they differ between worlds
     expanded = [rows for name in MODEL_FIELDS if (rows := batch.expanded(name)) is not None]
     return sum(rows.nbytes for rows in expanded) + 4 * sum(field.size for field in fields)

@@ -37,9 +37,9 @@ class DeterministicEngine(WarpEngine):
 
     partial_refresh = False
 
-    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, *rest: Any, **options: Any) -> None:
+    def __init__(self, model: mujoco.MjModel, nworld: int, device: wp.Device, *args: Any, **options: Any) -> None:
         self._scratch = Scratch(device)
-        super().__init__(model, nworld, device, *rest, **options)
+        super().__init__(model, nworld, device, *args, **options)
         with wp.ScopedDevice(device):
             self._order = CanonicalOrder(self.m, self.d, self._scratch.open)
 

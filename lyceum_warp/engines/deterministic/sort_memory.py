@@ -69,7 +69,7 @@ class ScratchSizes:
     @classmethod
     def probe(cls, capture: Callable[[int], Scratch]) -> "ScratchSizes":
         """Measure the scratch memory of 1024 and of 2048 worlds, and fit a line to the results."""
-        few, more = (capture(nworld) for nworld in _PROBED)
+        few, more = map(capture, _PROBED)
         fixed, each = _line(few.peak, more.peak)
         fixed_buffer, each_buffer = _line(few.largest, more.largest)
         return cls(fixed, each, (LARGEST_BUFFER - fixed_buffer) // max(1, each_buffer))

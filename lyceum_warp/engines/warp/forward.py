@@ -8,6 +8,7 @@ from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import warp as wp
 
 from lyceum_warp.core.fields import Stage
@@ -50,8 +51,8 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     them. It thus reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
     right after the positions, in every stage of a Runge-Kutta step.
     """
-    own_smooth = vars(forward_functions()["smooth"])
-    smooth = types.SimpleNamespace(**own_smooth | {part.__name__: _nothing for part in done})
+    functions = vars(forward_functions()["smooth"])
+    smooth = types.SimpleNamespace(**functions | {part.__name__: _nothing for part in done})
     positions = _copy("fwd_kinematics", smooth=smooth)
 
     def fwd_kinematics(model: mjw.Model, data: mjw.Data) -> None:
@@ -60,11 +61,11 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
             mjw.com_vel(model, data)
 
     fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics)
-    whole = _copy("_forward", fwd_position=fwd_position)
-    forward = _copy("forward", _forward=whole)
-    stage = _without(frozenset())["_forward"] if done else whole
+    inner = _copy("_forward", fwd_position=fwd_position)
+    forward = _copy("forward", _forward=inner)
+    stage = _without(frozenset())["_forward"] if done else inner
     step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=stage))
-    return {"_forward": whole, "forward": forward, "step": step}
+    return {"_forward": inner, "forward": forward, "step": step}
 
 
 def _copy(function: str, **names: Any) -> Callable[..., Any]:
@@ -138,43 +139,30 @@ def forward_parts(model: mujoco.MjModel, names: Collection[str]) -> tuple[Part, 
 
     For ``sensordata``, the parts compute the sensors of the position and velocity stages.
     """
-    wanted: set[Part] = set()
-    for name in names:
-        if name != "sensordata" and name not in _PART_OF:
-            return None
-        wanted.update(() if name == "sensordata" else (_PART_OF[name],))
-    sensors: list[Part] = []
+    parts, sensors = {_PART_OF.get(name) for name in names if name != "sensordata"}, list[Part]()
     if "sensordata" in names:
-        needed = _parts_of_sensors(model)
-        if needed is None:
-            return None
-        wanted |= needed
+        parts |= _parts_of_sensors(model)
         last = max((int(stage) for stage in model.sensor_needstage if stage < Stage.ACCELERATION), default=0)
         sensors = [mjw.sensor_pos, mjw.sensor_vel][:last]
     for part in reversed(_NEEDS):
-        if part in wanted:
-            wanted.update(_NEEDS[part])
-    if mjw.fwd_velocity in wanted:
-        wanted.discard(mjw.com_vel)
-    if _touching(model) and wanted & {mjw.transmission, mjw.fwd_velocity}:
+        if part in parts:
+            parts.update(_NEEDS[part])
+    if mjw.fwd_velocity in parts:
+        parts.discard(mjw.com_vel)
+    if None in parts or (_touching(model) and parts & {mjw.transmission, mjw.fwd_velocity}):
         return None
-    return (*(part for part in _NEEDS if part in wanted), *sensors)
+    return (*(part for part in _NEEDS if part in parts), *sensors)
 
 
-def _parts_of_sensors(model: mujoco.MjModel) -> set[Part] | None:
-    """Return the parts that position and velocity sensors need, or None if these sensors need a full forward pass."""
-    wanted: set[Part] = set()
+def _parts_of_sensors(model: mujoco.MjModel) -> set[Part | None]:
+    """Return the parts that position and velocity sensors need. They include None for a full forward pass."""
+    parts: set[Part | None] = set()
     camera = int(mujoco.mjtObj.mjOBJ_CAMERA)
-    for i in range(model.nsensor):
-        if model.sensor_needstage[i] >= Stage.ACCELERATION:
-            continue
-        parts = _PARTS_OF_SENSOR.get(int(model.sensor_type[i]))
-        if parts is None:
-            return None
-        wanted.update(parts)
+    for i in np.flatnonzero(model.sensor_needstage < Stage.ACCELERATION):
+        parts.update(_PARTS_OF_SENSOR.get(int(model.sensor_type[i]), (None,)))
         if camera in (model.sensor_objtype[i], model.sensor_reftype[i]):
-            wanted.add(mjw.camlight)
-    return wanted
+            parts.add(mjw.camlight)
+    return parts
 
 
 def _touching(model: mujoco.MjModel) -> bool:
@@ -195,7 +183,8 @@ class PartialForward:
     """
 
     def __init__(self, rows: ModelRows, data: mjw.Data, group: mjw.Data, states: wp.array, static: StaticGeoms) -> None:
-        self._rows, self._data, self._group, self._states, self._static = rows, data, group, states, static
+        self._rows, self._static = rows, static
+        self._data, self._group, self._states = data, group, states
         self._device = wp.get_device(data.qpos.device)
         with wp.ScopedDevice(self._device):
             self._group_states = wp.zeros((group.nworld, states.shape[1]), dtype=float)
@@ -230,7 +219,7 @@ class PartialForward:
         with wp.ScopedDevice(self._device):
             self._run(mask, work)
             launch_rows(copy_rows, mask, self._no_time, self._states[:, :1])  # column 0 is the time
-            mjw.set_state(self._rows.whole, self._data, self._states, _SPEC, mask)
+            mjw.set_state(self._rows.source, self._data, self._states, _SPEC, mask)
 
     def _run(self, mask: wp.array, work: Callable[[], None]) -> None:
         """Call ``work`` for each group of masked worlds."""
@@ -245,5 +234,5 @@ class PartialForward:
             work()
             self._turns.give_bits(group.overflow, self._data.overflow)
 
-        mjw.get_state(self._rows.whole, self._data, self._states, _SPEC, mask)
+        mjw.get_state(self._rows.source, self._data, self._states, _SPEC, mask)
         self._turns.run(mask, turn)

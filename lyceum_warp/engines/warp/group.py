@@ -56,10 +56,13 @@ class Turns:
     """
 
     def __init__(self, nworld: int, size: int, device: wp.Device, *, loop: bool = True) -> None:
-        self.nworld, self.size, self.device, self._loop = nworld, size, device, loop
+        self.nworld, self.size = nworld, size
+        self.device, self._loop = device, loop
         with wp.ScopedDevice(device):
             self._rank, self._world = wp.zeros(nworld, dtype=int), wp.zeros(size, dtype=int)
-            self._count, self._first, self._left = (wp.zeros(1, dtype=int) for _ in range(3))
+            self._count = wp.zeros(1, dtype=int)
+            self._first = wp.zeros(1, dtype=int)
+            self._left = wp.zeros(1, dtype=int)
         self._memory = Arena(device)
 
     def run(self, mask: wp.array, turn: Callable[[], None]) -> None:
@@ -129,8 +132,8 @@ class Arena(Reserve):
             with wp.ScopedAllocator(self.device, self):
                 yield
         finally:
-            counted, self._serving = not self._serving, False
-        if counted and (not self.blocks or self.blocks[-1].size < self._size):
+            self._serving = False
+        if not self.device.is_capturing and (not self.blocks or self.blocks[-1].size < self._size):
             self.add_block(self._size)
 
     def allocate(self, size_in_bytes: int) -> int:

@@ -129,8 +129,8 @@ def _equalities(model: mujoco.MjModel) -> int:
 
 def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
     """Count all limits of joints and tendons if the task randomizes fields that affect limits."""
-    drawn = not _LIMITS.isdisjoint(varied)
-    return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if drawn else 0
+    varies = not _LIMITS.isdisjoint(varied)
+    return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if varies else 0
 
 
 def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
@@ -154,10 +154,10 @@ def _probe(model: mujoco.MjModel) -> tuple[int, int]:
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-1.0, 1.0)).T
     contacts = constraints = 0
     # a third of the worlds with random velocities, and a third of those without
-    held = (np.arange(_WORLDS) % (_WORLDS // 2) >= _WORLDS // 3)[:, None]
+    at_bounds = (np.arange(_WORLDS) % (_WORLDS // 2) >= _WORLDS // 3)[:, None]
     bounds = np.where(rng.random((_WORLDS, model.nu)) < 0.5, low, high)
     for _ in range(_HOLDS):
-        batch.ctrl[:] = np.where(held, bounds, rng.uniform(low, high, size=(_WORLDS, model.nu)))
+        batch.ctrl[:] = np.where(at_bounds, bounds, rng.uniform(low, high, size=(_WORLDS, model.nu)))
         for _ in range(_SUBSTEPS):
             # the counts are correct even if the memory is too small
             with contextlib.suppress(SimulationError):

@@ -108,23 +108,23 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
 class ModelRows:
     """Copies a model for a group of worlds. Each given field has one row per world of the group.
 
-    ``take`` fills these rows, because the worlds in the group change. The constructor also copies the fields ``own``,
-    because the group writes them.
+    ``take`` fills these rows, because the worlds in the group change. The constructor also copies the fields
+    ``written``, because the group writes them.
     """
 
-    def __init__(self, whole: mjw.Model, names: Iterable[str], size: int, own: Iterable[str] = ()) -> None:
-        self.whole = whole
-        self.model = copy.copy(whole)
-        self.model.opt = copy.copy(whole.opt)
+    def __init__(self, source: mjw.Model, names: Iterable[str], size: int, written: Iterable[str] = ()) -> None:
+        self.source = source
+        self.model = copy.copy(source)
+        self.model.opt = copy.copy(source.opt)
         self._pairs: dict[str, tuple[wp.array, wp.array]] = {}
         for name in names:
-            source = getattr(owner(whole, name), name)
-            if source.size:
-                group = wp.zeros((size, *source.shape[1:]), dtype=source.dtype, device=source.device)
+            rows = getattr(owner(source, name), name)
+            if rows.size:
+                group = wp.zeros((size, *rows.shape[1:]), dtype=rows.dtype, device=rows.device)
                 setattr(owner(self.model, name), name, group)
-                self._pairs[name] = source, group
-        for name in own:
-            setattr(self.model, name, wp.clone(getattr(whole, name)))
+                self._pairs[name] = rows, group
+        for name in written:
+            setattr(self.model, name, wp.clone(getattr(source, name)))
 
     def take(self, turns: Turns) -> None:
         """Copy the rows of the group's worlds into the group's model."""
@@ -175,9 +175,9 @@ class ModelConstants:
             names = [field.name for field in fields]
             self._rows = ModelRows(put, [*names, *self._outputs], size, written - set(self._outputs))
             self._scratch = mjw.make_data(model, nworld=size, nconmax=1, njmax=1)
-            self._given = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
+            self._values = [flat(getattr(owner(put, name), name)).view(wp.int32) for name in names]
             # no computation produces a NaN with these bits, so all worlds count as changed at first
-            self._applied = [wp.full_like(given, -1) for given in self._given]
+            self._applied = [wp.full_like(values, -1) for values in self._values]
             self._changed = wp.zeros(nworld, dtype=bool)
             self._everyone = wp.full(size, True, dtype=bool)
             # see correct_weights
@@ -188,8 +188,8 @@ class ModelConstants:
     def __call__(self, mask: wp.array) -> None:
         """Update the masked worlds' constants, by Warp launches only."""
         self._changed.zero_()
-        for given, applied in zip(self._given, self._applied, strict=True):
-            args = [mask, given, applied, self._changed]
+        for values, applied in zip(self._values, self._applied, strict=True):
+            args = [mask, values, applied, self._changed]
             wp.launch(mark_changed, len(mask), args, device=mask.device)
         self._turns.run(self._changed, self._turn)
 

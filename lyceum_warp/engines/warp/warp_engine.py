@@ -29,7 +29,6 @@ from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
 from lyceum_warp.support.arrays import alias, flat, launch_rows
 from lyceum_warp.support.upstream import has_sdf_functions, quicken_mujoco_warp
-from lyceum_warp.support.validate import whole_number
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -82,10 +81,10 @@ class WarpEngine(Engine):
         with wp.ScopedDevice(device):
             self._state = wp.zeros((nworld, self.integration_size), dtype=float)
             self._history = wp.zeros_like(self.d.history)
-        self._own: dict[str, wp.array] = {}
+        self._views: dict[str, wp.array] = {}
         for field in self.fields.values():
-            self._own[field.name] = self._alias(field)
-            self.arrays[field.name] = wp.clone(self._own[field.name]) if field.snapshot else self._own[field.name]
+            self._views[field.name] = self._alias(field)
+            self.arrays[field.name] = wp.clone(self._views[field.name]) if field.snapshot else self._views[field.name]
         self.ctrl = self.arrays["ctrl"]
         for varied in self.dynamics.values():
             self.arrays[varied.name] = self._alias_model(varied)
@@ -98,13 +97,12 @@ class WarpEngine(Engine):
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
         self._current_parts = forward_parts(model, current)
-        self._reset_parts = None
-        if self.reset_stage < Stage.ACCELERATION:
-            self._reset_parts = forward_parts(model, self._reset)
+        needs_all = self.reset_stage == Stage.ACCELERATION
+        self._reset_parts = None if needs_all else forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # the parts that the next step can skip, because the last step or restart has computed them
-        moved = any(field.written for name, field in self.fields.items() if name in ("mocap_pos", "mocap_quat"))
-        current_parts = () if moved else self._current_parts or ()
+        moves_mocap = any(self.fields[name].written for name in ("mocap_pos", "mocap_quat") if name in self.fields)
+        current_parts = () if moves_mocap else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
         # A geom whose position is NaN has contacts with every element of a flex. The Jacobian rows of these contacts
         # hold NaN. The solver multiplies unused rows by zero, and NaN times zero is NaN. So a reset clears these rows.
@@ -172,7 +170,7 @@ class WarpEngine(Engine):
 
     def _copy_snapshots(self, mask: wp.array, fields: Iterable[Field]) -> None:
         for field in fields:
-            launch_rows(copy_rows, mask, flat(self._own[field.name]), flat(self.arrays[field.name]))
+            launch_rows(copy_rows, mask, flat(self._views[field.name]), flat(self.arrays[field.name]))
 
     # physics
 
@@ -216,9 +214,8 @@ class WarpEngine(Engine):
         with self._histories_kept():
             self._forward(self._current_parts, self.stage)
         if (mixed := self.fields.get("sensordata")) and mixed.snapshot and not mixed.lagged:
-            own, kept = self._own["sensordata"], self.arrays["sensordata"]
-            size = self.nworld, len(self._columns)
-            wp.launch(copy_columns, size, [mask, self._columns, own, kept], device=self.device)
+            args = [mask, self._columns, self._views["sensordata"], self.arrays["sensordata"]]
+            wp.launch(copy_columns, (self.nworld, len(self._columns)), args, device=self.device)
 
     def apply_model(self, mask: wp.array) -> None:
         with self._on_device():
@@ -351,19 +348,11 @@ def _refusals() -> Iterator[None]:
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    given = {"nconmax": nconmax, "njmax": njmax}
-    sizes = [size if size is None else whole_number(name, size, low=1) for name, size in given.items()]
     with _refusals():
-        _check_sdf_plugins(model)
-        probed = probe_sizes(model, varied) if None in sizes else (0, 0)
-    contacts, constraints = (other if size is None else size for size, other in zip(sizes, probed, strict=True))
-    return contacts, constraints
-
-
-def _check_sdf_plugins(model: mujoco.MjModel) -> None:
-    """Refuse SDF plugins without a registered distance function."""
-    if (model.geom_plugin >= 0).any() and not has_sdf_functions():
-        raise NotImplementedError("SDF plugins need a registered distance function")
+        if (model.geom_plugin >= 0).any() and not has_sdf_functions():
+            raise NotImplementedError("SDF plugins need a registered distance function")
+        contacts, constraints = probe_sizes(model, varied) if None in (nconmax, njmax) else (0, 0)
+    return contacts if nconmax is None else nconmax, constraints if njmax is None else njmax
 
 
 def _contacts_of_one_world(model: mjw.Model) -> int:
