@@ -224,11 +224,10 @@ def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
     Launched over (nsample,).
     """
     k = wp.tid()
-    own = return_in[k]
     better = int(0)
     first = k // samples * samples
     for j in range(first, first + samples):
-        if return_in[j] > own or (return_in[j] == own and j < k):
+        if return_in[j] > return_in[k] or (return_in[j] == return_in[k] and j < k):
             better += 1
     rank_out[k] = better
 
@@ -320,6 +319,14 @@ def undo_bad_fit(
         problem_inout[p] = problem_inout[p] | BAD_FIT
 
 
+@wp.func
+def plan_element(number: int, plants: int, nact: int) -> tuple[int, int, int]:
+    """Return the row, the plant and the column of an element of the plans."""
+    row = number // nact
+    t = row // plants
+    return t, row - t * plants, number - row * nact
+
+
 @wp.kernel(enable_backward=False, module=_TILES)
 def fit_deviation(
     weight_in: wp.array[float],
@@ -340,18 +347,15 @@ def fit_deviation(
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_in.shape[1], plan_in.shape[2]
-    t = number // (plants * nact)
-    column = number - t * plants * nact
-    p = plant_of(column, plants * nact, plants)
-    i = column - p * nact
+    t, p, i = plan_element(number, plants, nact)
     total = float(0.0)
     for k in range(first_row(p, nsample, plants) + lane, first_row(p + 1, nsample, plants), wp.block_dim()):
         distance = action_in[t, k, i] - plan_in[t, p, i]
         total += weight_in[k] * distance * distance
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:
-        fitted = wp.max(wp.sqrt(total) / spread_in[t], smallest_in[i])
-        deviation_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, fitted, deviation_in[t, p, i])
+        deviation = wp.max(wp.sqrt(total) / spread_in[t], smallest_in[i])
+        deviation_out[t, p, i] = wp.where(summary_in[p, 0] > -wp.inf, deviation, deviation_in[t, p, i])
 
 
 @wp.kernel(enable_backward=False, module=_TILES)
@@ -368,10 +372,7 @@ def average(
     """
     number, lane = wp.tid()
     nsample, plants, nact = weight_in.shape[0], plan_out.shape[1], plan_out.shape[2]
-    t = number // (plants * nact)
-    column = number - t * plants * nact
-    p = plant_of(column, plants * nact, plants)
-    i = column - p * nact
+    t, p, i = plan_element(number, plants, nact)
     total = float(0.0)
     for k in range(first_row(p, nsample, plants) + lane, first_row(p + 1, nsample, plants), wp.block_dim()):
         total += weight_in[k] * action_in[t, k, i]

@@ -40,6 +40,12 @@ def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.ar
     state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
 
 
+@wp.func
+def control_of(action: float, i: int, range_in: wp.array2d[float], scale_in: wp.array2d[float]) -> float:
+    """Map element ``i`` of an action to its control, clipped to the control's range, for tasks without ``control``."""
+    return wp.clamp(action * scale_in[i, 0] + scale_in[i, 1], range_in[i, 0], range_in[i, 1])
+
+
 @wp.kernel(enable_backward=False)
 def controls(
     action_inout: wp.array3d[float],
@@ -62,8 +68,7 @@ def controls(
         for i in range(action_inout.shape[2]):
             action_inout[t, w, i] = 0.0
     for i in range(ctrl_out.shape[2]):
-        ctrl = action_inout[t, w, i] * scale_in[i, 0] + scale_in[i, 1]
-        ctrl_out[t, w, i] = wp.clamp(ctrl, range_in[i, 0], range_in[i, 1])
+        ctrl_out[t, w, i] = control_of(action_inout[t, w, i], i, range_in, scale_in)
 
 
 @wp.kernel(enable_backward=False)

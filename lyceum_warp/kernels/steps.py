@@ -8,6 +8,7 @@ import warp as wp
 
 from lyceum_warp.core.done import FAULTS, Done
 from lyceum_warp.kernels.random import stream, substream
+from lyceum_warp.kernels.rollouts import control_of
 from lyceum_warp.kernels.step_types import Counters, TaskCode
 from lyceum_warp.kernels.transitions import judge_kernels, rollout_kernels
 
@@ -67,11 +68,10 @@ def act_kernels(task: TaskCode) -> None:
                 if wp.isnan(ctrl_out[w, i]):
                     fault = fault | NAN
                     ctrl_out[w, i] = 0.0
+                ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
         else:
             for i in range(ctrl_out.shape[1]):
-                ctrl_out[w, i] = safe_action_out[w, i] * scale_in[i, 0] + scale_in[i, 1]
-        for i in range(ctrl_out.shape[1]):
-            ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
+                ctrl_out[w, i] = control_of(safe_action_out[w, i], i, range_in, scale_in)
         fault_out[w] = fault
         counters.step[w] = counters.step[w] + 1
 
