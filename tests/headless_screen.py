@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 
-from lyceum_warp.viewer.protocol import Frame, Opened, Reply, Scene, Status
+from lyceum_warp.viewer.protocol import Frame, Opened, Scene, Status
 from lyceum_warp.viewer.session.frames import model_bytes
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.studio import imgui, implot
@@ -87,10 +87,12 @@ class Bench:
         io = imgui.GetIO()
         io.DisplaySize = imgui.Vec2(1280, 800)
         io.BackendFlags = int(io.BackendFlags) | int(imgui.BackendFlags.RendererHasTextures)
-        self.sent: list[Reply] = []
+        self.sent: list[Any] = []
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
-        self.panel = Panel(scene, model, self.sent.append, self.take, self, Opened("http://here"), lambda file: None)
+        self.panel = Panel(
+            scene, model, self.sent.append, self.take, self, Opened(("viewer: http://here",)), lambda file: None
+        )
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()
         self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])
@@ -107,7 +109,7 @@ class Bench:
         self.draw(frame_of(self.model, self.data, status))
         self.sent.clear()
 
-    def draw(self, frame: Frame | None = None) -> list[Reply]:
+    def draw(self, frame: Frame | None = None) -> list[Any]:
         self.given, before = frame, len(self.sent)
         imgui.NewFrame()
         self.viewer.dispatch(messages.UpdateEvent())

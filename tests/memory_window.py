@@ -4,7 +4,8 @@ from collections.abc import Callable, Iterable
 
 import torch
 
-from lyceum_warp.viewer.protocol import Command, Frame
+from lyceum_warp.viewer.commands import Command
+from lyceum_warp.viewer.protocol import Frame
 from lyceum_warp.viewer.session.clock import Session
 
 

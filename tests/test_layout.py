@@ -146,7 +146,8 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     assert not {"torch", "warp"} & set(loaded)
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
     faces = {"lyceum_warp.support", "lyceum_warp.support.faces"}
-    assert own == {"lyceum_warp", "lyceum_warp.viewer", "lyceum_warp.viewer.protocol", *faces, *window}
+    messages = {"lyceum_warp.viewer.commands", "lyceum_warp.viewer.protocol"}
+    assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *faces, *window}
 
 
 def test_viewer_session_imports_nothing_from_the_window() -> None:

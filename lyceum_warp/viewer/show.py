@@ -85,8 +85,8 @@ if (navigator.userAgentData && ["localhost", "127.0.0.1"].includes(location.host
 </script>"""
 """The HTML of a notebook's output.
 
-Studio shares memory between threads. In an embedded page, only Chromium-based browsers allow this. These browsers send
-the viewer's cookie only if the page has the notebook's host name.
+Studio shares memory between threads. In an embedded page, only Chromium-based browsers allow this. These browsers let
+studio store data only if the page has the notebook's host name.
 """
 
 
@@ -99,7 +99,7 @@ class BackgroundView:
 
     def __init__(self, session: Session, window: Window) -> None:
         self.address = window.address
-        self._title, self._window = session.stage.scene.title, window
+        self._session = session
         self._thread = threading.Thread(target=session.run, args=(window,), name="lyceum_warp view", daemon=True)
         self._thread.start()
 
@@ -110,11 +110,11 @@ class BackgroundView:
 
     def close(self) -> None:
         """End the view, and leave the worlds in their last state."""
-        self._window.close()
+        self._session.stage.closed = True
         self._thread.join()
 
     def _repr_html_(self) -> str:
-        title = html.escape(self._title)
+        title = html.escape(self._session.stage.scene.title)
         if not self.is_open:
             return f"viewer of {title} (closed)"
         return FRAME.format(name=f"viewer-{secrets.token_hex(4)}", address=html.escape(self.address), title=title)

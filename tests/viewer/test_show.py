@@ -21,7 +21,7 @@ def test_show_displays_the_page_and_a_link_in_a_notebook_while_the_worlds_run(
     while env.episode_step[0] == 0 and time.monotonic() < end:
         time.sleep(0.01)
     assert shown.is_open and env.episode_step[0] > 0
-    link = r'<a id="([\w-]+)" href="http://127\.0\.0\.1:\d+/\?token=[\w-]{43}" target="_blank">.*getElementById\("\1"\)'
+    link = r'<a id="([\w-]+)" href="http://127\.0\.0\.1:\d+/[\w-]{43}/" target="_blank">.*getElementById\("\1"\)'
     assert re.search(link, shown._repr_html_(), re.DOTALL) and 'createElement("iframe")' in shown._repr_html_()
     shown.close()
     shown.close()

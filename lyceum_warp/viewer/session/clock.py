@@ -13,18 +13,7 @@ import torch
 
 from lyceum_warp.controllers import ControlProgress, control_async
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import (
-    Close,
-    Command,
-    Drive,
-    Perturb,
-    SetGhosts,
-    SetMode,
-    SetNumber,
-    SetVideo,
-    TakePicture,
-)
-from lyceum_warp.viewer.session.commands import obey
+from lyceum_warp.viewer.commands import BETWEEN_CALLS, DURING_STEPS, Command, close
 from lyceum_warp.viewer.session.drivers import ControllerError, WorldControl
 from lyceum_warp.viewer.session.plant import POLL, InterruptedByCommand, WorkingClock
 from lyceum_warp.viewer.session.stage import Stage
@@ -59,12 +48,12 @@ class Session:
         controllers: Mapping[str, Any] | None = None,
         *,
         watchers: Sequence[Watcher] = (),
-        **shown: Any,
+        **options: Any,
     ) -> None:
-        self.stage = Stage(env, controllers, **shown)
+        self.stage = Stage(env, controllers, **options)
         self._watchers = watchers
         self._window: Window | None = None
-        self._closed = self._in_run = False
+        self._in_run = False
         self._waiting: deque[Command] = deque()
         self._next_step = self._next_frame = self._next_check = self._last_frame = self._last_work = 0.0
 
@@ -83,7 +72,7 @@ class Session:
             ends.callback(window.close)
             while True:
                 self._poll()
-                if self._closed:
+                if self.stage.closed:
                     return
                 try:
                     if self._by_the_clock():
@@ -113,8 +102,9 @@ class Session:
 
     def _poll(self) -> None:
         assert self._window is not None
-        if not self._window.is_open():
-            self._waiting.append(Close())
+        self.stage.closed |= not self._window.is_open()
+        if self.stage.closed and self._in_run:
+            raise InterruptedByCommand
         self._waiting.extend(self._window.commands())
         while self._waiting:
             self.obey(self._waiting.popleft())
@@ -132,7 +122,7 @@ class Session:
             return
         self._next_frame = now + _IDLE if stage.paused and not videos.due else max(self._next_frame + 1 / _FPS, now)
         self._last_frame = now
-        frame = stage.frame()
+        frame = stage.frame(news=self._window.wants_frame)
         self._window.show(frame)
         videos.add(frame)
 
@@ -182,24 +172,22 @@ class Session:
 
         Most commands first stop a plant that runs in real time, because they need its state.
         """
-        push = isinstance(command, Drive) or (isinstance(command, Perturb) and command.qpos is None)
-        if self._in_run and not push and not isinstance(command, SetVideo | TakePicture | SetGhosts):
+        function, arguments, options = command
+        if self._in_run and function not in DURING_STEPS:
             self._waiting.appendleft(command)
             raise InterruptedByCommand
         stage = self.stage
         self._next_frame = min(self._next_frame, self._last_frame + 1 / _FPS)
-        if isinstance(command, Close):
-            self._closed = True
-        if isinstance(command, SetMode | SetNumber) and not self._calls_have_ended():
+        if function in BETWEEN_CALLS and not self._calls_have_ended():
             return
         try:
-            obey(stage, command)
+            function(stage, *arguments, **options)
         except (ValueError, OSError, NoVideoError) as error:
             stage.frames.say(str(error))
         except ControllerError as error:
             self._give_up_control(error)
         stage.end_old_push()
-        if self._in_run and push:
+        if self._in_run:
             stage.live.expect_steps()
 
     def _calls_have_ended(self) -> bool:
@@ -207,13 +195,14 @@ class Session:
 
         The first calls of a new controller may capture CUDA graphs. No other controller may run during a capture.
         """
+        window = self._window
         while any(isinstance(each, WorldControl) and each.busy for each in self.stage.controllers.values()):
-            if (window := self._window) is not None:
+            if window is not None:
                 self._waiting.extend(window.commands())
-                if not window.is_open() or any(isinstance(each, Close) for each in self._waiting):
-                    self._closed = True
-                    return False
+                self.stage.closed |= not window.is_open() or any(each.function is close for each in self._waiting)
                 self._show_when_due(time.perf_counter())
+            if self.stage.closed:
+                return False
             time.sleep(POLL)
         return True
 

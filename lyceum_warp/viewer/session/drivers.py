@@ -156,9 +156,9 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
     samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
     if isinstance(controller, Planner):
         # samples are drawn independently, so the first ones represent all of them
-        shown = torch.arange(min(MOST_SAMPLES, controller.samples), device=plan.device)
-        shown[0] = controller.returns.argmax()
-        samples, best = controller.sampled.index_select(1, shown).to("cpu", torch.float32), 0
+        indices = torch.arange(min(MOST_SAMPLES, controller.samples), device=plan.device)
+        indices[0] = controller.returns.argmax()
+        samples, best = controller.sampled.index_select(1, indices).to("cpu", torch.float32), 0
     return PlanView(state.detach().to("cpu", torch.float64, copy=True).view(-1), actions, samples, best)
 
 

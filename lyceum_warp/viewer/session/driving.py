@@ -1,4 +1,4 @@
-"""Steer a walking robot by the user's commands, and draw commanded and measured velocities as arrows.
+"""Steer a walking robot by the user's commands, and show commanded and measured velocities as arrows.
 
 The task must store its command like the velocity tasks (see ``docs/velocity.md``). The robot's first joint must be the
 free joint of its base.
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import Arrow
+from lyceum_warp.viewer.protocol import Arrow, Velocity
 from lyceum_warp.viewer.session.live import Live
 
 _MEMORY = ("drawn_velocity", "heading_target", "heading_controlled", "standing", "command_timer")
@@ -25,14 +25,15 @@ class Driving:
 
     def __init__(self, env: Env) -> None:
         self._parts, self._params = env.state_space.parts, env.task.params
-        self.limits: tuple[float, float, float] | None = None
+        self.limits: Velocity | None = None
         """The task's largest forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
         if all(name in self._parts for name in _MEMORY):
             _, _, forward, turn = np.asarray(self._params["stages"])[0]
             self.limits = float(forward), float(self._params["lateral_velocity"]), float(turn)
-        self.wanted: tuple[float, float, float] | None = None
+        self.velocity: Velocity | None = None
+        """The user's command, or None if the task chooses its commands."""
 
-    def command(self, state: np.ndarray) -> tuple[float, float, float] | None:
+    def command(self, state: np.ndarray) -> Velocity | None:
         """Return the commanded forward velocity, lateral velocity and yaw rate in a state, (state_space.size,)."""
         if self.limits is None:
             return None
@@ -47,11 +48,11 @@ class Driving:
 
     def apply(self, live: Live) -> None:
         """Write the user's command into the displayed world, or let the task choose a command in the next step."""
-        if self.wanted is None:
+        if self.velocity is None:
             live.write(command_timer=np.zeros(1))
         else:
             none = dict.fromkeys(("heading_controlled", "standing"), np.zeros(1))
-            live.write(drawn_velocity=np.array(self.wanted), command_timer=np.array([_NEVER]), **none)
+            live.write(drawn_velocity=np.array(self.velocity), command_timer=np.array([_NEVER]), **none)
 
     def arrows(self, state: np.ndarray) -> tuple[Arrow, ...]:
         """Make arrows above the base: horizontal ones for velocities, and vertical ones for yaw rates."""

@@ -3,13 +3,15 @@
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import Frame, Ghost, SetGhosts, Status
+from lyceum_warp.viewer.protocol import MAX_MESSAGES, MAX_POINTS, Frame, Ghost, Ghosts, Status
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows
 from lyceum_warp.viewer.session.playback import Playback, reasons
@@ -27,14 +29,22 @@ class FrameMaker:
     """Makes frames."""
 
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
-        self.ghosts = SetGhosts()
-        self.messages: list[str] = []
+        self.ghosts = Ghosts()
         self._env, self._curves, self._driving = env, curves, driving
-        self._points: list[list[float]] = []
+        self._messages: deque[str] = deque(maxlen=MAX_MESSAGES)
+        self._points: deque[Sequence[float]] = deque(maxlen=MAX_POINTS)
 
     def say(self, text: str) -> None:
         """Show a message in the next frame."""
-        self.messages.append(text)
+        self._messages.append(text)
+
+    def news(self) -> dict[str, Any]:
+        """Return the messages and the points of curves since the last call."""
+        points = np.array(self._points, dtype=float).reshape(-1, 2 + self._curves)
+        messages = tuple(self._messages)
+        self._points.clear()
+        self._messages.clear()
+        return {"points": points, "messages": messages}
 
     def add_point(self, playback: Playback) -> None:
         """Add a step of a playback to the curves."""
@@ -52,13 +62,14 @@ class FrameMaker:
             traces: The paths of a planner's samples.
             status: A function that completes a ``Status``, given some of its fields.
         """
-        shown = _following(main.world, main.env.nworld, self.ghosts.worlds)
-        rows = live.rows(shown if live is main else (), self.ghosts.burst)
+        worlds = _following(main.world, main.env.nworld, self.ghosts.worlds)
+        rows = live.rows(worlds if live is main else (), self.ghosts.burst)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
+        self._points.extend(rows.points.tolist())
         others, grid = rows.states[1:], self.ghosts.grid
-        if live is not main and shown:  # the other worlds do not move
-            others = main.rows(shown).states[1:]
+        if live is not main and worlds:  # the other worlds do not move
+            others = main.rows(worlds).states[1:]
         ghosts = [] if traces is None else [Ghost(self._physics(traces.final), (*_PLAN, _OPACITY))]
         ghosts += self._beside(others) if grid else self._coloured(others)
         ghosts += self._burst(rows.back, _PAST)
@@ -71,14 +82,14 @@ class FrameMaker:
         return Frame(
             self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             None if traces is None else traces.paths, None if traces is None else traces.best,
-            self._driving.arrows(state), rows.points, self._take_messages(),
+            self._driving.arrows(state),
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; for ``status``, see ``of_worlds``."""
         episode, state = playback.episode, playback.state
-        shown = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
-        others = [playback.episodes[index].states for index in shown]
+        indices = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
+        others = [playback.episodes[index].states for index in indices]
         ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in others)
         around = playback.around(self.ghosts.burst)
         ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
@@ -92,11 +103,9 @@ class FrameMaker:
             world=0, step=playback.step, steps=episode.steps, time=playback.step * self._env.timestep,
             text=tuple(text), seekable=(0, episode.steps),
         )  # fmt: skip
-        points, self._points = self._points, []
         return Frame(
             self._physics(state), self._model_fields(state), complete, tuple(ghosts),
             arrows=self._driving.arrows(state),
-            samples=np.array(points, dtype=float).reshape(-1, 2 + self._curves), messages=self._take_messages(),
         )  # fmt: skip
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
@@ -138,10 +147,6 @@ class FrameMaker:
     def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
         parts = self._env.state_space.parts
         return {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
-
-    def _take_messages(self) -> tuple[str, ...]:
-        messages, self.messages = self.messages, []
-        return tuple(messages)
 
 
 def _following(index: int, number: int, count: int) -> list[int]:

@@ -19,7 +19,7 @@ PLANT_HISTORY_BYTES = 16 * 2**20
 HISTORY_STEPS = 2000
 """Maximum number of steps in the history."""
 
-_CURVE_ROWS = 512  # maximum number of curve points per frame; further points overwrite the oldest
+_CURVE_ROWS = 4096  # maximum number of curve points per frame; further points overwrite the oldest
 
 
 class Past:
@@ -287,13 +287,14 @@ class Live:
 
     def rows(self, worlds: Sequence[int] = (), burst: int = 0) -> Rows:
         """Copy the data of a frame to the host, with the states of other worlds and up to ``burst`` earlier states."""
-        past, shown = self.past, [self.world, *worlds]
-        states = self.env.get_state(out=self._state)[shown]
+        past = self.past
+        states = self.env.get_state(out=self._state)[[self.world, *worlds]]
         count = min(burst, past.behind)
         earlier = [(past.now - past.behind * i // count) % past.length for i in range(1, count + 1)]
-        parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves
-        rows, back, end, fault, curves = (part.cpu().numpy() for part in parts)
-        kept, self._points = np.arange(max(0, self._points - _CURVE_ROWS), self._points) % _CURVE_ROWS, 0
+        newest = [i % _CURVE_ROWS for i in range(max(0, self._points - _CURVE_ROWS), self._points)]
+        self._points = 0
+        parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves[newest]
+        rows, back, end, fault, points = (part.cpu().numpy() for part in parts)
         news = [tuple(each[1:].tolist()) if each[0] > self._reported else None for each in (end, fault)]
         self._reported = self.made
-        return Rows(rows, back, self.returns[self.world].item(), news[0], news[1], curves[kept])
+        return Rows(rows, back, self.returns[self.world].item(), news[0], news[1], points)

@@ -57,7 +57,7 @@ class Stage:
         self.mode: Mode = "passive"
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
-        self.dragging = False
+        self.dragging = self.closed = False
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -70,7 +70,6 @@ class Stage:
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
-        self.shown: Frame | None = None
         self.steps = 0
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
         self.select(modes[0], next(iter(self.controllers), None))
@@ -181,10 +180,10 @@ class Stage:
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
-    def set_number(self, of: str, name: str, value: float) -> None:
+    def set_number(self, owner: str, name: str, value: float) -> None:
         """Change a setting of the planner in use, or a task parameter in all worlds."""
         planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
-        if of == "planner":
+        if owner == "planner":
             if not isinstance(self.control, WorldControl):  # the mode may have changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [self.control]
@@ -202,8 +201,8 @@ class Stage:
         """Show another world. First clear the user's push and command in the displayed world."""
         before = self.live
         before.end_push()
-        if self.driving.wanted is not None:
-            self.driving.wanted = None
+        if self.driving.velocity is not None:
+            self.driving.velocity = None
             self.driving.apply(before)
         self.dragging = False
         if before is not self.main:
@@ -213,9 +212,9 @@ class Stage:
             self._transfer(self.main, before)
             self.reset_controller()
 
-    def go_on_from(self, state: torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
+    def go_on_from(self, state: np.ndarray | torch.Tensor, live: Live, *, new_episode: bool = False) -> None:
         """Set the displayed world's state, and continue its episode from there, even if the episode had ended."""
-        state = state.clone()
+        state = torch.as_tensor(state).clone()
         state[self.env.state_space.parts["done_reason"]] = 0.0
         live.set_row(state, new_episode=new_episode)
 
@@ -227,20 +226,20 @@ class Stage:
 
     # frames
 
-    def frame(self) -> Frame:
-        """Make a frame of the present state."""
-        files, self.videos.files = self.videos.files, []
-        self.shown = dataclasses.replace(self._frame(), files=tuple(str(file.absolute()) for file in files))
-        return self.shown
-
-    def _frame(self) -> Frame:
+    def frame(self, *, news: bool = True) -> Frame:
+        """Make a frame of the present state, with all new messages, files and points of curves if ``news`` is true."""
         if self.mode == "playback":
-            return self.frames.of_playback(self.playback, self._status)
-        frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status)
-        wanted, command, live = self.driving.wanted, frame.status.command, self.live
-        if wanted and command and not live.past.ahead and not np.allclose(command, wanted, atol=1e-6):
-            self.driving.apply(live)  # a reset or a change of world has replaced the user's command
-            live.expect_steps()
+            frame = self.frames.of_playback(self.playback, self._status)
+        else:
+            frame = self.frames.of_worlds(self.live, self.main, self._traces(), self._status)
+            velocity, command, live = self.driving.velocity, frame.status.command, self.live
+            if velocity and command and not live.past.ahead and not np.allclose(command, velocity, atol=1e-6):
+                self.driving.apply(live)  # a reset or a change of world has replaced the user's command
+                live.expect_steps()
+        if news:
+            files = tuple(str(file.absolute()) for file in self.videos.files)
+            self.videos.files.clear()
+            frame = dataclasses.replace(frame, files=files, **self.frames.news())
         return frame
 
     def _traces(self) -> Traces | None:
@@ -251,11 +250,11 @@ class Stage:
         try:
             seen = thread.follow(current.look())
         except Exception as error:
-            self.frames.say(f"the paths of samples cannot be drawn: {error}")
+            self.frames.say(f"the paths of samples cannot be shown: {error}")
             return None
         return seen if seen is not None and (self.paused or time.perf_counter() - seen.made < _OLD) else None
 
-    def _status(self, **rest: Any) -> Status:
+    def _status(self, **fields: Any) -> Status:
         now = time.perf_counter()
         self.progress.append((now, self.steps))
         begun, steps = self.progress[0]
@@ -266,7 +265,7 @@ class Stage:
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
             measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
-            ghosts=self.frames.ghosts, driven=self.driving.wanted is not None,
+            ghosts=self.frames.ghosts, driven=self.driving.velocity is not None,
             planner=planner_numbers(getattr(self.control, "controller", None)), params=task_numbers(self.env),
-            plan_ms=1000 * self.control.seconds if self.control else math.nan, **rest,
+            plan_ms=1000 * self.control.seconds if self.control else math.nan, **fields,
         )  # fmt: skip

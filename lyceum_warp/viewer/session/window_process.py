@@ -1,19 +1,18 @@
 """Start the window process, send it frames, and collect its commands."""
 
 import contextlib
-import os
+import multiprocessing
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import threading
 from collections import deque
-from multiprocessing.connection import Connection
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command, Failed, Frame, Opened, Scene
+from lyceum_warp.viewer.commands import Command, close
+from lyceum_warp.viewer.protocol import Failed, Frame, Opened, Scene, Taken
 
 OPENING_TIME = 60.0
 """Maximum time until the window is open, in seconds."""
@@ -44,15 +43,15 @@ class Window:
     """
 
     def __init__(self, scene: Scene, *, host: str = "127.0.0.1", port: int | None = None) -> None:
-        self._pending: Frame | None = None
-        self._taken = True
-        self._changed = threading.Condition()  # the lock of _changed also guards _pending and _taken
+        self.wants_frame = True
+        """Whether the window is ready for a frame."""
+        self.error: str | None = None
         self._ended = False
         self._commands: deque[Command] = deque()
-        self._threads: list[threading.Thread] = []
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  # closed in close()
-        self._socket, theirs = socket.socketpair()
-        self._connection = Connection(os.dup(self._socket.fileno()))
+        self._sender = ThreadPoolExecutor(1, "lyceum-viewer")  # the window may be slow to receive a frame
+        self._receiver = threading.Thread(target=self._receive, daemon=True, name="lyceum-viewer")
+        self._connection, theirs = multiprocessing.Pipe()
         with theirs:
             self._process = subprocess.Popen(
                 # with -P, Python does not search the current folder for modules
@@ -63,9 +62,8 @@ class Window:
                 stderr=self._log,
                 process_group=0,  # a terminal sends Ctrl-C to a whole process group
             )
-        self.error: str | None = None
         try:
-            self._connection.send(protocol.Opening(scene, host, port))
+            self._connection.send((scene, host, port))
             reply = self._connection.recv() if self._connection.poll(OPENING_TIME) else None
         except (EOFError, OSError):
             self._process.wait()
@@ -79,27 +77,16 @@ class Window:
                 raise ValueError(reply.reason)
             reason = reply.reason if isinstance(reply, Failed) else f"its process did not start in {OPENING_TIME:.0f} s"
             raise NoWindowError(f"the viewer's window cannot be opened: {reason}")
-        self.address = reply.address
         self.instructions = reply.instructions
         """The lines to print: the page's address, and the ssh command for other machines."""
-        for target in (self._send, self._receive):
-            self._threads.append(threading.Thread(target=target, daemon=True, name="lyceum-viewer"))
-            self._threads[-1].start()
+        self.address = self.instructions[0].partition(" ")[2]
+        self._receiver.start()
 
     def show(self, frame: Frame) -> None:
-        """Send a frame without waiting for the window.
-
-        An older frame that was not sent yet is skipped. The new frame then also holds the curve points and messages of
-        the older frame.
-        """
-        with self._changed:
-            self._pending = protocol.latest(self._pending, frame)
-            self._changed.notify()
-
-    @property
-    def wants_frame(self) -> bool:
-        """Whether the window is ready for a frame."""
-        return self._taken and self._pending is None and not self._ended
+        """Send a frame without waiting for the window, if ``wants_frame`` is true."""
+        if self.wants_frame:
+            self.wants_frame = False
+            self._sender.submit(self._connection.send, frame)
 
     def commands(self) -> list[Command]:
         """Return the commands since the last call, in order."""
@@ -111,24 +98,21 @@ class Window:
 
     def close(self) -> None:
         """End the window process."""
-        self._end()
-        with contextlib.suppress(OSError):  # this wakes both threads and the window process
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
+        if self._connection.closed:
+            return
+        self._ended = True
+        self.wants_frame = False
+        self._sender.submit(self._connection.send, None)
         try:
             self._process.wait(CLOSING_TIME)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        for thread in self._threads:  # end the threads first, because they must not read from a closed connection
-            thread.join(CLOSING_TIME)
+        self._sender.shutdown()
+        if self._receiver.is_alive():
+            self._receiver.join(CLOSING_TIME)
         self._connection.close()
         self._log.close()
-
-    def _end(self) -> None:
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
 
     def _last_words(self) -> str:
         code = self._process.returncode
@@ -140,36 +124,22 @@ class Window:
         lines = self._log.read().decode(errors="replace").strip().splitlines()
         return lines[-1].strip() if lines else f"its process ended with code {code}"
 
-    def _send(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._ended or (self._taken and self._pending is not None))
-                if self._ended:
-                    return
-                frame, self._pending, self._taken = self._pending, None, False
-            try:
-                self._connection.send(frame)
-            except (OSError, ValueError):
-                return  # the receiving thread reports the reason
-
     def _receive(self) -> None:
         closed = False
         try:
-            while not self._ended:
-                reply: protocol.Reply = self._connection.recv()
-                if isinstance(reply, protocol.Taken):
-                    with self._changed:
-                        self._taken = True
-                        self._changed.notify()
+            while True:
+                reply: Command | Failed | Taken = self._connection.recv()
+                if isinstance(reply, Taken):
+                    self.wants_frame = not self._ended
                 elif isinstance(reply, Failed):
                     self.error = reply.reason
-                elif not isinstance(reply, Opened):
-                    closed = closed or isinstance(reply, protocol.Close)
+                else:
+                    closed = closed or reply.function is close
                     self._commands.append(reply)
         except (EOFError, OSError):
             if not self._ended and not closed and self.error is None:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(CLOSING_TIME)
                 self.error = self._last_words()
-        finally:
-            self._end()
+        self._ended = True
+        self.wants_frame = False

@@ -1,38 +1,37 @@
-"""Turn keys and buttons into commands."""
+"""List the user's actions with their keys, and send the corresponding commands."""
 
 import dataclasses
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import MOST_BURST, Command, Frame, Scene, Status
+from lyceum_warp.viewer import commands
+from lyceum_warp.viewer.commands import Command
+from lyceum_warp.viewer.protocol import MOST_BURST, Frame, Scene, Status
 from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
+
+P = ParamSpec("P")
 
 SPEEDS = tuple(2.0**power for power in range(-4, 5))
 """The speeds that the user can choose, in simulated seconds per second of wall time."""
 MANY_STEPS = 50
 """Shift+Right and Shift+Left move by this many steps."""
 
-_DRIVING = tuple(getattr(imgui.Key, name) for name in "WSADQE")  # forward, back, left, right, turn left, turn right
-
-KEY_NAMES = {"Right": "RightArrow", "Left": "LeftArrow", "Up": "UpArrow", "Down": "DownArrow"}
-"""Maps the panel's names of keys to ImGui's names."""
+_DRIVING_KEYS = tuple(getattr(imgui.Key, name) for name in "WSADQE")
 
 
 class Actions:
     """Stores the user's choices, and sends the corresponding commands."""
 
-    def __init__(self, scene: Scene, do: Callable[[Command], None]) -> None:
-        self.scene, self.do = scene, do
+    def __init__(self, scene: Scene, send: Callable[[Command], None]) -> None:
+        self.scene, self._send = scene, send
         self.frame: Frame | None = None
         self.viewer: Any
         self.cameras: ViewCameras
         self.windows = {"messages", *(["curves"] if scene.curves else [])}
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
-        self._keys = key_table()
         self._steering = (0.0, 0.0, 0.0)  # the last command that the keys gave
 
     @property
@@ -40,6 +39,10 @@ class Actions:
         """The session's status, which is unknown before the first frame."""
         assert self.frame is not None
         return self.frame.status
+
+    def do(self, function: Callable[Concatenate[Any, P], None], *arguments: P.args, **options: P.kwargs) -> None:
+        """Send a command: a function of ``commands.py`` with its arguments."""
+        self._send(Command(function, arguments, options))
 
     def say(self, *messages: str) -> None:
         """Add lines to the messages."""
@@ -51,13 +54,14 @@ class Actions:
         io = imgui.GetIO()
         if io.WantCaptureKeyboard:
             return
-        for key in self._keys:
-            *held, name = key.name.split("+")
-            code = getattr(imgui.Key, KEY_NAMES.get(name, name))
-            if [io.KeyCtrl, io.KeyShift] == ["Ctrl" in held, "Shift" in held] and imgui.IsKeyPressed(code, key.repeat):
-                key.action(self)
+        for key, action in ACTIONS.items():
+            *modifiers, name = key.split("+")
+            code = getattr(imgui.Key, f"{name}Arrow" if name in ("Right", "Left", "Up", "Down") else name)
+            held = [io.KeyCtrl, io.KeyShift] == ["Ctrl" in modifiers, "Shift" in modifiers]
+            if held and imgui.IsKeyPressed(code, action.repeat):
+                action.act(self)
                 return
-        if self.status.driven and any(map(imgui.IsKeyDown, _DRIVING)):
+        if self.status.driven and any(map(imgui.IsKeyDown, _DRIVING_KEYS)):
             return
         viewer, flying = self.viewer, self.cameras.state.camera_index == ux.FREE_CAMERA_IDX
         if not io.KeyCtrl:
@@ -69,101 +73,96 @@ class Actions:
         """Send a velocity command when the user presses or releases W, A, S, D, Q or E."""
         if self.scene.speeds is None or not self.status.driven or imgui.GetIO().WantCaptureKeyboard:
             return
-        ahead, back, left, right, anticlockwise, clockwise = (bool(imgui.IsKeyDown(key)) for key in _DRIVING)
+        ahead, back, left, right, anticlockwise, clockwise = (bool(imgui.IsKeyDown(key)) for key in _DRIVING_KEYS)
         forward, lateral, turn = self.scene.speeds
-        command = (ahead - back) * forward, (left - right) * lateral, (anticlockwise - clockwise) * turn
-        if command != self._steering:
-            self._steering = command
-            self.do(protocol.Drive(command))
+        velocity = (ahead - back) * forward, (left - right) * lateral, (anticlockwise - clockwise) * turn
+        if velocity != self._steering:
+            self._steering = velocity
+            self.do(commands.drive, velocity)
 
     def toggle_driving(self) -> None:
         """Let the user drive, or let the task choose commands again."""
         if self.scene.speeds is not None:
-            self.do(protocol.Drive(None if self.status.driven else (0.0, 0.0, 0.0)))
+            self.do(commands.drive, None if self.status.driven else (0.0, 0.0, 0.0))
 
     def change_mode(self, by: int) -> None:
         """Change to the next or the previous mode."""
         modes = self.scene.modes
-        self.do(protocol.SetMode(modes[(modes.index(self.status.mode) + by) % len(modes)]))
+        self.do(commands.set_mode, modes[(modes.index(self.status.mode) + by) % len(modes)])
 
     def change_controller(self, by: int) -> None:
         """Change to the next or the previous controller."""
         names = self.scene.controllers
         if names:
-            now = names.index(self.status.controller) if self.status.controller in names else -by
-            self.do(protocol.SetMode("controller", controller=names[(now + by) % len(names)]))
+            index = names.index(self.status.controller) if self.status.controller in names else -by
+            self.do(commands.set_mode, "controller", controller=names[(index + by) % len(names)])
 
-    def change_shown(self, by: int) -> None:
-        """Show the next or the previous world or episode."""
+    def change_world(self, by: int) -> None:
+        """Show the next or the previous world, or episode of a playback."""
         if self.status.mode == "playback":
             episode = ((self.status.episode or 0) + by) % len(self.scene.episodes)
-            self.do(protocol.SetMode("playback", episode=episode))
+            self.do(commands.set_mode, "playback", episode=episode)
         else:
-            self.do(protocol.SetWorld("next" if by > 0 else "previous"))
+            self.do(commands.set_world, "next" if by > 0 else "previous")
 
     def change_speed(self, by: int) -> None:
         """Double or halve the speed."""
-        now = SPEEDS.index(self.status.speed)
-        self.do(protocol.SetSpeed(SPEEDS[min(max(now + by, 0), len(SPEEDS) - 1)]))
+        index = SPEEDS.index(self.status.speed) + by
+        self.do(commands.set_speed, SPEEDS[min(max(index, 0), len(SPEEDS) - 1)])
 
     def set_ghosts(self, **changes: Any) -> None:
         """Change settings of the ghosts."""
-        self.do(dataclasses.replace(self.status.ghosts, **changes))
+        self.do(commands.set_ghosts, dataclasses.replace(self.status.ghosts, **changes))
 
     def toggle_video(self) -> None:
         """Start a video from the view's camera, or end the video."""
-        self.do(protocol.SetVideo(self.cameras.view() if self.status.video is None else None))
-
-    def take_picture(self) -> None:
-        """Write a picture from the view's camera."""
-        self.do(protocol.TakePicture(self.cameras.view()))
-
-    def toggle_window(self, title: str) -> None:
-        """Open or close a window of the panel."""
-        self.windows ^= {title}
+        self.do(commands.set_video, self.cameras.view() if self.status.video is None else None)
 
 
 @dataclasses.dataclass(frozen=True)
-class Key:
-    """A key and its action."""
+class Action:
+    """What a key or a button does."""
 
-    name: str
     what: str
-    action: Callable[["Actions"], None]
+    act: Callable[[Actions], object]
+    icon: str = ""
+    """The button's label. Without an icon, there is no button."""
     repeat: bool = False
+    """Whether the action is repeated while the key is held down."""
 
 
-def key_table() -> list[Key]:
-    """List the keys of the panel. Browsers pass all of them on to the page."""
-    return [
-        Key("F1", "show or hide this table", lambda p: p.toggle_window("keys")),
-        Key("F2", "messages", lambda p: p.toggle_window("messages")),
-        Key("F3", "curves", lambda p: p.toggle_window("curves")),
-        Key("Space", "pause or continue", lambda p: p.do(protocol.SetPaused(not p.status.paused))),
-        Key("Right", "a step", lambda p: p.do(protocol.StepBy(1)), repeat=True),
-        Key("Left", "a step back", lambda p: p.do(protocol.StepBy(-1)), repeat=True),
-        Key("Shift+Right", f"{MANY_STEPS} steps", lambda p: p.do(protocol.StepBy(MANY_STEPS)), repeat=True),
-        Key("Shift+Left", f"{MANY_STEPS} steps back", lambda p: p.do(protocol.StepBy(-MANY_STEPS)), repeat=True),
-        Key("Ctrl+Right", "next mode", lambda p: p.change_mode(1)),
-        Key("Ctrl+Left", "previous mode", lambda p: p.change_mode(-1)),
-        Key("Ctrl+Down", "next controller", lambda p: p.change_controller(1)),
-        Key("Ctrl+Up", "previous controller", lambda p: p.change_controller(-1)),
-        Key("Down", "next world, or next episode of a playback", lambda p: p.change_shown(1), repeat=True),
-        Key("Up", "previous world or episode", lambda p: p.change_shown(-1), repeat=True),
-        Key("Shift+Up", "double the speed", lambda p: p.change_speed(1)),
-        Key("Shift+Down", "halve the speed", lambda p: p.change_speed(-1)),
-        Key("Backspace", "reset", lambda p: p.do(protocol.Reset(random=False))),
-        Key("Shift+Backspace", "random reset", lambda p: p.do(protocol.Reset(random=True))),
-        Key("Ctrl+R", "reverse the playback", lambda p: p.do(protocol.SetBackwards(not p.status.backwards))),
-        Key("Ctrl+B", "burst: many states at once",
-            lambda p: p.set_ghosts(burst=0 if p.status.ghosts.burst else MOST_BURST // 2)),
-        Key("Enter", "drive a walking robot: W A S D move it, Q E turn it", lambda p: p.toggle_driving()),
-        Key("Ctrl+V", "start or end a video and a page that plays it", lambda p: p.toggle_video()),
-        Key("Ctrl+P", "take a picture", lambda p: p.take_picture()),
-        Key("Ctrl+A", "look at everything", lambda p: p.cameras.reset()),
-        Key("Escape", "free camera", lambda p: p.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
-    ]  # fmt: skip
-
+ACTIONS = {
+    "F1": Action("show or hide this table", lambda a: a.windows.symmetric_difference_update({"keys"})),
+    "F2": Action("messages", lambda a: a.windows.symmetric_difference_update({"messages"})),
+    "F3": Action("curves", lambda a: a.windows.symmetric_difference_update({"curves"})),
+    "Backspace": Action("reset", lambda a: a.do(commands.reset, random=False), "\uf0e2"),
+    "Shift+Backspace": Action("random reset", lambda a: a.do(commands.reset, random=True), "\uf074"),
+    "Shift+Left": Action(
+        f"{MANY_STEPS} steps back", lambda a: a.do(commands.step_by, -MANY_STEPS), "\uf04a", repeat=True
+    ),
+    "Left": Action("a step back", lambda a: a.do(commands.step_by, -1), "\uf048", repeat=True),
+    "Space": Action("pause or continue", lambda a: a.do(commands.set_paused, not a.status.paused), "\uf04c"),
+    "Right": Action("a step", lambda a: a.do(commands.step_by, 1), "\uf051", repeat=True),
+    "Shift+Right": Action(f"{MANY_STEPS} steps", lambda a: a.do(commands.step_by, MANY_STEPS), "\uf04e", repeat=True),
+    "Ctrl+Right": Action("next mode", lambda a: a.change_mode(1)),
+    "Ctrl+Left": Action("previous mode", lambda a: a.change_mode(-1)),
+    "Ctrl+Down": Action("next controller", lambda a: a.change_controller(1)),
+    "Ctrl+Up": Action("previous controller", lambda a: a.change_controller(-1)),
+    "Up": Action("previous world or episode", lambda a: a.change_world(-1), repeat=True),
+    "Down": Action("next world, or next episode of a playback", lambda a: a.change_world(1), repeat=True),
+    "Shift+Up": Action("double the speed", lambda a: a.change_speed(1)),
+    "Shift+Down": Action("halve the speed", lambda a: a.change_speed(-1)),
+    "Ctrl+R": Action("reverse the playback", lambda a: a.do(commands.set_backwards, not a.status.backwards)),
+    "Ctrl+B": Action(
+        "burst: many states at once", lambda a: a.set_ghosts(burst=0 if a.status.ghosts.burst else MOST_BURST // 2)
+    ),
+    "Enter": Action("drive a walking robot: W A S D move it, Q E turn it", lambda a: a.toggle_driving()),
+    "Ctrl+V": Action("start or end a video and a page that plays it", lambda a: a.toggle_video(), "\uf03d  video"),
+    "Ctrl+P": Action("take a picture", lambda a: a.do(commands.take_picture, a.cameras.view()), "\uf030  picture"),
+    "Ctrl+A": Action("look at everything", lambda a: a.cameras.reset(), "look at everything"),
+    "Escape": Action("free camera", lambda a: a.cameras.choose(ux.TUMBLE_CAMERA_IDX)),
+}
+"""The actions by their keys. Browsers pass all of these keys on to the page."""
 
 OTHER_KEYS = (
     ("0 to 5", "groups of geoms, with Shift groups of sites"),

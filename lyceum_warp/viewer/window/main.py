@@ -1,4 +1,4 @@
-"""Run the window process: receive frames, draw them with studio, and send commands.
+"""Run the window process: receive frames, show them with studio, and send commands.
 
 The process does not import torch and Warp, which would cost seconds and hundreds of megabytes.
 """
@@ -12,18 +12,18 @@ from multiprocessing.connection import Connection
 
 import mujoco
 
-from lyceum_warp.viewer.protocol import Close, Failed, Frame, Opened, Opening, Reply, Taken
+from lyceum_warp.viewer.commands import Command, close, command
+from lyceum_warp.viewer.protocol import Failed, Frame, Opened, Scene, Taken
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.panel import Panel
-from lyceum_warp.viewer.window.proxy import Proxy
-from lyceum_warp.viewer.window.sockets import private_socket
+from lyceum_warp.viewer.window.server import PageServer
 
 
 class WindowEnd:
     """The window process's connection to the session.
 
-    One thread receives frames, and the drawing thread gets them from ``take``. The session sends a frame only after the
-    window has taken the previous one.
+    One thread receives frames, and the rendering thread gets them from ``take``. The session sends a frame only after
+    the window has taken the previous one.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -32,7 +32,7 @@ class WindowEnd:
         self._frame: Frame | None = None
         self._parent = os.getppid()
 
-    def send(self, reply: Reply) -> None:
+    def send(self, reply: Command | Failed | Opened | Taken) -> None:
         """Send a message to the session, unless the session has ended."""
         with self._sending, contextlib.suppress(OSError):
             self._connection.send(reply)
@@ -45,52 +45,49 @@ class WindowEnd:
         return frame
 
     def receive(self) -> None:
-        """Receive frames until the session ends."""
+        """Receive frames until the session closes the window or ends."""
         with contextlib.suppress(EOFError, OSError):
-            while True:
+            while os.getppid() == self._parent:  # a forked child of the session may hold the connection open
                 if self._connection.poll(1.0):
                     self._frame = self._connection.recv()
-                elif os.getppid() != self._parent:  # a forked child of the session may hold the connection open
-                    return
+                    if self._frame is None:
+                        return
 
 
 def main(descriptor: int) -> None:
-    """Draw until the session or the user closes the window. ``descriptor`` is the connection to the session."""
+    """Show frames until the session or the user closes the window. ``descriptor`` is the connection to the session."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the session handles Ctrl-C, and then ends this process
     os.nice(5)  # the session's planner may need every core
     connection = Connection(descriptor)
     end = WindowEnd(connection)
     try:
-        run(connection.recv(), end)
-        end.send(Close())
+        run(end, *connection.recv())
+        end.send(command(close))
     except Exception as error:
         kind = "" if isinstance(error, RuntimeError) else f"{type(error).__name__}: "
         end.send(Failed(" ".join(f"{kind}{error}".split())))
         raise
 
 
-def run(opening: Opening, end: WindowEnd) -> None:
+def run(end: WindowEnd, scene: Scene, host: str, port: int | None) -> None:
     """Run studio with the panel."""
-    with contextlib.ExitStack() as ends:
-        try:
-            proxy = ends.enter_context(Proxy(host=opening.host, port=opening.port, title=opening.scene.title))
-        except ValueError as error:
-            return end.send(Failed(str(error), refused=True))
-        sock = private_socket()
-        model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": opening.scene.model})
-        planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        model.geom_size[planes, :2] = 0.0  # studio draws planes of size 0 as infinite
-        screen = studio.Screen()
-        opened = Opened(proxy.address, tuple(proxy.instructions))
-        panel = Panel(opening.scene, model, end.send, end.take, screen, opened, proxy.offer)
+    try:
+        server = PageServer(host=host, port=port, title=scene.title)
+    except ValueError as error:
+        return end.send(Failed(str(error), refused=True))
+    model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": scene.model})
+    planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    model.geom_size[planes, :2] = 0.0  # studio shows planes of size 0 as infinite
+    screen = studio.Screen()
+    panel = Panel(scene, model, end.send, end.take, screen, Opened(tuple(server.instructions)), server.offer)
+    server.on_quiet = panel.mouse.let_go
 
-        def follow() -> None:
-            end.receive()
-            screen.close()
-            time.sleep(3.0)
-            os._exit(1)  # end the process even if studio hangs
+    def follow() -> None:
+        end.receive()
+        screen.close()
+        time.sleep(3.0)
+        os._exit(1)  # end the process even if studio hangs
 
-        threading.Thread(target=follow, daemon=True).start()
-        screen.show_model(model)
-        proxy.start(sock.getsockname(), on_quiet=panel.mouse.let_go)
-        screen.run(panel, title=opening.scene.title, sock=sock)
+    threading.Thread(target=follow, daemon=True).start()
+    screen.show_model(model)
+    screen.run(panel, title=scene.title, server=server)

@@ -7,57 +7,57 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.protocol import Perturb
+from lyceum_warp.viewer.commands import Command, command, perturb
 
 
 class Mouse:
     """Converts drags of the selected body to commands."""
 
-    def __init__(self, do: Callable[[Perturb], None]) -> None:
-        self._do = do
-        self._pushed: Perturb | None = None
-        self._left = False
+    def __init__(self, send: Callable[[Command], None]) -> None:
+        self._send = send
+        self._push: dict[str, np.ndarray] = {}
+        self._tab_lost = False
         self._lock = threading.Lock()
 
     def drag(self, viewer: Any, *, paused: bool) -> None:
         """Push the selected body while the mouse drags it. If the session is paused, move it instead."""
         with self._lock:
-            if self._left:
-                self._left = False
+            if self._tab_lost:
+                self._tab_lost = False
                 viewer.perturb.active = 0
-            if viewer.perturb.active and viewer.perturb.select > 0:
-                push = _perturbation(viewer.model, viewer.data, viewer.perturb, paused)
-                if self._pushed is None or _rounded(push) != _rounded(self._pushed):
-                    self._pushed = push
-                    self._do(push)
-            else:
-                self._end()
+            if not viewer.perturb.active or viewer.perturb.select <= 0:
+                return self._end()
+            push = _perturbation(viewer.model, viewer.data, viewer.perturb, paused)
+            if _rounded(push) != _rounded(self._push):
+                self._push = push
+                self._send(command(perturb, **push))
 
     def let_go(self) -> None:
         """End a push after the browser has disconnected. Any thread may call this method."""
         with self._lock:
-            self._left = True  # without a browser, studio does not notice the release of the button
+            self._tab_lost = True  # without a browser, studio does not notice the release of the button
             self._end()
 
     def _end(self) -> None:
-        if self._pushed is not None:
-            forces, self._pushed = np.zeros_like(self._pushed.forces), None
-            self._do(Perturb(forces=forces))
+        if self._push:
+            self._send(command(perturb, np.zeros_like(self._push["forces"])))
+            self._push = {}
 
 
-def _perturbation(model: mujoco.MjModel, data: mujoco.MjData, perturb: mujoco.MjvPerturb, paused: bool) -> Perturb:
+def _perturbation(
+    model: mujoco.MjModel, data: mujoco.MjData, drag: mujoco.MjvPerturb, paused: bool
+) -> dict[str, np.ndarray]:
     data.xfrc_applied[:] = 0
-    mujoco.mjv_applyPerturbPose(model, data, perturb, int(paused))
+    mujoco.mjv_applyPerturbPose(model, data, drag, int(paused))
     if not paused:
-        mujoco.mjv_applyPerturbForce(model, data, perturb)
-    moved = bool(model.body_mocapid[model.body_rootid[perturb.select]] >= 0)
-    return Perturb(
-        forces=data.xfrc_applied.copy(),
-        qpos=data.qpos.copy() if paused else None,
-        mocap_pos=data.mocap_pos.copy() if moved else None,
-        mocap_quat=data.mocap_quat.copy() if moved else None,
-    )
+        mujoco.mjv_applyPerturbForce(model, data, drag)
+    push = {"forces": data.xfrc_applied.copy()}
+    if paused:
+        push["qpos"] = data.qpos.copy()
+    if model.body_mocapid[model.body_rootid[drag.select]] >= 0:
+        push |= {"mocap_pos": data.mocap_pos.copy(), "mocap_quat": data.mocap_quat.copy()}
+    return push
 
 
-def _rounded(push: Perturb) -> list[Any]:
-    return [None if part is None else (part.round(9) + 0.0).tolist() for part in vars(push).values()]
+def _rounded(push: dict[str, np.ndarray]) -> dict[str, Any]:
+    return {name: (values.round(9) + 0.0).tolist() for name, values in push.items()}

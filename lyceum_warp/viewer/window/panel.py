@@ -6,7 +6,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.protocol import Frame, Opened, Reply, Scene
+from lyceum_warp.viewer.commands import Command
+from lyceum_warp.viewer.protocol import Frame, Opened, Scene
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.actions import Actions
 from lyceum_warp.viewer.window.mouse import Mouse
@@ -25,7 +26,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self,
         scene: Scene,
         model: mujoco.MjModel,
-        send: Callable[[Reply], None],
+        send: Callable[[Command | Opened], None],
         newest: Callable[[], Frame | None],
         screen: studio.Screen,
         opened: Opened,
@@ -70,7 +71,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
     @studio.handler
     def on_gui(self, event: studio.Gui) -> None:
         """Build the windows."""
-        self.windows.draw()
+        self.windows.build()
         self.viewer.camera_index = self.actions.cameras.state.camera_index
 
     def take(self, frame: Frame) -> None:
@@ -78,8 +79,8 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.actions.frame = frame
         self._show_model(frame)
         model, data = self.viewer.model, self.viewer.data
-        if frame.samples is not None:
-            self.windows.curves.add(frame.samples)
+        if frame.points is not None:
+            self.windows.curves.add(frame.points)
         for file in frame.files:
             self._offer(file)
         if frame.messages:
@@ -88,7 +89,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)
             mujoco.mj_forward(model, data)
-        self.viewer.extra_geoms[:] = self._geoms.draw(frame, np.array(self.viewer.vis_options.geomgroup))
+        self.viewer.extra_geoms[:] = self._geoms.of(frame, np.array(self.viewer.vis_options.geomgroup))
 
     def _show_model(self, frame: Frame) -> None:
         changed, visible = self.values.set(frame.model_fields)

@@ -1,4 +1,4 @@
-"""Draw ghosts and traces, set the values of one world in the model, and choose the camera."""
+"""Show ghosts and traces, set the values of one world in the model, and choose the camera."""
 
 import copy
 import itertools
@@ -23,14 +23,14 @@ VISIBLE = (
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
     "mesh_", "skin_", "flex_",
 )  # fmt: skip
-"""Prefixes of the model fields that change how the model is drawn."""
+"""Prefixes of the model fields that change how the model looks."""
 
 
 # ghosts and traces
 
 
 class ExtraGeoms:
-    """Draws ghosts and traces with a limited number of geoms: first the best trace, then ghosts, then other traces."""
+    """Makes the geoms of ghosts and traces, up to a limit: first the best trace, then ghosts, then other traces."""
 
     def __init__(self, model: mujoco.MjModel, limit: int) -> None:
         self.model, self.limit = model, limit
@@ -39,7 +39,7 @@ class ExtraGeoms:
         # `_ghosts` adds a ghost before it counts the geoms, so the scene needs room beyond the limit
         self._scene = mujoco.MjvScene(model, limit + 2 * (model.ngeom + model.nsite) + 10)
 
-    def draw(self, frame: Frame, groups: np.ndarray) -> list[mujoco.MjvGeom]:
+    def of(self, frame: Frame, groups: np.ndarray) -> list[mujoco.MjvGeom]:
         """Make the geoms of a frame. The geoms are valid until the next frame.
 
         Args:
@@ -88,7 +88,7 @@ class ExtraGeoms:
 
 
 def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
-    """Draw paths with at most ``limit`` lines. Drop points first, then whole paths."""
+    """Make the lines of paths, at most ``limit`` lines. Drop points first, then whole paths."""
     if not paths:
         return []
     segments = min(len(paths[0]) - 1, max(limit // len(paths), FEWEST_SEGMENTS))

@@ -1,13 +1,13 @@
-"""Draw the windows of the panel with ImGui."""
+"""Build the windows of the panel with ImGui."""
 
 from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 
-from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer import commands
 from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST, MOST_GHOSTS
-from lyceum_warp.viewer.window.actions import MANY_STEPS, OTHER_KEYS, SPEEDS, Actions, key_table
+from lyceum_warp.viewer.window.actions import ACTIONS, OTHER_KEYS, SPEEDS, Actions
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
@@ -20,7 +20,7 @@ WINDOWS = ("messages", "curves", "view", "keys")
 
 
 class Windows:
-    """Draws the windows of the panel."""
+    """Builds the windows of the panel."""
 
     def __init__(self, actions: Actions) -> None:
         self.curves = Curves(len(actions.scene.curves))
@@ -30,8 +30,8 @@ class Windows:
         self._folded = False
         self._size = (0.0, 0.0)
 
-    def draw(self) -> None:
-        """Draw every open window."""
+    def build(self) -> None:
+        """Build every open window."""
         size = imgui.GetIO().DisplaySize
         width, height = size.x, size.y
         # panels stay where the user moved them until the browser window is resized
@@ -49,7 +49,7 @@ class Windows:
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
     ) -> None:
-        """Draw a window if it is open. ``place`` is its left edge, top edge, width and height in pixels."""
+        """Build a window if it is open. ``place`` is its left edge, top edge, width and height in pixels."""
         left, top, width, height = place
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
@@ -63,7 +63,7 @@ class Windows:
             content()
         if first:
             self._folded = not unfolded
-            if not still_open:  # studio draws a close button in every window
+            if not still_open:  # studio adds a close button in every window
                 imgui.SetWindowCollapsed(True)
         imgui.End()
         if not first and not still_open:
@@ -86,74 +86,67 @@ class Windows:
         self._camera()
 
     def _modes(self) -> None:
-        status = self._actions.status
+        status, do = self._actions.status, self._actions.do
         for i, mode in enumerate(self._scene.modes):
             if i:
                 imgui.SameLine()
             if highlighted_button(mode, mode == status.mode):
-                self._actions.do(protocol.SetMode(mode))
+                do(commands.set_mode, mode)
         if status.mode == "controller":
             for name in self._scene.controllers:
                 if imgui.Selectable(name, name == status.controller):
-                    self._actions.do(protocol.SetMode("controller", controller=name))
+                    do(commands.set_mode, "controller", controller=name)
         if status.mode == "playback":
-            chosen = combo("episode", self._scene.episodes, status.episode or 0)
-            if chosen is not None:
-                self._actions.do(protocol.SetMode("playback", episode=chosen))
+            episode = combo("episode", self._scene.episodes, status.episode or 0)
+            if episode is not None:
+                do(commands.set_mode, "playback", episode=episode)
             changed, backwards = imgui.Checkbox("backwards", status.backwards)
             if changed:
-                self._actions.do(protocol.SetBackwards(backwards))
+                do(commands.set_backwards, backwards)
 
     def _worlds(self) -> None:
         if self._scene.nworld == 1:
             return
         imgui.SeparatorText(f"world, of {self._scene.nworld:,}")
         imgui.PushItemWidth(90)
-        entered, world = imgui.InputInt(
-            "##world", self._actions.status.world, 0, 0, int(imgui.InputTextFlags.EnterReturnsTrue)
-        )
+        only_enter = int(imgui.InputTextFlags.EnterReturnsTrue)
+        entered, world = imgui.InputInt("##world", self._actions.status.world, 0, 0, only_enter)
         imgui.PopItemWidth()
         if entered:
-            self._actions.do(protocol.SetWorld(world))
-        choices: tuple[tuple[str, protocol.WorldChoice], ...] = (
-            ("\uf053", "previous"), ("\uf054", "next"), ("best", "best"), ("worst", "worst"),
-        )  # fmt: skip
-        for i, (label, choice) in enumerate(choices):
-            if i != 2:
+            self._actions.do(commands.set_world, world)
+        choices: tuple[commands.WorldChoice, ...] = ("previous", "next", "best", "worst")
+        for label, choice in zip(("\uf053", "\uf054", "best", "worst"), choices, strict=True):
+            if choice != "best":
                 imgui.SameLine()
             if imgui.Button(label):
-                self._actions.do(protocol.SetWorld(choice))
+                self._actions.do(commands.set_world, choice)
 
     def _time(self) -> None:
         status = self._actions.status
         imgui.SeparatorText("time")
-        buttons: tuple[tuple[str, str, protocol.Command], ...] = (
-            ("\uf0e2", "reset", protocol.Reset(random=False)),
-            ("\uf074", "random reset", protocol.Reset(random=True)),
-            ("\uf04a", f"{MANY_STEPS} steps back", protocol.StepBy(-MANY_STEPS)),
-            ("\uf048", "a step back", protocol.StepBy(-1)),
-            ("\uf04b" if status.paused else "\uf04c", "continue or pause", protocol.SetPaused(not status.paused)),
-            ("\uf051", "a step", protocol.StepBy(1)),
-            ("\uf04e", f"{MANY_STEPS} steps", protocol.StepBy(MANY_STEPS)),
-        )
-        for i, (label, tip, command) in enumerate(buttons):
-            if i:
-                imgui.SameLine()
-            if imgui.Button(label):
-                self._actions.do(command)
-            imgui.SetItemTooltip(tip)
+        for key in ("Backspace", "Shift+Backspace", "Shift+Left", "Left", "Space", "Right", "Shift+Right"):
+            self._button(key, "\uf04b" if key == "Space" and status.paused else None)
+            imgui.SameLine()
+        imgui.NewLine()
         imgui.PushItemWidth(90)
-        chosen = combo("speed", [speed_name(speed) for speed in SPEEDS], SPEEDS.index(status.speed))
+        speed = combo("speed", [speed_name(speed) for speed in SPEEDS], SPEEDS.index(status.speed))
         imgui.PopItemWidth()
-        if chosen is not None:
-            self._actions.do(protocol.SetSpeed(SPEEDS[chosen]))
+        if speed is not None:
+            self._actions.do(commands.set_speed, SPEEDS[speed])
         first, last = status.seekable
         if first < last:
             imgui.PushItemWidth(-1)
             changed, step = imgui.SliderInt("##scrub", min(max(status.step, first), last), first, last, "step %d")
             imgui.PopItemWidth()
             if changed:
-                self._actions.do(protocol.Seek(step))
+                self._actions.do(commands.seek, step)
+
+    def _button(self, key: str, icon: str | None = None) -> None:
+        """Build the button of an action."""
+        action = ACTIONS[key]
+        if imgui.Button(icon or action.icon):
+            action.act(self._actions)
+        imgui.SetItemTooltip(f"{action.what} ({key})")
 
     def _status(self) -> None:
         status = self._actions.status
@@ -172,34 +165,36 @@ class Windows:
         imgui.SeparatorText("drive")
         if imgui.Checkbox("with the keys W A S D, Q E (Enter)", status.driven)[0]:
             self._actions.toggle_driving()
-        for i, (name, most) in enumerate(zip(("forward", "left", "turn left"), speeds, strict=True)):
-            changed, value = imgui.SliderFloat(name, status.command[i], -2 * most, 2 * most, "%.2f")
-            if changed:
-                command = [*status.command]
-                command[i] = value
-                self._actions.do(protocol.Drive((command[0], command[1], command[2])))
+        names = ("forward", "left", "turn left")
+        sliders = [
+            imgui.SliderFloat(name, value, -2 * speed, 2 * speed, "%.2f")
+            for name, value, speed in zip(names, status.command, speeds, strict=True)
+        ]
+        if any(changed for changed, _ in sliders):
+            forward, left, turn = (value for _, value in sliders)
+            self._actions.do(commands.drive, (forward, left, turn))
 
     def _numbers(self) -> None:
         """Let the user change the planner's settings and the task's parameters.
 
         A value is sent when the user has finished editing it.
         """
-        status = self._actions.status
-        parts: tuple[tuple[Literal["planner", "task"], Any], ...] = ("planner", status.planner), ("task", status.params)
-        for of, numbers in parts:
-            if not numbers or not imgui.CollapsingHeader(f"{of} settings"):
+        numbers = {"planner": self._actions.status.planner, "task": self._actions.status.params}
+        owners: tuple[Literal["planner", "task"], ...] = ("planner", "task")
+        for owner in owners:
+            if not numbers[owner] or not imgui.CollapsingHeader(f"{owner} settings"):
                 continue
             imgui.PushItemWidth(110)
-            for name, now in numbers:
-                value = self._edited.get((of, name), now)
-                if isinstance(now, int):
-                    changed, value = imgui.DragInt(name, int(value), max(0.01 * now, 0.1), 1, 100_000)
+            for name, number in numbers[owner]:
+                value = self._edited.get((owner, name), number)
+                if isinstance(number, int):
+                    changed, value = imgui.DragInt(name, int(value), max(0.01 * number, 0.1), 1, 100_000)
                 else:
-                    changed, value = imgui.DragFloat(name, value, max(abs(now) / 100, 1e-3), 0, 0, "%.4g")
+                    changed, value = imgui.DragFloat(name, value, max(abs(number) / 100, 1e-3), 0, 0, "%.4g")
                 if changed:
-                    self._edited[of, name] = value
+                    self._edited[owner, name] = value
                 if imgui.IsItemDeactivatedAfterEdit():
-                    self._actions.do(protocol.SetNumber(of, name, self._edited.pop((of, name), value)))
+                    self._actions.do(commands.set_number, owner, name, self._edited.pop((owner, name), value))
             imgui.PopItemWidth()
 
     def _push(self) -> None:
@@ -240,7 +235,7 @@ class Windows:
                 imgui.SetItemTooltip(what)
         if self._scene.nworld > 1:
             changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
-            if changed:  # limit the worlds to the number that a browser can draw
+            if changed:  # limit the worlds to the number that a browser can render
                 self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
         changed, plan = imgui.Checkbox("plan", ghosts.plan)
         if changed:
@@ -254,25 +249,24 @@ class Windows:
         viewer = self._actions.viewer
         ux.camera_selection_gui(viewer.model, viewer.data, viewer.camera, self._actions.cameras.state)
         imgui.PopItemWidth()
-        if imgui.Button("look at everything"):
-            self._actions.cameras.reset()
+        self._button("Ctrl+A")
 
     def _buttons(self) -> None:
         imgui.SeparatorText("more")
-        making = self._actions.status.video is not None
-        if highlighted_button("\uf03d  end the video" if making else "\uf03d  video", making):
+        if self._actions.status.video is None:
+            self._button("Ctrl+V")
+        elif highlighted_button("\uf03d  end the video", True):
             self._actions.toggle_video()
         imgui.SameLine()
-        if imgui.Button("\uf030  picture"):
-            self._actions.take_picture()
+        self._button("Ctrl+P")
         imgui.SameLine()
         if imgui.Button("quit"):
-            self._actions.do(protocol.Close())
+            self._actions.do(commands.close)
         for i, title in enumerate(WINDOWS):
             if i:
                 imgui.SameLine()
             if highlighted_button(title, title in self._actions.windows):
-                self._actions.toggle_window(title)
+                self._actions.windows ^= {title}
         if self._actions.status.video is not None:
             imgui.TextWrapped(self._actions.status.video)
 
@@ -333,11 +327,11 @@ class Windows:
         ux.joints_gui(viewer.model, viewer.data, viewer.vis_options)
         if paused and (viewer.data.qpos != before).any():
             forces = np.zeros_like(viewer.data.xfrc_applied)
-            self._actions.do(protocol.Perturb(forces=forces, qpos=viewer.data.qpos.copy()))
+            self._actions.do(commands.perturb, forces, qpos=viewer.data.qpos.copy())
 
     def _help(self) -> None:
         if imgui.BeginTable("##keys", 2):
-            for keys, what in [*((key.name, key.what) for key in key_table()), *OTHER_KEYS]:
+            for keys, what in [*((key, action.what) for key, action in ACTIONS.items()), *OTHER_KEYS]:
                 imgui.TableNextColumn()
                 imgui.TextUnformatted(keys)
                 imgui.TableNextColumn()
@@ -349,7 +343,7 @@ class Windows:
 
 
 def highlighted_button(label: str, on: bool) -> bool:
-    """Draw a button, highlighted if ``on`` is true, and return whether it was pressed."""
+    """Build a button, highlighted if ``on`` is true, and return whether it was pressed."""
     if on:
         imgui.PushStyleColor(int(imgui.Col.Button), imgui.Vec4(0.2, 0.55, 0.9, 1.0))
     pressed = imgui.Button(label)
@@ -359,7 +353,7 @@ def highlighted_button(label: str, on: bool) -> bool:
 
 
 def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
-    """Draw names and values in two columns."""
+    """Show names and values in two columns."""
     if imgui.BeginTable(label, 2):
         for name, value in rows:
             imgui.TableNextColumn()
@@ -370,9 +364,9 @@ def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
 
 
 def combo(label: str, names: Any, now: int) -> int | None:
-    """Draw a list of choices, and return the index of a new choice."""
-    changed, chosen = imgui.Combo(label, now, list(names))
-    return int(chosen) if changed and chosen != now else None
+    """Build a list of choices, and return the index of a new choice."""
+    changed, index = imgui.Combo(label, now, list(names))
+    return int(index) if changed and index != now else None
 
 
 def speed_name(speed: float) -> str:

@@ -10,8 +10,7 @@ from memory_window import MemoryWindow, run
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command
+from lyceum_warp.viewer.commands import Command, close, command, set_paused, set_speed, set_video
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viz import drawing
 
@@ -19,11 +18,11 @@ from lyceum_warp.viz import drawing
 def test_session_obeys_the_commands_set_speed_and_set_paused(shared_env: SharedEnv) -> None:
     window = run(
         Session(shared_env("point_mass")),
-        [protocol.SetSpeed(8.0)],
+        [command(set_speed, 8.0)],
         lambda frame: frame.status.measured_speed > 4,
-        [protocol.SetPaused(True)],
+        [command(set_paused, True)],
         lambda frame: frame.status.paused,
-        [protocol.Close()],
+        [command(close)],
     )
     assert len({frame.status.step for frame in window.frames if frame.status.paused}) == 1
 
@@ -34,7 +33,7 @@ def test_failed_video_is_reported_as_a_message(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
     session = Session(shared_env("point_mass"), seed=0)
-    window = run(session, [protocol.SetVideo({})], lambda frame: bool(frame.messages))
+    window = run(session, [command(set_video, {})], lambda frame: bool(frame.messages))
     assert window.messages[0].startswith("no video: this machine cannot draw")
     assert window.frames[-1].status.video is None
 

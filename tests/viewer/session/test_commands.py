@@ -7,13 +7,12 @@ from conftest import SharedEnv
 from memory_window import pushing
 
 import lyceum_warp as lw
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Perturb, SetMode, StepBy
+from lyceum_warp.viewer.commands import Command, command, perturb, seek, set_mode, set_number, set_world, step_by
 from lyceum_warp.viewer.session.clock import Session
 
 FORCES = np.zeros((5, 6))
 FORCES[1, 0] = 50.0
-PUSH, RELEASE = Perturb(FORCES), Perturb(0 * FORCES)
+PUSH, RELEASE = command(perturb, FORCES), command(perturb, 0 * FORCES)
 
 
 def pushed(env: lw.Env, world: int) -> bool:
@@ -23,19 +22,21 @@ def pushed(env: lw.Env, world: int) -> bool:
 def test_push_ends_when_the_viewer_shows_another_world(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    for command, pushes in ((PUSH, (True, False)), (protocol.SetWorld(1), (False, False)),
+    for each, pushes in ((PUSH, (True, False)), (command(set_world, 1), (False, False)),
                             (PUSH, (False, True)), (RELEASE, (False, False))):  # fmt: skip
-        session.obey(command)
+        session.obey(each)
         assert (pushed(env, 0), pushed(env, 1)) == pushes
 
 
-@pytest.mark.parametrize("branch", [Perturb(0 * FORCES, qpos=np.full(6, 0.1)), SetMode("passive"),
-                                    SetMode("controller", "other"), protocol.SetWorld(1), StepBy(3)])  # fmt: skip
-def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch: protocol.Command) -> None:
+@pytest.mark.parametrize("branch", [
+    command(perturb, 0 * FORCES, qpos=np.full(6, 0.1)), command(set_mode, "passive"),
+    command(set_mode, "controller", "other"), command(set_world, 1), command(step_by, 3),
+])  # fmt: skip
+def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch: Command) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, controllers={"policy": pushing, "other": pushing}, paused=True)
-    for command in (PUSH, StepBy(4), RELEASE, StepBy(2), StepBy(-4)):
-        session.obey(command)
+    for each in (PUSH, command(step_by, 4), RELEASE, command(step_by, 2), command(step_by, -4)):
+        session.obey(each)
     assert pushed(env, 0)
     session.obey(branch)
     assert not pushed(env, 0)
@@ -44,10 +45,10 @@ def test_restored_push_ends_when_the_world_changes(shared_env: SharedEnv, branch
 def test_push_released_after_steps_back_lasts_until_the_newest_state(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    for command in (StepBy(2), PUSH, StepBy(2), StepBy(-4), RELEASE, StepBy(2)):
-        session.obey(command)
+    for each in (command(step_by, 2), PUSH, command(step_by, 2), command(step_by, -4), RELEASE, command(step_by, 2)):
+        session.obey(each)
     assert pushed(env, 0)  # restored
-    session.obey(StepBy(2))
+    session.obey(command(step_by, 2))
     assert not pushed(env, 0) and session.stage.live.past.ahead == 0
 
 
@@ -60,8 +61,8 @@ def test_state_for_a_controller_excludes_the_push() -> None:
         return torch.zeros(3)
 
     session = Session(env, controllers={"look": look}, paused=True)
-    for command in (SetMode("passive"), PUSH, SetMode("controller", "look")):
-        session.obey(command)
+    for each in (command(set_mode, "passive"), PUSH, command(set_mode, "controller", "look")):
+        session.obey(each)
     plant = session.stage.live.env
     assert pushed(plant, 0) and not pushed(env, 0)
     position = plant.get_state()[0, plant.state_space.parts["qpos"]][0].item()
@@ -75,12 +76,12 @@ def test_state_for_a_controller_excludes_the_push() -> None:
 def test_body_can_be_placed_while_paused(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=2)
     session = Session(env, paused=True)
-    session.obey(protocol.SetWorld(1))
+    session.obey(command(set_world, 1))
     session.stage.advance(2)
     before = env.get_state()
     qpos = before[1, env.state_space.parts["qpos"]].numpy().copy()
     qpos[1] += 0.5
-    session.obey(Perturb(np.zeros((env.model.nbody, 6)), qpos=qpos))
+    session.obey(command(perturb, np.zeros((env.model.nbody, 6)), qpos=qpos))
     np.testing.assert_array_equal(session.stage.frame().state[env.state_space.parts["qpos"]], qpos)
     assert torch.equal(env.get_state()[0], before[0])
 
@@ -89,7 +90,7 @@ def test_seeking_shows_a_step_of_the_episode(shared_env: SharedEnv) -> None:
     session = Session(shared_env("hopper", nworld=2), seed=0)
     session.stage.advance(8)
     for step, shown in ((3, 3), (100, 8)):
-        session.obey(protocol.Seek(step))
+        session.obey(command(seek, step))
         status = session.stage.frame().status
         assert status.step == shown and status.paused and status.seekable == (0, 8)
 
@@ -104,11 +105,11 @@ def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> Non
         total[env.done] = 0.0
     for choice, expected in (("best", total.argmax()), ("worst", total.argmin()), (2, 2), ("next", 3), ("next", 0),
                              ("previous", 3)):  # fmt: skip
-        session.obey(protocol.SetWorld(choice))
+        session.obey(command(set_world, choice))
         frame = session.stage.frame()
         assert frame.status.world == int(expected), choice
         np.testing.assert_array_equal(frame.state, env.get_state()[int(expected), : len(frame.state)].numpy())
-    session.obey(protocol.SetWorld(4))
+    session.obey(command(set_world, 4))
     assert session.stage.frame().messages == ("there is no world 4: there are 4 worlds, numbered from 0",)
 
 
@@ -117,11 +118,11 @@ def test_set_mode_selects_a_controller_or_zero_actions(shared_env: SharedEnv) ->
     half: Callable[[torch.Tensor], torch.Tensor] = lambda obs: 0.5 * pushing(obs)  # noqa: E731
     session = Session(env, controllers={"push": pushing, "half": half}, paused=True)
     assert session.stage.scene.modes == ("controller", "passive")
-    for command, name, action in (
-        (SetMode("controller"), "push", 0.5), (SetMode("controller", "half"), "half", 0.25),
-        (SetMode("passive"), None, 0.0),
+    for each, name, action in (
+        (command(set_mode, "controller"), "push", 0.5), (command(set_mode, "controller", "half"), "half", 0.25),
+        (command(set_mode, "passive"), None, 0.0),
     ):  # fmt: skip
-        session.obey(command)
+        session.obey(each)
         session.stage.advance()
         assert env.action.abs().max() == action and session.stage.frame().status.controller == name
 
@@ -133,11 +134,11 @@ def test_planner_continues_with_changed_settings() -> None:
     stage.advance()
     assert dict(stage.frame().status.planner) == {"noise": 1.0, "temperature": 0.2, "horizon": 16, "samples": 8}
     for name, value in (("noise", 0.5), ("samples", 12), ("horizon", 10)):
-        session.obey(protocol.SetNumber("planner", name, value))
+        session.obey(command(set_number, "planner", name, value))
     config = stage.controllers["mppi"].controller.config  # type: ignore[union-attr]
     assert (config.noise, config.samples, config.horizon, config.temperature) == (0.5, 12, 10, 0.2)
     stage.advance()
-    session.obey(protocol.SetNumber("planner", "temperature", -1.0))
+    session.obey(command(set_number, "planner", "temperature", -1.0))
     assert "temperature" in stage.frame().messages[-1]
     stage.advance()
     stage.close()
@@ -151,7 +152,7 @@ def test_changed_reward_weight_applies_to_all_worlds() -> None:
     before = env.reward.clone()
     name = "ctrl_cost_weight"
     value = dict(session.stage.frame().status.params)[name]
-    session.obey(protocol.SetNumber("task", name, value + 1.0))
+    session.obey(command(set_number, "task", name, value + 1.0))
     assert dict(session.stage.frame().status.params)[name] == value + 1.0
     env.set_state(state)
     env.step(torch.ones(2, 3))

@@ -6,7 +6,8 @@ from conftest import SharedEnv
 from memory_window import pushing
 
 import lyceum_warp as lw
-from lyceum_warp.viewer import protocol
+from lyceum_warp.viewer.commands import command, set_ghosts, set_mode, set_world, step_by
+from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
 
@@ -14,8 +15,8 @@ def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: Shared
     env = shared_env("hopper", nworld=4)
     session = Session(env, paused=True, seed=0)
     session.stage.advance(10)
-    session.obey(protocol.SetWorld(2))
-    session.obey(protocol.SetGhosts(worlds=2, burst=5))
+    session.obey(command(set_world, 2))
+    session.obey(command(set_ghosts, Ghosts(worlds=2, burst=5)))
     ghosts = session.stage.frame().ghosts
     state, qpos = env.get_state(), env.state_space.parts["qpos"]
     for ghost, world in zip(ghosts, (3, 0), strict=False):
@@ -23,10 +24,10 @@ def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: Shared
     past = ghosts[2:]
     assert len(past) == 5 and past[0].colour[3] > past[1].colour[3] and past[0].colour[0] > past[0].colour[2]
     np.testing.assert_array_equal(past[-1].state[qpos], session.stage.live.past.states[0, 2, qpos].numpy())
-    session.obey(protocol.SetGhosts(worlds=3, grid=True))
+    session.obey(command(set_ghosts, Ghosts(worlds=3, grid=True)))
     shifts = {ghost.shift for ghost in session.stage.frame().ghosts}
     assert len(shifts) == 3 and (0.0, 0.0) not in shifts and all(g.colour is None for g in session.stage.frame().ghosts)
-    session.obey(protocol.SetGhosts(worlds=9))
+    session.obey(command(set_ghosts, Ghosts(worlds=9)))
     assert len(session.stage.frame().ghosts) == 3
 
 
@@ -45,7 +46,7 @@ def test_faults_and_ends_of_episodes_are_shown_as_messages(shared_env: SharedEnv
     steps = session.stage.live.made
     (message,) = session.stage.frame().messages
     assert message.startswith(f"the episode ended after {steps} steps (terminated), return ")
-    session.obey(protocol.SetMode("controller", "bad"))
+    session.obey(command(set_mode, "controller", "bad"))
     session.stage.advance()
     assert "fault in world 1: action (1 so far)" in session.stage.frame().messages
 
@@ -58,13 +59,13 @@ def test_frames_contain_every_point_of_the_curves(shared_env: SharedEnv) -> None
     for _ in range(20):
         session.stage.advance()
         rewards.append(env.reward[0].item())
-    points = session.stage.frame().samples
+    points = session.stage.frame().points
     assert points.shape == (20, 2 + len(session.stage.scene.curves))
     np.testing.assert_array_equal(points[:, 2], rewards)
     np.testing.assert_allclose(points[:, 0], env.timestep * np.arange(1, 21))
-    session.obey(protocol.StepBy(-5))
-    session.obey(protocol.StepBy(6))
-    np.testing.assert_allclose(session.stage.frame().samples[:, 0], [env.timestep * 21])
+    session.obey(command(step_by, -5))
+    session.obey(command(step_by, 6))
+    np.testing.assert_allclose(session.stage.frame().points[:, 0], [env.timestep * 21])
 
 
 def test_frame_contains_model_fields_that_differ_between_worlds() -> None:

@@ -9,8 +9,8 @@ from memory_window import run
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import SetMode, StepBy
+from lyceum_warp.viewer.commands import command, reset, set_ghosts, set_mode, set_paused, set_speed, set_world, step_by
+from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
 PLANNER = dict(horizon=8, samples=6, temperature=0.01, noise=0.3)
@@ -23,9 +23,9 @@ def test_plant_runs_in_real_time_and_the_viewer_draws_the_plan() -> None:
     window = run(
         session,
         lambda frame: frame.traces is not None and frame.status.time > 0.4,
-        [protocol.SetPaused(True), StepBy(-5)],
+        [command(set_paused, True), command(step_by, -5)],
         lambda frame: frame.status.paused and frame.status.seekable[1] - frame.status.step == 5,
-        [StepBy(5), protocol.SetPaused(False), protocol.SetSpeed(4.0)],
+        [command(step_by, 5), command(set_paused, False), command(set_speed, 4.0)],
         lambda frame: frame.status.time > 1.5,
     )
     frame = window.frames[-1]
@@ -33,27 +33,27 @@ def test_plant_runs_in_real_time_and_the_viewer_draws_the_plan() -> None:
     assert frame.traces.shape == (7, 9, 3) and frame.best == 0 and len(frame.ghosts) == 1
     assert frame.status.plan_ms > 0 and session.stage.paused is False
     np.testing.assert_allclose(np.ptp(frame.traces[:, 0], axis=0), 0.0, atol=1e-12)
-    assert np.isfinite(np.concatenate([frame.samples for frame in window.frames])).all()
+    assert np.isfinite(np.concatenate([frame.points for frame in window.frames])).all()
 
 
 def test_planner_controls_a_copy_of_the_world_in_view(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", nworld=3)
     mppi = lw.MPPI("point_mass", **PLANNER)
     session = Session(env, controllers={"mppi": mppi, "own": towards}, paused=True, seed=0)
-    session.obey(protocol.SetWorld(1))
+    session.obey(command(set_world, 1))
     before, qpos = env.get_state(), env.state_space.parts["qpos"]
     session.stage.advance(3)
     assert torch.equal(env.get_state(), before)
     moved = session.stage.live.env.get_state()[0]
     assert not torch.equal(moved, before[1])
-    session.obey(protocol.SetGhosts(worlds=1))
+    session.obey(command(set_ghosts, Ghosts(worlds=1)))
     np.testing.assert_array_equal(session.stage.frame().ghosts[0].state[qpos], before[2, qpos].numpy())
-    session.obey(protocol.SetWorld(2))
+    session.obey(command(set_world, 2))
     assert torch.equal(env.get_state()[1, qpos], moved[qpos])
     assert torch.equal(session.stage.live.env.get_state()[0, qpos], before[2, qpos])
-    session.obey(SetMode("controller", "own"))
+    session.obey(command(set_mode, "controller", "own"))
     session.stage.advance()
-    session.obey(SetMode("passive"))
+    session.obey(command(set_mode, "passive"))
     after = env.get_state()
     assert torch.equal(after[0], before[0]) and not torch.equal(after[2, qpos], before[2, qpos])
     assert session.stage.frame().status.world == 2
@@ -62,7 +62,7 @@ def test_planner_controls_a_copy_of_the_world_in_view(shared_env: SharedEnv) -> 
 def test_plant_starts_another_episode_after_the_end_of_an_episode() -> None:
     env = lw.make("point_mass", autoreset=False, horizon=12)
     session = Session(env, controllers={"own": towards}, seed=0)
-    session.obey(protocol.SetSpeed(8.0))
+    session.obey(command(set_speed, 8.0))
     window = run(session, lambda frame: session.stage.live.made > 30)
     ends = [message for message in window.messages if "the episode ended after 12 steps (truncated)" in message]
     assert len(ends) >= 2
@@ -92,13 +92,13 @@ def test_a_slow_plan_does_not_delay_commands(shared_env: SharedEnv) -> None:
     run(
         session,
         lambda frame: len(slow.log) > 6 and slow.inside == 1,
-        [protocol.Reset(random=True)],
+        [command(reset, random=True)],
         lambda frame: frame.status.step == 0,
-        [protocol.SetWorld(1)],
+        [command(set_world, 1)],
         lambda frame: frame.status.world == 1,
-        [protocol.SetPaused(True)],
+        [command(set_paused, True)],
         lambda frame: frame.status.paused,
-        [protocol.SetPaused(False), protocol.SetSpeed(2.0)],
+        [command(set_paused, False), command(set_speed, 2.0)],
         lambda frame: frame.status.speed == 2.0,
     )
     calls = len(slow.log)
@@ -134,7 +134,7 @@ def test_failing_controller_is_reported_and_stopped(
 
     controller = {"policy": policy, "planner": planner, "unfit": unfit}[kind]
     session = Session(shared_env("point_mass", nworld=2), controllers={kind: controller}, seed=0, paused=paused)
-    script = [[StepBy(20)]] if paused else []
+    script = [[command(step_by, 20)]] if paused else []
     window = run(session, *script, lambda frame: frame.status.mode == "passive" and bool(frame.messages))
     assert window.messages[0].startswith(f"the controller {kind!r} failed: {text}")
     assert session.stage.paused and window.frames[-1].status.paused
@@ -144,5 +144,5 @@ def test_failing_controller_is_reported_and_stopped(
 def test_viewer_shows_frames_even_if_the_plant_never_waits(shared_env: SharedEnv) -> None:
     env = shared_env("point_mass", autoreset=False, horizon=0)
     session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
-    session.obey(protocol.SetSpeed(16.0))
+    session.obey(command(set_speed, 16.0))
     run(session, lambda frame: session.stage.live.made > 0, *[[]] * 20)

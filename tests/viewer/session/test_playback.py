@@ -5,8 +5,8 @@ from conftest import SharedEnv
 from toy_controllers import towards
 
 import lyceum_warp as lw
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import StepBy
+from lyceum_warp.viewer.commands import command, reset, seek, set_backwards, set_ghosts, set_mode, step_by
+from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
 
@@ -26,23 +26,23 @@ def test_playback_can_seek_reverse_and_loop(shared_env: SharedEnv, trajectories:
     def shown() -> np.ndarray:
         return session.stage.frame().state[qpos]
 
-    session.obey(protocol.Seek(7))
+    session.obey(command(seek, 7))
     np.testing.assert_array_equal(shown(), trajectories[0].states[7, qpos])
-    session.obey(StepBy(-2))
+    session.obey(command(step_by, -2))
     assert session.stage.frame().status.step == 5
-    session.obey(protocol.SetBackwards(True))
+    session.obey(command(set_backwards, True))
     session.stage.advance(6)
     assert session.stage.frame().status.step == 20
-    session.obey(protocol.SetMode("playback", episode=1))
+    session.obey(command(set_mode, "playback", episode=1))
     frame = session.stage.frame()
     assert frame.status.step == 15 and frame.status.steps == 15 and frame.status.episode == 1
-    session.obey(protocol.SetBackwards(False))
-    session.obey(protocol.Reset(random=False))
+    session.obey(command(set_backwards, False))
+    session.obey(command(reset, random=False))
     session.stage.frame()
     session.stage.advance(3)
-    points = session.stage.frame().samples
+    points = session.stage.frame().points
     np.testing.assert_allclose(points[:, 2], trajectories[1].rewards[:3])
-    session.obey(protocol.SetGhosts(episodes=2, burst=4))
+    session.obey(command(set_ghosts, Ghosts(episodes=2, burst=4)))
     ghosts = session.stage.frame().ghosts
     np.testing.assert_array_equal(ghosts[0].state[qpos], trajectories[0].states[3, qpos])
     past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
@@ -52,8 +52,8 @@ def test_playback_can_seek_reverse_and_loop(shared_env: SharedEnv, trajectories:
 def test_worlds_continue_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
     env = shared_env("point_mass")
     session = Session(env, episodes={"first": trajectories[0]}, paused=True)
-    session.obey(protocol.Seek(20))
-    session.obey(protocol.SetMode("passive"))
+    session.obey(command(seek, 20))
+    session.obey(command(set_mode, "passive"))
     qpos = env.state_space.parts["qpos"]
     assert torch.equal(env.get_state()[0, qpos], trajectories[0].states[20, qpos])
     session.stage.advance()
@@ -65,7 +65,7 @@ def test_states_are_played_back_without_rewards(shared_env: SharedEnv) -> None:
     session = Session(env, episodes=states)
     session.stage.advance()
     frame = session.stage.frame()
-    assert frame.status.steps == 3 and np.isnan(frame.samples[:, 2:]).all()
+    assert frame.status.steps == 3 and np.isnan(frame.points[:, 2:]).all()
 
 
 def test_episode_of_another_task_or_model_raises_an_error(

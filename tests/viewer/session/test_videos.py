@@ -12,8 +12,8 @@ from conftest import SharedEnv
 from memory_window import MemoryWindow
 
 from lyceum_warp.support.interrupts import Interrupted, signals
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Command, Frame
+from lyceum_warp.viewer.commands import Command, command, set_video, take_picture
+from lyceum_warp.viewer.protocol import Frame
 from lyceum_warp.viewer.session import videos
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
@@ -32,8 +32,8 @@ def test_a_video_of_the_session_is_written_and_reported(
     def after(frame: Frame, number: int) -> list[Command] | None:
         assert (frame.status.video is not None) == (0 < number <= 15)
         return {
-            0: [protocol.SetVideo(CAMERA), protocol.TakePicture(CAMERA)],
-            15: [protocol.SetVideo(None)],
+            0: [command(set_video, CAMERA), command(take_picture, CAMERA)],
+            15: [command(set_video, None)],
             16: None,
         }.get(number, [])
 

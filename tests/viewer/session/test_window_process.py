@@ -17,9 +17,7 @@ from headless_screen import frame_of, robot, scene_of
 
 import lyceum_warp
 from lyceum_warp.viewer import show
-from lyceum_warp.viewer.protocol import latest
 from lyceum_warp.viewer.session.window_process import Window
-from lyceum_warp.viewer.window.proxy import SCRIPT
 
 MODEL = robot()
 DATA = mujoco.MjData(MODEL)
@@ -32,10 +30,7 @@ def shared_window() -> Iterator[Window]:
 
 
 def page(window: Window, path: str = "") -> bytes:
-    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-    with browser.open(window.address, timeout=10) as first:
-        address = urllib.parse.urljoin(first.url, path)
-    with browser.open(address, timeout=10) as response:
+    with urllib.request.urlopen(window.address + path, timeout=10) as response:
         content: bytes = response.read()
     return content
 
@@ -65,10 +60,10 @@ def is_alive(pid: int) -> bool:
 
 def test_two_windows_serve_page_and_model_at_different_ports(shared_window: Window) -> None:
     assert shared_window.is_open()
-    assert b"canvas" in page(shared_window) and SCRIPT.encode() in page(shared_window)
+    assert b"canvas" in page(shared_window)
     assert wait_until(lambda: len(page(shared_window, "model")) > 1000)
     port = urllib.parse.urlsplit(shared_window.address).port
-    with pytest.raises(ValueError, match=f"^port {port} is in use.*$"):
+    with pytest.raises(ValueError, match=f"port {port}"):
         Window(scene_of(MODEL), port=port)
 
 
@@ -80,15 +75,14 @@ def test_process_listens_on_the_loopback_address_only(shared_window: Window) -> 
             fields = line.split()
             if fields[3] == "0A" and f"socket:[{fields[9]}]" in own:
                 listening.add(fields[1].partition(":")[0])
-    assert listening == {"0100007F", "00000000000000000000000001000000"}  # 127.0.0.1, ::1
+    assert listening == {"0100007F"}  # 127.0.0.1
 
 
-def test_window_accepts_frames_without_a_browser(shared_window: Window) -> None:
-    assert shared_window.commands() == []
-    assert wait_until(lambda: shared_window.wants_frame)
+def test_window_requests_no_further_frame_without_a_page(shared_window: Window) -> None:
+    assert shared_window.commands() == [] and shared_window.wants_frame
     shared_window.show(frame_of(MODEL, DATA))
+    time.sleep(0.5)
     assert not shared_window.wants_frame
-    assert wait_until(lambda: shared_window.wants_frame)
 
 
 def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
@@ -96,25 +90,6 @@ def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
     time.sleep(0.3)
     assert shared_window.is_open() and page(shared_window)
     assert os.getpgid(process_of(shared_window)) != os.getpgid(0)  # a terminal sends Ctrl-C to one process group
-
-
-# frames
-
-
-def test_points_and_messages_of_skipped_frames_are_merged_up_to_a_limit() -> None:
-    merged = None
-    for frame in (
-        frame_of(MODEL, DATA, samples=np.array([[0.0, 1, 2]]), messages=("one",)),
-        frame_of(MODEL, DATA),
-        last := frame_of(MODEL, DATA, samples=np.array([[0.1, 3, 4]]), messages=("two", "three")),
-    ):
-        merged = latest(merged, frame)
-    assert merged is not None and merged.samples is not None
-    np.testing.assert_array_equal(merged.samples, [[0.0, 1, 2], [0.1, 3, 4]])
-    assert merged.messages == ("one", "two", "three") and merged.state is last.state
-    for i in range(30):
-        merged = latest(merged, frame_of(MODEL, DATA, samples=np.full((1000, 3), i), messages=("m",) * 10))
-    assert merged.samples is not None and len(merged.samples) == 20_000 and len(merged.messages) == 200
 
 
 # ends
@@ -138,7 +113,7 @@ def test_close_ends_the_process_and_closes_all_file_descriptors(capfd: pytest.Ca
 def test_frames_for_a_hanging_window_do_not_block() -> None:
     with contextlib.closing(Window(scene_of(MODEL))) as window:
         os.kill(process_of(window), signal.SIGSTOP)
-        frame = frame_of(MODEL, DATA, samples=np.zeros((20_000, 3)))
+        frame = frame_of(MODEL, DATA, points=np.zeros((20_000, 3)))
         for _ in range(5):  # fills the pipe
             window.show(frame)
             time.sleep(0.02)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from headless_screen import Bench, frame_of, robot, scene_of, status_of
 
-from lyceum_warp.viewer.protocol import Perturb
+from lyceum_warp.viewer.commands import Command
 from lyceum_warp.viewer.window import studio
 
 
@@ -15,7 +15,7 @@ def bench() -> Bench:
     return bench
 
 
-def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
+def drag(bench: Bench, body: str, *, paused: bool) -> list[Command]:
     perturb, data = bench.viewer.perturb, bench.viewer.data
     perturb.select = bench.model.body(body).id
     perturb.flexselect = perturb.skinselect = -1
@@ -26,7 +26,7 @@ def drag(bench: Bench, body: str, *, paused: bool) -> list[Perturb]:
     return hold(bench, paused=paused)
 
 
-def hold(bench: Bench, *, paused: bool) -> list[Perturb]:
+def hold(bench: Bench, *, paused: bool) -> list[Command]:
     before = len(bench.sent)
     bench.panel.mouse.drag(bench.viewer, paused=paused)
     return bench.sent[before:]  # type: ignore[return-value]
@@ -34,24 +34,24 @@ def hold(bench: Bench, *, paused: bool) -> list[Perturb]:
 
 def test_dragged_body_is_pushed_until_the_release(bench: Bench) -> None:
     (push,) = drag(bench, "ball", paused=False)
-    assert push.forces[bench.model.body("ball").id, 0] > 0
-    assert push.qpos is None and push.mocap_pos is None
+    assert push.options["forces"][bench.model.body("ball").id, 0] > 0
+    assert list(push.options) == ["forces"]
     bench.viewer.perturb.active = 0
     (end,) = hold(bench, paused=False) + hold(bench, paused=False)
-    assert not end.forces.any()
+    assert not end.arguments[0].any()
 
 
 def test_drag_while_paused_places_the_body_only_when_the_mouse_moves(bench: Bench) -> None:
     (place,) = drag(bench, "ball", paused=True)
-    np.testing.assert_allclose(place.qpos[0], 0.5)
-    assert not place.forces.any()
+    np.testing.assert_allclose(place.options["qpos"][0], 0.5)
+    assert not place.options["forces"].any()
     for _ in range(5):
         assert hold(bench, paused=True) == []
         bench.data.qpos[:] = bench.viewer.data.qpos
         bench.panel.take(frame_of(bench.model, bench.data, status_of(paused=True)))
     bench.viewer.perturb.refpos = bench.viewer.perturb.refpos + np.array([0.0, 0.1, 0])
     (place,) = hold(bench, paused=True)
-    np.testing.assert_allclose(place.qpos[:2], [0.5, 0.1])
+    np.testing.assert_allclose(place.options["qpos"][:2], [0.5, 0.1])
 
 
 @pytest.mark.parametrize("paused", [False, True])
@@ -62,7 +62,7 @@ def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> N
     bench.panel.mouse.let_go()
     bench.panel.mouse.let_go()
     (end,) = bench.sent
-    assert isinstance(end, Perturb) and not end.forces.any() and end.qpos is None
+    assert not end.arguments[0].any() and not end.options
     assert hold(bench, paused=paused) == []  # the next browser
     assert not bench.viewer.perturb.active
     assert len(drag(bench, "ball", paused=paused)) == 1
@@ -71,4 +71,4 @@ def test_push_ends_when_its_browser_disconnects(bench: Bench, paused: bool) -> N
 @pytest.mark.parametrize("paused", [False, True])
 def test_dragged_mocap_body_is_placed(bench: Bench, paused: bool) -> None:
     (place,) = drag(bench, "goal", paused=paused)
-    np.testing.assert_allclose(place.mocap_pos, [[1.5, 0, 1]])
+    np.testing.assert_allclose(place.options["mocap_pos"], [[1.5, 0, 1]])

@@ -1,16 +1,27 @@
+from typing import Any
+
 import mujoco
 import numpy as np
 import pytest
 from headless_screen import Bench, frame_of, robot, scene_of, state_of, status_of
 
-from lyceum_warp.viewer import protocol
-from lyceum_warp.viewer.protocol import Ghost, Opened, SetVideo
+from lyceum_warp.viewer.commands import (
+    command,
+    reset,
+    set_backwards,
+    set_ghosts,
+    set_mode,
+    set_paused,
+    set_speed,
+    set_video,
+    set_world,
+    step_by,
+)
+from lyceum_warp.viewer.protocol import Ghost, Ghosts, Opened
 from lyceum_warp.viewer.window import studio
-from lyceum_warp.viewer.window.actions import key_table
+from lyceum_warp.viewer.window.actions import ACTIONS
 from lyceum_warp.viewer.window.studio import imgui
 from lyceum_warp.viewer.window.windows import WINDOWS
-
-KEYS = {key.name: key for key in key_table()}
 
 
 @pytest.fixture
@@ -19,9 +30,9 @@ def bench() -> Bench:
     return Bench(model, scene_of(model))
 
 
-def pressed(bench: Bench, key: str, **status: object) -> list[object]:
+def pressed(bench: Bench, key: str, **status: object) -> list[Any]:
     bench.show(status_of(**status))
-    KEYS[key].action(bench.panel.actions)
+    ACTIONS[key].act(bench.panel.actions)
     return list(bench.sent)
 
 
@@ -39,9 +50,9 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
             mode=mode, episode=1, video="video.mp4", seekable=(0, 20), command=(0.5, 0.0, 0.1), driven=True,
             planner=(("noise", 0.5), ("samples", 8)), params=(("weight", 0.1),), paused=True,
         ),
-        samples=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
+        points=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
-    assert bench.sent == [Opened("http://here")]
+    assert bench.sent == [Opened(("viewer: http://here",))]
     assert bench.draw() == bench.draw(frame) == []  # draw without a frame, then with the first frame
     bench.panel.actions.cameras.choose(studio.ux.FREE_CAMERA_IDX)
     assert bench.draw() == []
@@ -69,33 +80,29 @@ def test_panel_draws_ghosts_and_traces(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "command"),
+    ("key", "sent"),
     [
-        ("Space", protocol.SetPaused(True)), ("Right", protocol.StepBy(1)), ("Left", protocol.StepBy(-1)),
-        ("Shift+Right", protocol.StepBy(50)), ("Shift+Left", protocol.StepBy(-50)),
-        ("Ctrl+Right", protocol.SetMode("controller")), ("Ctrl+Left", protocol.SetMode("playback")),
-        ("Ctrl+Down", protocol.SetMode("controller", "mppi")), ("Ctrl+Up", protocol.SetMode("controller", "mppi")),
-        ("Down", protocol.SetWorld("next")), ("Up", protocol.SetWorld("previous")),
-        ("Shift+Up", protocol.SetSpeed(2.0)), ("Shift+Down", protocol.SetSpeed(0.5)),
-        ("Backspace", protocol.Reset(random=False)),
-        ("Shift+Backspace", protocol.Reset(random=True)), ("Ctrl+R", protocol.SetBackwards(True)),
-        ("Ctrl+B", protocol.SetGhosts(burst=25)),
+        ("Space", command(set_paused, True)), ("Left", command(step_by, -1)), ("Shift+Right", command(step_by, 50)),
+        ("Ctrl+Right", command(set_mode, "controller")), ("Ctrl+Left", command(set_mode, "playback")),
+        ("Ctrl+Down", command(set_mode, "controller", controller="mppi")), ("Down", command(set_world, "next")),
+        ("Shift+Up", command(set_speed, 2.0)), ("Shift+Backspace", command(reset, random=True)),
+        ("Ctrl+R", command(set_backwards, True)), ("Ctrl+B", command(set_ghosts, Ghosts(burst=25))),
     ],
 )  # fmt: skip
-def test_key_sends_its_command(bench: Bench, key: str, command: object) -> None:
-    assert pressed(bench, key) == [command]
+def test_key_sends_its_command(bench: Bench, key: str, sent: object) -> None:
+    assert pressed(bench, key) == [sent]
 
 
 def test_keys_depend_on_the_mode_and_stay_within_limits(bench: Bench) -> None:
-    assert pressed(bench, "Down", mode="playback", episode=1) == [protocol.SetMode("playback", episode=0)]
-    assert pressed(bench, "Shift+Up", speed=16.0) == [protocol.SetSpeed(16.0)]
-    assert pressed(bench, "Shift+Down", speed=1 / 16) == [protocol.SetSpeed(1 / 16)]
-    assert pressed(bench, "Ctrl+B", ghosts=protocol.SetGhosts(worlds=1, burst=3)) == [protocol.SetGhosts(worlds=1)]
+    assert pressed(bench, "Down", mode="playback", episode=1) == [command(set_mode, "playback", episode=0)]
+    assert pressed(bench, "Shift+Up", speed=16.0) == [command(set_speed, 16.0)]
+    assert pressed(bench, "Shift+Down", speed=1 / 16) == [command(set_speed, 1 / 16)]
+    assert pressed(bench, "Ctrl+B", ghosts=Ghosts(worlds=1, burst=3)) == [command(set_ghosts, Ghosts(worlds=1))]
 
 
 @pytest.mark.parametrize("mode", ["passive", "controller", "playback"])
 def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
-    for name in KEYS:
+    for name in ACTIONS:
         pressed(bench, name, mode=mode)
         bench.draw()
 
@@ -105,10 +112,11 @@ def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
 
 def test_default_camera_tracks_the_body_of_a_tracking_camera(bench: Bench) -> None:
     ball = bench.model.body("ball").id
-    (command,) = pressed(bench, "Ctrl+V")
-    assert isinstance(command, SetVideo) and command.camera is not None
-    assert command.camera["type"] == mujoco.mjtCamera.mjCAMERA_TRACKING and command.camera["trackbodyid"] == ball
-    assert pressed(bench, "Ctrl+V", video="video.mp4") == [SetVideo(None)]
+    (video,) = pressed(bench, "Ctrl+V")
+    assert video.function is set_video
+    assert video.arguments[0]["type"] == mujoco.mjtCamera.mjCAMERA_TRACKING
+    assert video.arguments[0]["trackbodyid"] == ball
+    assert pressed(bench, "Ctrl+V", video="video.mp4") == [command(set_video, None)]
 
 
 def test_user_can_choose_a_fixed_camera_of_the_model(bench: Bench) -> None:

@@ -23,16 +23,16 @@ def ghost(x: float) -> Ghost:
 
 
 def test_ghost_draws_the_moving_geoms_of_visible_groups_in_its_colour() -> None:
-    geoms = ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(2.0),)), SHOWN)
+    geoms = ExtraGeoms(MODEL, 100).of(frame(ghosts=(ghost(2.0),)), SHOWN)
     assert [geom.type for geom in geoms] == [int(mujoco.mjtGeom.mjGEOM_SPHERE)]  # no static plane
     np.testing.assert_allclose(geoms[0].pos, [2, 0, 1])
     np.testing.assert_allclose(geoms[0].rgba, [0.2, 0.4, 0.6, 0.3])
     assert geoms[0].transparent
-    assert ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(2.0),)), HIDDEN) == []
+    assert ExtraGeoms(MODEL, 100).of(frame(ghosts=(ghost(2.0),)), HIDDEN) == []
 
 
 def test_ghosts_that_coincide_with_the_displayed_world_are_omitted() -> None:
-    geoms = ExtraGeoms(MODEL, 100).draw(frame(ghosts=(ghost(0.0), ghost(0.5))), SHOWN)
+    geoms = ExtraGeoms(MODEL, 100).of(frame(ghosts=(ghost(0.0), ghost(0.5))), SHOWN)
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
 
 
@@ -41,11 +41,11 @@ def test_ghosts_that_coincide_with_the_displayed_world_are_omitted() -> None:
 def test_traces_are_thinned_before_some_are_omitted(limit: int, number: int, best: int | None) -> None:
     traces = np.random.default_rng(0).normal(size=(number, 33, 3))
     scene = ExtraGeoms(MODEL, limit)
-    geoms = scene.draw(frame(traces=traces, best=best), SHOWN)
+    geoms = scene.of(frame(traces=traces, best=best), SHOWN)
     assert len(geoms) <= min(limit, 160)
     assert (len(geoms) >= 4 * number) == (limit >= 100 and number == 10)  # each trace needs at least 4 lines
     ghosts = tuple(ghost(i) for i in range(20))
-    assert len(scene.draw(frame(ghosts=ghosts, traces=traces, best=best), SHOWN)) <= limit
+    assert len(scene.of(frame(ghosts=ghosts, traces=traces, best=best), SHOWN)) <= limit
 
 
 # model values
