@@ -61,12 +61,19 @@ class Screen:
         # studio would serve everyone: on every address, and on a loopback port that other users can use
         web_server.bind_public_socket = web_server.bind_loopback_socket = private
         web_server.serve = server.serve
+        web_server.WebServer = _WebServer
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         viewer = _Viewer(config, self._viewer_end, plugins=[own], server=server)
         if len(replaced) < 2:
             viewer.close()
             raise RuntimeError(f"mujoco.studio {mujoco.__version__} would listen on every address of this machine")
         viewer_protocol.run_viewer_loop(viewer)
+
+
+class _WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
+    def update_state(self, payload: bytes) -> None:
+        if payload != self._state_payload:  # the browser already has equal ones
+            super().update_state(payload)
 
 
 class _Viewer(web_viewer.WebViewer):  # type: ignore[misc]  # studio has no types

@@ -1,5 +1,6 @@
 """Build the windows of the panel with ImGui."""
 
+import time
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -11,7 +12,9 @@ from lyceum_warp.viewer.window.actions import ACTIONS, OTHER_KEYS, SPEEDS, Actio
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""A plotted curve covers PLOT_SECONDS seconds with at most PLOT_POINTS points. Every frame sends all points."""
+"""A plotted curve covers PLOT_SECONDS seconds with at most PLOT_POINTS points."""
+PLOT_PERIOD = 0.2
+"""Seconds between two updates of the plots. Each update sends all points to the browser."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 FEW_CURVES = 2
@@ -27,6 +30,8 @@ class Windows:
         self._actions, self._scene = actions, actions.scene
         self._edited: dict[tuple[str, str], float] = {}
         self._plotted = set(self._scene.curves[:FEW_CURVES])
+        self._plot = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
+        self._next_plot = 0.0
         self._folded = False
         self._size = (0.0, 0.0)
 
@@ -283,7 +288,11 @@ class Windows:
             for name in names:
                 if imgui.Checkbox(name, name in self._plotted)[0]:
                     self._plotted ^= {name}
-        low, mean, high = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
+        now = time.monotonic()
+        if now >= self._next_plot:
+            self._next_plot = now + PLOT_PERIOD
+            self._plot = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
+        low, mean, high = self._plot
         times, ends = mean[:, 0], high[high[:, 1] > 0, 0]
         flags = int(implot.Flags.NoLegend) | int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect)
         flags |= int(implot.Flags.NoTitle)
