@@ -262,15 +262,15 @@ def _listen(host: str, port: int) -> list[socket.socket]:
 
 
 class PrivateSocket(socket.socket):
-    """A socket that listens on a free port of 127.0.0.1, and refuses connections of other users.
+    """A socket for a free port of 127.0.0.1 that refuses connections of other users.
 
-    All users of a machine can connect to its loopback address.
+    All users of a machine can connect to its loopback address. Studio calls ``listen``. Its user interface would poll an
+    earlier connection, which no page needs yet.
     """
 
     def __init__(self) -> None:
         super().__init__(socket.AF_INET, socket.SOCK_STREAM)
         self.bind(("127.0.0.1", 0))
-        self.listen()
 
     def accept(self) -> tuple[socket.socket, Any]:
         """Accept a connection of this user."""

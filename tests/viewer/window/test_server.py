@@ -214,6 +214,7 @@ def test_free_port_is_found_and_invalid_port_or_host_raises_an_error(monkeypatch
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can start a process of another user")
 def test_other_users_cannot_connect_to_a_private_socket() -> None:
     with PrivateSocket() as private:
+        private.listen()
         if (child := os.fork()) == 0:
             with contextlib.suppress(OSError):
                 os.setuid(65534)
