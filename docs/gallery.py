@@ -246,7 +246,7 @@ def pictures(env: lw.Env, states: torch.Tensor, show: Show) -> list[Image.Image]
     size = (SCALE * SIZE[0], SCALE * SIZE[1])
     painter = Painter(mujoco, model, size, camera_values(model, show.camera))
     steps = [round(i / RATE / env.timestep) for i in range(int(len(states) * env.timestep * RATE) or 1)]
-    images = [painter.draw(shot) for shot in shots(env, states[steps])]
+    images = [painter.render(shot) for shot in shots(env, states[steps])]
     return [Image.fromarray(picture).resize(SIZE, Image.Resampling.LANCZOS) for picture in images]
 
 

@@ -1,4 +1,4 @@
-"""Draw plots, render videos, and write curves for TensorBoard.
+"""Make plots, render videos, and write curves for TensorBoard.
 
 Plots and videos need the extra ``viz``.
 """

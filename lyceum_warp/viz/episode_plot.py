@@ -11,7 +11,7 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 
 
 def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
-    """Draw episodes of a controller as PNG.
+    """Plot episodes of a controller as PNG.
 
     The left side shows reward and evaluation metric against simulated time. Two plots on the right side show planning
     times and ages of actions against wall time. A histogram below them shows the planning times. Dashed lines show the
@@ -30,9 +30,9 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
     grid = figure.add_gridspec(6, 2)
     reward, evaluation = (figure.add_subplot(grid[rows, 0]) for rows in (slice(0, 3), slice(3, 6)))
     planning, age, histogram = (figure.add_subplot(grid[rows, 1]) for rows in (slice(0, 2), slice(2, 4), slice(4, 6)))
-    _draw_outcomes(reward, evaluation, episodes)
-    _draw_times(planning, age, episodes)
-    _draw_histogram(histogram, episodes)
+    _plot_outcomes(reward, evaluation, episodes)
+    _plot_times(planning, age, episodes)
+    _plot_histogram(histogram, episodes)
     histogram.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
     histogram.xaxis.set_minor_formatter(LogFormatter())
     finish_axes((reward, evaluation, planning, age, histogram))
@@ -45,7 +45,7 @@ def _line_style(episodes: Sequence[Trajectory]) -> dict[str, Any]:
     return dict(color=LINE, linewidth=1.2, alpha=max(0.25, 1 / len(episodes) ** 0.5))
 
 
-def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory]) -> None:
+def _plot_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory]) -> None:
     for episode in episodes:
         line = _line_style(episodes) | {"marker": "." if episode.steps < 3 else ""}  # a line of one point is invisible
         seconds = episode.timestep * np.arange(1, episode.steps + 1)
@@ -63,7 +63,7 @@ def _draw_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory])
         evaluation.legend(frameon=False, loc="best")
 
 
-def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
+def _plot_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None:
     dots = _line_style(episodes) | {"linestyle": "", "marker": ".", "markersize": 3}
     for episode in episodes:
         # skip the first plan: it loads kernels, and its time would dominate the scale
@@ -83,7 +83,7 @@ def _draw_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None
         axes.set_ylim(bottom=0)
 
 
-def _draw_histogram(axes: Any, episodes: Sequence[Trajectory]) -> None:
+def _plot_histogram(axes: Any, episodes: Sequence[Trajectory]) -> None:
     times = 1000 * np.concatenate([episode.plan_times[1:].numpy() for episode in episodes])
     times = times[times > 0]
     if len(times):

@@ -124,7 +124,7 @@ def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
 
 
 def _surface(model: mujoco.MjModel, geom: int) -> Surface | None:
-    """Make a geom's surface in the geom's coordinates. Some kinds of geoms are not drawn."""
+    """Make a geom's surface in the geom's coordinates. Some kinds of geoms are omitted."""
     types = mujoco.mjtGeom
     kind, size = types(int(model.geom_type[geom])), model.geom_size[geom]
     if kind == types.mjGEOM_PLANE:

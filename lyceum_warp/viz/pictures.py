@@ -4,11 +4,11 @@ import numpy as np
 
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
-from lyceum_warp.viz.drawing import DrawingProcess
+from lyceum_warp.viz.renderer import Renderer
 from lyceum_warp.viz.video import shots
 
 
-class WorldPictures(DrawingProcess):
+class WorldPictures(Renderer):
     """Renders the current states of an environment's worlds.
 
     Args:
@@ -27,7 +27,7 @@ class WorldPictures(DrawingProcess):
             self.__enter__()
         pictures = []
         for shot in shots(self.env, self.env.get_state().cpu()):
-            self.draw(shot)
+            self.render(shot)
             pictures.append(self.picture())
         return pictures
 

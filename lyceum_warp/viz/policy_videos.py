@@ -41,14 +41,14 @@ def policy_video(
         (episode,) = policy_episodes(
             one, acting(policy), 1, seed=seed, curriculum=curriculum, progress=running
         )  # fmt: skip
-    drawing = None if progress is None else functools.partial(progress, "drawing the video", "frames")
-    return write_video(one, episode.states, path, camera=camera, progress=drawing)
+    rendering = None if progress is None else functools.partial(progress, "rendering the video", "frames")
+    return write_video(one, episode.states, path, camera=camera, progress=rendering)
 
 
 class Videos:
     """Writes a video of the mean policy every few iterations.
 
-    After an error, for example because the machine cannot draw, training continues without videos.
+    After an error, for example because the machine cannot render, training continues without videos.
     """
 
     def __init__(

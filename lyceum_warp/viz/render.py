@@ -1,14 +1,14 @@
-"""Draw states as a video or as single pictures: ``python render.py folder``.
+"""Render states as a video or as single pictures: ``python render.py folder``.
 
-``drawing.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
+``renderer.py`` runs this program as a subprocess. It writes pickled objects to the program's stdin: a dict with
 ``size``, ``fps``, ``camera`` and ``background``, then a ``Shot`` for each picture, and None at the end. If stdin closes
 before None arrives, the parent process has died. The folder holds the model, ``model.mjb``. The program writes
 ``video.mp4``. If ``fps`` is None, it writes each picture to ``picture.raw`` instead. The program prints "ready" once it
-can draw, and "frame" after each picture.
+can render, and "frame" after each picture.
 
-MuJoCo chooses its graphics library when it is imported, and a failing driver may end the process. ``drawing.py``
-therefore starts a process for each library that it tries. Exit code 3 means that the machine cannot draw with this
-library. The last line on stderr then holds the reason. The program imports no module of the package.
+MuJoCo chooses its graphics backend when it is imported, and a failing driver may end the process. ``renderer.py``
+therefore starts a process for each backend that it tries. Exit code 3 means that the machine cannot render with this
+backend. The last line on stderr then holds the reason. The program imports no module of the package.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-CANNOT_DRAW = 3
+CANNOT_RENDER = 3
 ABANDONED = 4
 
 VIDEO, PICTURE = "video.mp4", "picture.raw"
@@ -44,7 +44,7 @@ class Shot(TypedDict):
 
 
 class Painter:
-    """Draws states of a model."""
+    """Renders states of a model."""
 
     def __init__(self, mujoco: Any, model: Any, size: tuple[int, int], camera: dict[str, Any]) -> None:
         self.mujoco, self.model = mujoco, model
@@ -60,8 +60,8 @@ class Painter:
             setattr(self.view, name, value)
         self._fields: dict[str, np.ndarray] = {}
 
-    def draw(self, shot: Shot) -> np.ndarray:
-        """Draw one frame, (height, width, 3) uint8."""
+    def render(self, shot: Shot) -> np.ndarray:
+        """Render one frame, (height, width, 3) uint8."""
         if any(not np.array_equal(value, self._fields.get(name, ())) for name, value in shot["model_fields"].items()):
             self._fields = shot["model_fields"]
             change_model(self.mujoco, self.model, self._fields)
@@ -107,7 +107,7 @@ def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
 
 
 def main(folder: str) -> int:
-    """Draw the shots that arrive on stdin, and return the exit code."""
+    """Render the shots that arrive on stdin, and return the exit code."""
     source = sys.stdin.buffer
     try:
         import mujoco
@@ -118,15 +118,15 @@ def main(folder: str) -> int:
         model = mujoco.MjModel.from_binary_path(str(Path(folder, "model.mjb")))
         painter = Painter(mujoco, model, job["size"], job["camera"])
         painter.renderer.update_scene(painter.data, painter.view)
-        painter.renderer.render()  # some drivers fail only when they draw
-    except Exception as error:  # the type of the error depends on the graphics library
+        painter.renderer.render()  # some drivers fail only when they render
+    except Exception as error:  # the type of the error depends on the backend
         print(str(error).strip() or type(error).__name__, file=sys.stderr)
-        return CANNOT_DRAW
+        return CANNOT_RENDER
     try:
         with contextlib.nullcontext() if job["fps"] is None else _video(Path(folder, VIDEO), job) as writer:
             print("ready", flush=True)
             while (shot := pickle.load(source)) is not None:
-                image = painter.draw(shot)
+                image = painter.render(shot)
                 if writer is None:
                     Path(folder, PICTURE).write_bytes(image.tobytes())
                 else:

@@ -15,7 +15,7 @@ def new_figure(purpose: str, width: float, height: float) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ImportError(f"drawing {purpose} needs matplotlib: {EXTRA}") from error
+        raise ImportError(f"plotting {purpose} needs matplotlib: {EXTRA}") from error
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

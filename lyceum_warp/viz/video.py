@@ -3,9 +3,9 @@
 import contextlib
 import math
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeAlias
 
 import mujoco
@@ -15,9 +15,9 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
-from lyceum_warp.viz.drawing import Drawing, check_video
 from lyceum_warp.viz.extra import NoVideoError
 from lyceum_warp.viz.render import Shot
+from lyceum_warp.viz.renderer import FileRenderer, check_video
 
 __all__ = ["NoVideoError", "Progress", "Recorder", "check_video", "write_video"]
 
@@ -41,7 +41,7 @@ def write_video(
     """Render states into an mp4 file, with the model fields of their worlds.
 
     The video has at most 60 frames per second. If time steps are shorter than frames, states are skipped. A subprocess
-    draws the video, without a display.
+    renders the video, without a display.
 
     Args:
         env: The environment of the states.
@@ -65,14 +65,15 @@ def write_video(
     rate = positive_number("speed", speed, "simulated seconds per second") / env.timestep
     stride = max(1, math.ceil(rate / _MAX_RATE - 1e-9))
     rows = states[::stride].cpu()
+    view = camera_values(env.model, camera)
     with (
-        Drawing(env.model, out, camera=camera_values(env.model, camera), size=size, fps=rate / stride) as drawing,
-        LongWork("drawing the video", "frames") if progress is None else contextlib.nullcontext(progress) as report,
+        FileRenderer(env.model, out, camera=view, size=size, fps=rate / stride) as renderer,
+        LongWork("rendering the video", "frames") if progress is None else contextlib.nullcontext(progress) as report,
     ):
         for i, shot in enumerate(shots(env, rows)):
-            drawing.draw(shot)
+            renderer.render(shot)
             report(i + 1, len(rows))
-        return drawing.finish()
+        return renderer.finish()
 
 
 def check_states(env: Env, states: torch.Tensor) -> None:
@@ -114,15 +115,15 @@ class Recorder:
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
         """The number of frames that repeat an earlier picture, because the queue was full."""
-        self._drawing = Drawing(model, out, camera=camera, size=size, fps=fps, background=True)
+        self._renderer = FileRenderer(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
-        self._shots: deque[Shot] = deque()
-        self._changed = threading.Condition()  # the lock of _changed also guards the queue
-        self._ended = self._cancelled = False
+        self._shots: SimpleQueue[Shot | None] = SimpleQueue()
+        self._newest: Shot
+        self._cancelled = False
         self._error: NoVideoError | OSError | None = None
         # Thread.join of Python 3.11 would mark the thread as stopped if a signal interrupts the call
         self._done = threading.Event()
-        threading.Thread(target=self._draw, name="lyceum-warp video", daemon=True).start()
+        threading.Thread(target=self._run, name="lyceum-warp video", daemon=True).start()
 
     @property
     def finished(self) -> bool:
@@ -131,20 +132,17 @@ class Recorder:
 
     def add(self, shot: Shot) -> None:
         """Add a shot, unless the video has failed."""
-        with self._changed:
-            self.added += shot["frames"]
-            if len(self._shots) < self._most:
-                self._shots.append(shot)
-            else:
-                self._shots[-1]["frames"] += shot["frames"]
-                self.dropped += shot["frames"]
-            self._changed.notify_all()
+        self.added += shot["frames"]
+        if self._shots.qsize() < self._most:
+            self._newest = shot
+            self._shots.put(shot)
+        else:
+            self._newest["frames"] += shot["frames"]
+            self.dropped += shot["frames"]
 
     def end(self) -> None:
         """Announce that no more shots follow. The subprocess then completes the file."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
+        self._shots.put(None)
 
     def wait(self, seconds: float) -> None:
         """Wait until the video is complete or has failed, but at most for the given seconds."""
@@ -162,26 +160,20 @@ class Recorder:
         """Cancel the video, and write no file. A complete video is kept."""
         if not self.finished:
             self._cancelled = True
-            self._shots.clear()
             self.end()
-            self._drawing.abandon()
+            self._renderer.abandon()
             self._done.wait(_KILLED)
 
-    def _draw(self) -> None:
-        product = self._drawing.product
+    def _run(self) -> None:
+        product = self._renderer.product
         try:
-            with self._drawing as drawing:
-                while (shot := self._next()) is not None:
-                    drawing.draw(shot)
-                drawing.finish()
+            with self._renderer as renderer:
+                while (shot := self._shots.get()) is not None:
+                    renderer.render(shot)
+                renderer.finish()
         except (NoVideoError, OSError) as error:
             self._error = NoVideoError(f"{product} {self.out} was cancelled") if self._cancelled else error
         except Exception as error:  # a thread has no caller that could catch the error
             self._error = NoVideoError(f"{product} could not be written ({' '.join(str(error).split())})")
         finally:
             self._done.set()
-
-    def _next(self) -> Shot | None:
-        with self._changed:
-            self._changed.wait_for(lambda: self._shots or self._ended)
-            return self._shots.popleft() if self._shots else None

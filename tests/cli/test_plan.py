@@ -71,7 +71,7 @@ def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys:
     assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
     lines = capsys.readouterr().out.splitlines()
     video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
-    if video.startswith("none: this machine cannot draw"):
+    if video.startswith("none: this machine cannot render"):
         pytest.skip(video)
     assert Path(video).read_bytes()[4:8] == b"ftyp"
 

@@ -6,7 +6,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.viz import WorldPictures
-from lyceum_warp.viz.drawing import NoVideoError
+from lyceum_warp.viz.renderer import NoVideoError
 
 SIZE = (96, 64)
 
@@ -22,7 +22,7 @@ def pictures(env: lw.Env) -> Iterator[WorldPictures]:
     try:
         pictures()
     except NoVideoError as error:
-        if "cannot draw off-screen" not in str(error):
+        if "cannot render off-screen" not in str(error):
             raise
         pytest.skip(str(error))
     yield pictures

@@ -15,7 +15,7 @@ from headless_screen import state_of
 from varied_task import ball
 
 import lyceum_warp as lw
-from lyceum_warp.viz import FreeCamera, Shot, drawing, video
+from lyceum_warp.viz import FreeCamera, Shot, renderer, video
 from lyceum_warp.viz.cameras import camera_values
 
 SMALL = (96, 64)
@@ -54,9 +54,9 @@ def model() -> mujoco.MjModel:
 
 
 @pytest.fixture(scope="module")
-def can_draw(model: mujoco.MjModel) -> None:
+def can_render(model: mujoco.MjModel) -> None:
     try:
-        with drawing.DrawingProcess(model, camera={}, size=SMALL):
+        with renderer.Renderer(model, camera={}, size=SMALL):
             pass
     except video.NoVideoError as error:
         pytest.skip(str(error))
@@ -66,7 +66,7 @@ def episode(env: lw.Env, seed: int) -> torch.Tensor:
     return lw.control(env, lambda state, obs: torch.zeros(env.action_space.size), seed=seed).states
 
 
-@pytest.mark.usefixtures("can_draw")
+@pytest.mark.usefixtures("can_render")
 def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) -> None:
     frames: list[tuple[int, int]] = []
     states, out = episode(env, 4), tmp_path / "new" / "video.mp4"
@@ -79,7 +79,7 @@ def test_write_video_writes_a_frame_for_each_state(env: lw.Env, tmp_path: Path) 
     assert min(result["brightest"]) > 100  # the scene has light
 
 
-@pytest.mark.usefixtures("can_draw")
+@pytest.mark.usefixtures("can_render")
 def test_video_is_rendered_from_the_given_camera(env: lw.Env, tmp_path: Path) -> None:
     near, far = (
         video.write_video(env, env.get_state(), tmp_path / "video.mp4", camera=camera, size=SMALL).read_bytes()
@@ -91,8 +91,8 @@ def test_video_is_rendered_from_the_given_camera(env: lw.Env, tmp_path: Path) ->
 def test_error_on_a_machine_that_cannot_render_names_a_fix(
     env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
-    message = r"cannot draw off-screen \(nonsense: .*\): install Mesa's EGL"
+    monkeypatch.setattr(renderer, "backends", lambda: ["nonsense"])
+    message = r"cannot render off-screen \(nonsense: .*\): install Mesa's EGL"
     with pytest.raises(video.NoVideoError, match=message) as caught:
         video.write_video(env, env.get_state(), tmp_path / "video.mp4")
     assert "\n" not in str(caught.value)
@@ -131,7 +131,7 @@ def video_of(model: mujoco.MjModel, out: Path, *, fps: float = 30.0, most_waitin
     return video.Recorder(model, out, camera=camera_values(model), size=SMALL, fps=fps, most_waiting=most_waiting)
 
 
-@pytest.mark.usefixtures("can_draw")
+@pytest.mark.usefixtures("can_render")
 def test_shots_of_a_video_may_have_ghosts_lines_and_different_model_fields(
     model: mujoco.MjModel, tmp_path: Path
 ) -> None:
@@ -153,7 +153,7 @@ def test_shots_of_a_video_may_have_ghosts_lines_and_different_model_fields(
     assert result["columns"][3] > result["columns"][2] + 0.5
 
 
-@pytest.mark.usefixtures("can_draw")
+@pytest.mark.usefixtures("can_render")
 def test_slow_rendering_drops_shots_but_keeps_the_video_length(model: mujoco.MjModel, tmp_path: Path) -> None:
     mp4 = video_of(model, tmp_path / "video.mp4", most_waiting=2)
     for i in range(10):
@@ -173,18 +173,18 @@ def test_cancelled_or_empty_video_does_not_replace_the_old_file(model: mujoco.Mj
     mp4.cancel()
     with pytest.raises(video.NoVideoError, match="video.mp4 was cancelled"):
         mp4.close()
-    with pytest.raises(video.NoVideoError, match="has no frame|cannot draw"):
+    with pytest.raises(video.NoVideoError, match="has no frame|cannot render"):
         video_of(model, out).close()
     assert out.read_text() == "old" and [file.name for file in tmp_path.iterdir()] == ["video.mp4"]
 
 
 @pytest.mark.long
-@pytest.mark.usefixtures("can_draw")
+@pytest.mark.usefixtures("can_render")
 def test_killed_program_leaves_no_video_file(tmp_path: Path) -> None:
     program = """
 import sys, time, mujoco
-from lyceum_warp.viz.drawing import Drawing
-with Drawing(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={}, size=(96, 64), fps=30):
+from lyceum_warp.viz.renderer import FileRenderer
+with FileRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={}, size=(96, 64), fps=30):
     print("ready", flush=True)
     time.sleep(60)
 """

@@ -14,7 +14,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import described, memoryless_action
 
 MOST_SAMPLES = 24
-"""Maximum number of samples whose paths the viewer draws."""
+"""Maximum number of samples whose paths the viewer shows."""
 
 
 class ControllerError(Exception):

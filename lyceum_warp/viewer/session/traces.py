@@ -25,7 +25,7 @@ SHARE = 0.15
 
 
 def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, int]:
-    """Choose the point whose path the viewer draws. Return its field in MjData, such as "site_xpos", and its index.
+    """Choose the point whose path the viewer shows. Return its field in MjData, such as "site_xpos", and its index.
 
     The default for a robot with an unactuated base, such as a hopper or a humanoid, is the centre of mass. The default
     for an arm is the first site of the last body in the longest chain of actuated bodies. If this body has no site, the

@@ -23,42 +23,43 @@ _PATIENCE = 120.0  # seconds to finish videos when the viewer ends
 
 
 class VideoTaker:
-    """Records one video at a time. Earlier videos and pictures may still be drawn in the background."""
+    """Records one video at a time. Earlier videos and pictures may still be rendered in the background."""
 
     def __init__(self, model: mujoco.MjModel, title: str) -> None:
         self._model, self._title = model, title
-        self._running: Recorder | None = None
-        self._drawing: list[Recorder] = []
+        self._video: Recorder | None = None
+        self._recorders: list[Recorder] = []  # of all files that are not complete
         self._start = 0.0
         self._states: list[np.ndarray] = []
         self._camera: dict[str, Any] = {}
-        self._pages: list[str] = []  # messages
+        self._messages: list[str] = []
         self.files: list[Path] = []
 
     @property
     def name(self) -> str | None:
         """The name of the current video."""
-        return None if self._running is None else self._running.out.name
+        return None if self._video is None else self._video.out.name
 
     @property
     def due(self) -> bool:
         """Whether the video needs a frame."""
-        return self._running is not None and (time.perf_counter() - self._start) * FPS >= self._running.added
+        return self._video is not None and (time.perf_counter() - self._start) * FPS >= self._video.added
 
     def begin(self, camera: dict[str, Any]) -> None:
         """End the current video, and start another one."""
         self.end()
         self._camera, self._states = camera, []
-        self._running = Recorder(self._model, self._file(".mp4"), camera=camera, fps=FPS, most_waiting=_MOST_WAITING)
+        self._video = Recorder(self._model, self._file(".mp4"), camera=camera, fps=FPS, most_waiting=_MOST_WAITING)
+        self._recorders.append(self._video)
         self._start = time.perf_counter()
 
     def picture(self, camera: dict[str, Any], frame: Frame) -> None:
-        """Draw a picture of a frame."""
+        """Render a picture of a frame."""
         out = self._file(".png")
         picture = Recorder(self._model, out, camera=camera, size=_PICTURE_SIZE, fps=None, most_waiting=1)
         picture.add(_shot(frame, 1))
         picture.end()
-        self._drawing.append(picture)
+        self._recorders.append(picture)
 
     def _file(self, ending: str) -> Path:
         title = re.sub(r"[^\w.-]+", "-", self._title, flags=re.ASCII)  # the title may be a task's path
@@ -66,7 +67,7 @@ class VideoTaker:
 
     def add(self, frame: Frame) -> None:
         """Repeat a frame until the video reaches the present time."""
-        video = self._running
+        video = self._video
         if video is None or (count := int((time.perf_counter() - self._start) * FPS) + 1 - video.added) <= 0:
             return
         self._states += [frame.state] * count
@@ -74,32 +75,33 @@ class VideoTaker:
 
     def end(self) -> None:
         """Stop adding frames to the video, and write its page. A subprocess finishes the video file."""
-        if (video := self._running) is None:
+        if (video := self._video) is None:
             return
-        self._running = None
+        self._video = None
         video.end()
-        self._drawing.append(video)
         if not self._states:
             return
         page = video.out.with_suffix(".html")
         try:
             write_states(self._model, self._states, page, dt=1 / FPS, title=self._title, camera=self._camera)
         except OSError as error:
-            self._pages.append(f"no page: {error}")
+            self._messages.append(f"no page: {error}")
         else:
-            self._pages.append(f"page: {page}")
+            self._messages.append(f"page: {page}")
             self.files.append(page)
 
     def completed(self) -> list[str]:
         """Return a message for each video, picture or page that was completed or has failed since the last call."""
-        if self._running is not None and self._running.finished:  # it failed
-            self._drawing.append(self._running)
-            self._running = None
-        done = [drawing for drawing in self._drawing if drawing.finished]
-        self._drawing = [drawing for drawing in self._drawing if drawing not in done]
-        lines, self._pages = [*self._pages, *map(_completed, done)], []
-        self.files += [drawing.out for drawing in done if drawing.out.exists()]
-        return lines
+        completed = [recorder for recorder in self._recorders if recorder.finished]
+        for recorder in completed:
+            self._recorders.remove(recorder)
+            self._messages.append(_message(recorder))
+            if recorder is self._video:  # it failed
+                self._video = None
+            if recorder.out.exists():
+                self.files.append(recorder.out)
+        messages, self._messages = self._messages, []
+        return messages
 
     @contextlib.contextmanager
     def finishing(self, show: Callable[[str], object]) -> Iterator[None]:
@@ -114,13 +116,13 @@ class VideoTaker:
             end = time.monotonic() + _PATIENCE
             try:
                 with obeyed():
-                    for drawing in self._drawing:
-                        drawing.wait(end - time.monotonic())
+                    for recorder in self._recorders:
+                        recorder.wait(end - time.monotonic())
             finally:
-                for drawing in self._drawing:
-                    drawing.cancel()  # no effect on a complete video
-                for line in self.completed():
-                    show(line)
+                for recorder in self._recorders:
+                    recorder.cancel()  # no effect on a complete video
+                for message in self.completed():
+                    show(message)
 
 
 def _shot(frame: Frame, count: int) -> Shot:
@@ -133,12 +135,14 @@ def _shot(frame: Frame, count: int) -> Shot:
     )  # fmt: skip
 
 
-def _completed(drawing: Recorder) -> str:
-    kind = "picture" if drawing.out.suffix == ".png" else "video"
+def _message(recorder: Recorder) -> str:
+    kind = "picture" if recorder.out.suffix == ".png" else "video"
     try:
-        line = f"{kind}: {drawing.close()}"
+        message = f"{kind}: {recorder.close()}"
     except (NoVideoError, OSError) as error:
         return f"no {kind}: {error}"
-    if not drawing.dropped:
-        return line
-    return f"{line} ({drawing.dropped} of {drawing.added} frames dropped, which came faster than they were drawn)"
+    if not recorder.dropped:
+        return message
+    return (
+        f"{message} ({recorder.dropped} of {recorder.added} frames dropped, which came faster than they were rendered)"
+    )

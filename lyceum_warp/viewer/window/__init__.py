@@ -1,1 +1,1 @@
-"""Draw frames and handle input, with mujoco, NumPy and studio, but without torch or Warp."""
+"""Show frames and handle input, with mujoco, NumPy and studio, but without torch or Warp."""

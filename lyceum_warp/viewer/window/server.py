@@ -264,8 +264,8 @@ def _listen(host: str, port: int) -> list[socket.socket]:
 class PrivateSocket(socket.socket):
     """A socket for a free port of 127.0.0.1 that refuses connections of other users.
 
-    All users of a machine can connect to its loopback address. Studio calls ``listen``. Its user interface would poll an
-    earlier connection, which no page needs yet.
+    All users of a machine can connect to its loopback address. Studio calls ``listen``. Its user interface would poll
+    an earlier connection, which no page needs yet.
     """
 
     def __init__(self) -> None:

@@ -12,7 +12,7 @@ from toy_controllers import towards
 import lyceum_warp as lw
 from lyceum_warp.viewer.commands import Command, close, command, set_paused, set_speed, set_video
 from lyceum_warp.viewer.session.clock import Session
-from lyceum_warp.viz import drawing
+from lyceum_warp.viz import renderer
 
 
 def test_session_obeys_the_commands_set_speed_and_set_paused(shared_env: SharedEnv) -> None:
@@ -31,10 +31,10 @@ def test_failed_video_is_reported_as_a_message(
     shared_env: SharedEnv, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
+    monkeypatch.setattr(renderer, "backends", lambda: ["nonsense"])
     session = Session(shared_env("point_mass"), seed=0)
     window = run(session, [command(set_video, {})], lambda frame: bool(frame.messages))
-    assert window.messages[0].startswith("no video: this machine cannot draw")
+    assert window.messages[0].startswith("no video: this machine cannot render")
     assert window.frames[-1].status.video is None
 
 

@@ -17,7 +17,7 @@ from lyceum_warp.viewer.protocol import Frame
 from lyceum_warp.viewer.session import videos
 from lyceum_warp.viewer.session.clock import Session
 from lyceum_warp.viewer.session.videos import VideoTaker
-from lyceum_warp.viz import drawing
+from lyceum_warp.viz import renderer
 from lyceum_warp.viz.video import NoVideoError
 
 CAMERA = dict(type=1, trackbodyid=1, fixedcamid=-1, lookat=[0.0, 0.0, 1.0], distance=4.0, azimuth=90.0,
@@ -40,7 +40,7 @@ def test_a_video_of_the_session_is_written_and_reported(
     window = MemoryWindow(after)
     Session(shared_env("hopper")).run(window)  # type: ignore[arg-type]
     told = "\n".join([*window.messages, capsys.readouterr().out])
-    if "this machine cannot draw" in told:
+    if "this machine cannot render" in told:
         pytest.skip(told)
     heads = {"mp4": b"ftyp", "png": b"\r\n\x1a\n", "html": b"ctyp"}
     for kind, ending in (("video", "mp4"), ("picture", "png"), ("page", "html")):
@@ -60,18 +60,18 @@ def taker(shared_env: SharedEnv, tmp_path: Path) -> Iterator[VideoTaker]:
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn, draw = threading.Event(), drawing.Drawing.draw
+    rendered, render = threading.Event(), renderer.FileRenderer.render
 
-    def slow(self: drawing.Drawing, shot: Any) -> None:
-        draw(self, shot)
-        drawn.set()
+    def slow(self: renderer.FileRenderer, shot: Any) -> None:
+        render(self, shot)
+        rendered.set()
         time.sleep(0.5)
 
-    monkeypatch.setattr(drawing.Drawing, "draw", slow)
+    monkeypatch.setattr(renderer.FileRenderer, "render", slow)
     monkeypatch.setattr(videos, "FPS", 5)  # without a GPU, rendering is slow, so the video must omit some poses
     try:
         taker.begin(CAMERA)
-        while not drawn.is_set():
+        while not rendered.is_set():
             taker.add(frame)
             time.sleep(0.02)
         for _ in range(10):

@@ -11,14 +11,14 @@ import sys
 import tempfile
 import threading
 from pathlib import Path
-from typing import Any, Self
+from typing import IO, Any, Self
 
 import mujoco
 import numpy as np
 
 from lyceum_warp.support.files import replaced
 from lyceum_warp.viz.extra import EXTRA, NoVideoError
-from lyceum_warp.viz.render import CANNOT_DRAW, PICTURE, VIDEO, Shot
+from lyceum_warp.viz.render import CANNOT_RENDER, PICTURE, VIDEO, Shot
 
 _PATIENCE = 10.0  # seconds that a subprocess gets to end before it is killed
 
@@ -29,21 +29,22 @@ def check_video() -> None:
         raise NoVideoError(f"videos need {' and '.join(missing)}: {EXTRA}")
 
 
-def libraries() -> list[str]:
+def backends() -> list[str]:
     """The values of MUJOCO_GL to try, in order. "" stands for MuJoCo's default."""
-    given = os.environ.get("MUJOCO_GL", "")
-    others = ["egl", "osmesa"] if sys.platform.startswith("linux") else [""]
-    return list(dict.fromkeys([given, *others] if given else others))
+    backend = os.environ.get("MUJOCO_GL", "")
+    if not sys.platform.startswith("linux"):
+        return [backend]
+    return list(dict.fromkeys([*filter(None, [backend]), "egl", "osmesa"]))
 
 
-class DrawingProcess:
-    """A context manager for a subprocess that renders states with the first graphics library that works.
+class Renderer:
+    """A context manager for a subprocess that renders states with the first graphics backend that works.
 
     Args:
         model: The model.
         camera: The attributes of the ``mujoco.MjvCamera``.
         size: The width and the height in pixels, both even.
-        fps: The frames per second of a video. None draws pictures.
+        fps: The frames per second of a video. None renders pictures.
         background: Whether the subprocess has a low priority.
     """
 
@@ -58,45 +59,45 @@ class DrawingProcess:
             raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
         self.size = int(size[0]), int(size[1])
         self._job = {"size": self.size, "fps": fps, "camera": camera, "background": background}
-        self._ends = contextlib.ExitStack()
+        self._resources = contextlib.ExitStack()
+        self._folder: Path
+        self._log: IO[str]
         self._process: subprocess.Popen[bytes] | None = None
-        self._errors: Any = None
         self._lock = threading.Lock()  # other threads may call `abandon`
-        self._abandoned = self._drawn = False
+        self._abandoned = self._rendered = False
 
     def __enter__(self) -> Self:
         failures: list[str] = []
-        for library in libraries():
+        for backend in backends():
             try:
-                self._start(library)
-                if self._process is not None and self._answer() == "ready":
+                self._start(backend)
+                if self._reply() == "ready":
                     return self
-                code, reason = self._ended()
+                code, reason = self._end()
             except BaseException:
                 self._stop()
                 raise
             self._stop()
-            failures.append(f"{library or 'OpenGL'}: {reason}")
-            if code > 0 and code != CANNOT_DRAW:  # another graphics library would fail, too
+            failures.append(f"{backend or 'OpenGL'}: {reason}")
+            if code > 0 and code != CANNOT_RENDER:  # another backend would fail, too
                 raise NoVideoError(f"{self.product} could not be written ({reason})")
         raise NoVideoError(
-            f"this machine cannot draw off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
-            "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a library that works"
+            f"this machine cannot render off-screen ({'; '.join(failures)}): install Mesa's EGL (on Debian and Ubuntu "
+            "libegl1 and libgl1-mesa-dri) or OSMesa (libosmesa6), or set MUJOCO_GL to a backend that works"
         )
 
     def __exit__(self, *exception: object) -> None:
         self._stop()
 
-    def draw(self, shot: Shot) -> None:
-        """Draw a shot."""
-        self._drawn = True
-        if not self._send(shot) or self._answer() != "frame":
-            raise NoVideoError(f"{self.product} could not be written ({self._ended()[1]})")
+    def render(self, shot: Shot) -> None:
+        """Render a shot."""
+        self._rendered = True
+        if not self._send(shot) or self._reply() != "frame":
+            raise NoVideoError(f"{self.product} could not be written ({self._end()[1]})")
 
     def picture(self) -> np.ndarray:
         """Return the last picture, (height, width, 3) uint8."""
-        pixels = np.fromfile(Path(self._folder, PICTURE), dtype=np.uint8)
-        return pixels.reshape(self.size[1], self.size[0], 3)
+        return np.fromfile(self._folder / PICTURE, dtype=np.uint8).reshape(self.size[1], self.size[0], 3)
 
     def abandon(self) -> None:
         """Kill the subprocess, and do not start another one. Any thread may call this method.
@@ -108,22 +109,22 @@ class DrawingProcess:
             if self._process is not None:
                 _kill(self._process)
 
-    def _start(self, library: str) -> None:
+    def _start(self, backend: str) -> None:
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
-        if library:
-            environment["MUJOCO_GL"] = library
+        if backend:
+            environment["MUJOCO_GL"] = backend
         folder = tempfile.TemporaryDirectory(prefix="lyceum-warp-", ignore_cleanup_errors=True)
-        self._folder = self._ends.enter_context(folder)
-        mujoco.mj_saveModel(self._model, str(Path(self._folder, "model.mjb")), None)
-        self._errors = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
-        self._ends.enter_context(self._errors)
+        self._folder = Path(self._resources.enter_context(folder))
+        self._log = tempfile.TemporaryFile("w+", errors="replace")  # noqa: SIM115
+        self._resources.enter_context(self._log)
+        mujoco.mj_saveModel(self._model, str(self._folder / "model.mjb"), None)
         # -P: modules beside render.py must not shadow packages
-        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), self._folder]
+        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), str(self._folder)]
         with self._lock:
             if self._abandoned:
                 raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
-                command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+                command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log,
                 start_new_session=True,  # so that Ctrl-C in the shell reaches only the parent
             )  # fmt: skip
         self._send(self._job)
@@ -137,7 +138,7 @@ class DrawingProcess:
             return False
         return True
 
-    def _answer(self) -> str:
+    def _reply(self) -> str:
         """Read the next reply of the subprocess, or "" if it has ended."""
         assert self._process is not None and self._process.stdout is not None
         for line in self._process.stdout:
@@ -145,17 +146,18 @@ class DrawingProcess:
                 return line.decode().strip()
         return ""
 
-    def _ended(self) -> tuple[int, str]:
+    def _end(self) -> tuple[int, str]:
+        """Wait for the end of the subprocess, and return its exit code and the last line that it printed."""
         assert self._process is not None
         code = self._process.wait()
-        self._errors.seek(0)
-        lines = self._errors.read().strip().splitlines()
+        self._log.seek(0)
+        lines = self._log.read().strip().splitlines()
         return code, lines[-1].strip()[:160] if lines else f"it ended with code {code}"
 
     def _stop(self) -> None:
         with self._lock:
             process, self._process = self._process, None
-        with self._ends:
+        with self._resources:
             if process is None:
                 return
             assert process.stdin is not None and process.stdout is not None
@@ -170,8 +172,8 @@ class DrawingProcess:
                 process.stdout.close()
 
 
-class Drawing(DrawingProcess):
-    """A subprocess that draws shots into a video (mp4) or, without ``fps``, one shot into a picture (png)."""
+class FileRenderer(Renderer):
+    """A subprocess that renders shots into a video (mp4) or, without ``fps``, one shot into a picture (png)."""
 
     def __init__(
         self, model: mujoco.MjModel, out: str | Path, *, camera: dict[str, Any], size: tuple[int, int],
@@ -187,10 +189,10 @@ class Drawing(DrawingProcess):
 
     def finish(self) -> Path:
         """Complete the video or the picture, and move it to its path."""
-        if not self._drawn:
+        if not self._rendered:
             raise NoVideoError(f"{self.product} {self.out} has no frame: nothing is written")
         self._send(None)
-        code, reason = self._ended()
+        code, reason = self._end()
         if code:
             raise NoVideoError(f"{self.product} could not be written ({reason})")
         self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -200,12 +202,11 @@ class Drawing(DrawingProcess):
 
                 imageio.imwrite(temporary, self.picture(), format="png")
             else:
-                shutil.copyfile(Path(self._folder, VIDEO), temporary)
+                shutil.copyfile(self._folder / VIDEO, temporary)
         return self.out
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    if process.poll() is not None:
-        return
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(process.pid, signal.SIGKILL)
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
