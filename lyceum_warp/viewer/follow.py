@@ -24,8 +24,8 @@ class Follower:
         """Load the weights if the file is new, and return messages for the user."""
         path = self.run.policy
         try:
-            found = path.stat()
-            stamp = found.st_mtime_ns, found.st_ino, found.st_size
+            status = path.stat()
+            stamp = status.st_mtime_ns, status.st_ino, status.st_size
             if stamp == self._seen:
                 return []
             self._seen = stamp

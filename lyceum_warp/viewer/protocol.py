@@ -127,8 +127,7 @@ class Frame:
     status: Status
     ghosts: tuple[Ghost, ...] = ()
     traces: np.ndarray | None = None
-    """The paths of the planner's samples, (samples, points, 3), in metres."""
-    best: int | None = None
+    """The paths of the planner's samples, (samples, points, 3), in metres. The first one is the best."""
     arrows: tuple[Arrow, ...] = ()
     points: np.ndarray | None = None
     """The points of all curves, (points, 2 + curves): the simulated time in seconds, whether an episode ended (0 or 1),

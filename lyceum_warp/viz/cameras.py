@@ -62,36 +62,35 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
     raise ValueError(f"there is no camera {camera!r}: {_listed(names)}, or {FREE!r}, MuJoCo's default free camera")
 
 
-def parsed_camera(words: Iterable[str]) -> str | FreeCamera | None:
-    """Parse a camera from command-line words.
+def parsed_camera(arguments: Iterable[str]) -> str | FreeCamera | None:
+    """Parse a camera from the command line.
 
     Args:
-        words: A name, an index, or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation, track.
-            Without words, the result is None.
+        arguments: A name, an index, or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation,
+            track. Without arguments, the result is None.
     """
-    words = list(words)
-    if not words or (len(words) == 1 and "=" not in words[0]):
-        return words[0] if words else None
-    parts: dict[str, object] = {}
-    kinds = [field.name for field in dataclasses.fields(FreeCamera)]
-    for word in words:
-        name, equals, value = word.partition("=")
-        if not equals or name not in kinds:
-            raise ValueError(
-                f"a camera is a name, an index, or a pose of {', '.join(f'{kind}=...' for kind in kinds)}, not {word!r}"
-            )
-        parts[name] = value if name == "track" else _numbers(name, value)
-    return FreeCamera(**parts)  # type: ignore[arg-type]
+    arguments = list(arguments)
+    if not arguments or (len(arguments) == 1 and "=" not in arguments[0]):
+        return arguments[0] if arguments else None
+    pose: dict[str, object] = {}
+    names = [field.name for field in dataclasses.fields(FreeCamera)]
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if not equals or name not in names:
+            options = ", ".join(f"{name}=..." for name in names)
+            raise ValueError(f"a camera is a name, an index, or a pose of {options}, not {argument!r}")
+        pose[name] = value if name == "track" else _numbers(name, value)
+    return FreeCamera(**pose)  # type: ignore[arg-type]
 
 
 def _numbers(name: str, value: str) -> float | tuple[float, ...]:
-    count, wanted = (3, "X,Y,Z") if name == "lookat" else (1, "a number")
+    count, form = (3, "X,Y,Z") if name == "lookat" else (1, "a number")
     try:
         numbers = tuple(map(float, value.split(",")))
     except ValueError:
         numbers = ()
     if len(numbers) != count:
-        raise ValueError(f"the camera's {name} must be {wanted}, not {value!r}")
+        raise ValueError(f"the camera's {name} must be {form}, not {value!r}")
     return numbers if name == "lookat" else numbers[0]
 
 
@@ -140,8 +139,8 @@ def _body(model: mujoco.MjModel, body: str | int) -> int:
     names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, i) or "" for i in range(model.nbody)]
     if (index := _index(names, body)) is not None:
         return index
-    given = ", ".join(name for name in names if name)
-    hint = did_you_mean(str(body), names, f"its bodies are {textwrap.shorten(given, 200)}")
+    bodies = ", ".join(filter(None, names))
+    hint = did_you_mean(str(body), names, f"its bodies are {textwrap.shorten(bodies, 200)}")
     raise ValueError(f"the camera cannot track the body {body!r}, which the model does not have: {hint}")
 
 

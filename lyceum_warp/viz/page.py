@@ -62,8 +62,8 @@ def write_states(
     tracked = camera["trackbodyid"]
     if (fixed := camera["fixedcamid"]) >= 0:  # a camera of the model has no point to look at
         tracked = int(model.cam_bodyid[fixed])
-        whole = {"lookat": model.stat.center.tolist(), "distance": 1.5 * model.stat.extent}
-        camera = whole | {"azimuth": 120.0, "elevation": -20.0}
+        camera = {"lookat": model.stat.center.tolist(), "distance": 1.5 * model.stat.extent}
+        camera |= {"azimuth": 120.0, "elevation": -20.0}
     moving = np.flatnonzero(model.body_dofnum)
     content = {
         "dt": dt, "ranges": ranges, "fovy": float(model.vis.global_.fovy), "reach": 30 * float(model.stat.extent),
@@ -116,10 +116,10 @@ def _triangles(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray, list[tupl
 
 
 def _colour(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Return a geom's own colour, or its material's colour."""
-    own, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
-    if material < 0 or not np.allclose(own, (0.5, 0.5, 0.5, 1.0)):
-        return own
+    """Return a geom's colour, or its material's colour."""
+    colour, material = model.geom_rgba[geom].astype(float), model.geom_matid[geom]
+    if material < 0 or not np.allclose(colour, (0.5, 0.5, 0.5, 1.0)):
+        return colour
     return np.array(model.mat_rgba[material], dtype=float)
 
 
@@ -170,10 +170,10 @@ def _flat(points: np.ndarray, faces: np.ndarray) -> Surface:
     for corner in range(3):
         np.add.at(mean, faces[:, corner], normals)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-30)
-    own = np.repeat(normals / area, 3, axis=0)
+    flat = np.repeat(normals / area, 3, axis=0)
     shared = mean[faces.ravel()]
-    smooth = (own * shared).sum(1, keepdims=True) > np.cos(np.radians(30))
-    return corners.reshape(-1, 3), np.where(smooth, shared, own), np.arange(faces.size).reshape(-1, 3)
+    smooth = (flat * shared).sum(1, keepdims=True) > np.cos(np.radians(30))
+    return corners.reshape(-1, 3), np.where(smooth, shared, flat), np.arange(faces.size).reshape(-1, 3)
 
 
 def _round(kind: mujoco.mjtGeom, size: np.ndarray) -> Surface:

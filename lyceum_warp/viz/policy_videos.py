@@ -33,9 +33,9 @@ def policy_video(
     curriculum = curriculum or Curriculum.of(env)
     one = evaluation_worlds(env, 1, autoreset=False)
     policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
-    with contextlib.ExitStack() as shown:
+    with contextlib.ExitStack() as stack:
         if progress is None:
-            running: Progress = shown.enter_context(LongWork("running an episode for the video", "steps"))
+            running: Progress = stack.enter_context(LongWork("running an episode for the video", "steps"))
         else:
             running = functools.partial(progress, "running an episode", "steps")
         (episode,) = policy_episodes(

@@ -34,9 +34,7 @@ class PlanView:
     actions: torch.Tensor
     """The actions of the plan, (horizon, nact)."""
     samples: torch.Tensor
-    """The actions of the samples, (horizon, samples, nact)."""
-    best: int | None
-    """The index of the sample with the largest return."""
+    """The actions of the samples, (horizon, samples, nact). The first sample has the largest return."""
 
 
 class PolicyControl:
@@ -61,12 +59,12 @@ class PolicyControl:
 
     def act(self) -> None:
         """Write the actions of all worlds."""
-        begun = time.perf_counter()
+        start = time.perf_counter()
         try:
             self._env.action.copy_(self._policy(self._env.obs))
         except Exception as error:
             raise ControllerError(self.name, error) from error
-        self.seconds = time.perf_counter() - begun
+        self.seconds = time.perf_counter() - start
 
 
 class WorldControl:
@@ -78,8 +76,8 @@ class WorldControl:
         self.plans = hasattr(controller, "actions")
         self._busy = threading.Lock()
         self._run = self.calls = 0
-        self._reset_due = self._wanted = False
-        self._seen: PlanView | None = None
+        self._reset_due = self._copy_due = False
+        self._plan: PlanView | None = None
         self.hidden: slice | None = None
         """The columns of the state that hold the user's push force. Controllers see zeros in these columns."""
 
@@ -97,7 +95,7 @@ class WorldControl:
         """Reset the controller before its next call."""
         self._reset_due = True
 
-    def call(self, run: int, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
+    def call(self, run: int, state: torch.Tensor, obs: torch.Tensor, **options: Any) -> torch.Tensor:
         """Call the controller.
 
         Raises:
@@ -113,22 +111,22 @@ class WorldControl:
             try:
                 if due and callable(reset := getattr(self.controller, "reset", None)):
                     reset(None)
-                begun = time.perf_counter()
-                action = self.controller(state, obs, **words)
+                start = time.perf_counter()
+                action = self.controller(state, obs, **options)
             except Exception as error:
                 raise ControllerError(self.name, error) from error
             self.calls += 1
-            self.seconds = time.perf_counter() - begun
-            if self._wanted:
-                self._wanted = False
-                self._seen = plan_view(self.controller, state)
+            self.seconds = time.perf_counter() - start
+            if self._copy_due:
+                self._copy_due = False
+                self._plan = plan_view(self.controller, state)
         return action
 
     def look(self) -> PlanView | None:
         """Return the plan that was copied since the last call, and request a copy of the next plan."""
-        seen, self._seen = self._seen, None
-        self._wanted = True
-        return seen
+        plan, self._plan = self._plan, None
+        self._copy_due = True
+        return plan
 
 
 class ControlRun:
@@ -142,9 +140,9 @@ class ControlRun:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._control.controller, name)
 
-    def __call__(self, state: torch.Tensor, obs: torch.Tensor, **words: Any) -> torch.Tensor:
+    def __call__(self, state: torch.Tensor, obs: torch.Tensor, **options: Any) -> torch.Tensor:
         """See ``WorldControl.call``."""
-        return self._control.call(self._number, state, obs, **words)
+        return self._control.call(self._number, state, obs, **options)
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
@@ -153,37 +151,37 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
     if not isinstance(plan, torch.Tensor) or plan.ndim != 2:
         return None
     actions = plan.detach().to("cpu", torch.float32, copy=True)
-    samples, best = torch.empty(len(actions), 0, actions.shape[1]), None
+    samples = torch.empty(len(actions), 0, actions.shape[1])
     if isinstance(controller, Planner):
         # samples are drawn independently, so the first ones represent all of them
         indices = torch.arange(min(MOST_SAMPLES, controller.samples), device=plan.device)
         indices[0] = controller.returns.argmax()
-        samples, best = controller.sampled.index_select(1, indices).to("cpu", torch.float32), 0
-    return PlanView(state.detach().to("cpu", torch.float64, copy=True).view(-1), actions, samples, best)
+        samples = controller.sampled.index_select(1, indices).to("cpu", torch.float32)
+    return PlanView(state.detach().to("cpu", torch.float64, copy=True).view(-1), actions, samples)
 
 
 Control = PolicyControl | WorldControl
 
 
-def controls(given: Mapping[str, Any], env: Env) -> dict[str, Control]:
+def controls(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
     """Check controllers. A policy takes one argument, and a controller of one world takes two.
 
     Raises:
         ValueError: A controller is not callable, or does not fit the task.
     """
-    found: dict[str, Control] = {}
-    for name, controller in given.items():
+    controls: dict[str, Control] = {}
+    for name, controller in controllers.items():
         if not isinstance(name, str) or not name:
             raise ValueError(f"controllers must have names, as controllers={{'policy': policy}}, not {name!r}")
         if _is_policy(controller):
-            found[name] = PolicyControl(name, controller, env)
+            controls[name] = PolicyControl(name, controller, env)
             continue
         try:
             CheckedController(controller, env)
         except ValueError as error:
             raise ValueError(f"the controller {name!r} does not fit: {error}") from error
-        found[name] = WorldControl(name, controller)
-    return found
+        controls[name] = WorldControl(name, controller)
+    return controls
 
 
 def _is_policy(controller: Any) -> bool:

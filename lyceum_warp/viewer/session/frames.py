@@ -67,11 +67,11 @@ class FrameMaker:
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
         self._points.extend(rows.points.tolist())
-        others, grid = rows.states[1:], self.ghosts.grid
+        neighbours = rows.states[1:]
         if live is not main and worlds:  # the other worlds do not move
-            others = main.rows(worlds).states[1:]
+            neighbours = main.rows(worlds).states[1:]
         ghosts = [] if traces is None else [Ghost(self._physics(traces.final), (*_PLAN, _OPACITY))]
-        ghosts += self._beside(others) if grid else self._coloured(others)
+        ghosts += self._beside(neighbours) if self.ghosts.grid else self._coloured(neighbours)
         ghosts += self._burst(rows.back, _PAST)
         step, past = int(state[parts["step"]][0]), live.past
         complete = status(
@@ -81,16 +81,15 @@ class FrameMaker:
         )  # fmt: skip
         return Frame(
             self._physics(state), self._model_fields(state), complete, tuple(ghosts),
-            None if traces is None else traces.paths, None if traces is None else traces.best,
-            self._driving.arrows(state),
+            None if traces is None else traces.paths, self._driving.arrows(state),
         )  # fmt: skip
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; for ``status``, see ``of_worlds``."""
         episode, state = playback.episode, playback.state
         indices = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
-        others = [playback.episodes[index].states for index in indices]
-        ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in others)
+        episodes = [playback.episodes[index].states for index in indices]
+        ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in episodes)
         around = playback.around(self.ghosts.burst)
         ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
         ghosts += self._burst((episode.states[s] for s in around if s > playback.step), _FUTURE)

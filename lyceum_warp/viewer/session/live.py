@@ -87,7 +87,7 @@ class Live:
 
     def __init__(self, env: Env, *, limit: int = HISTORY_BYTES) -> None:
         self.env, self.past = env, Past(env, limit)
-        self.made = self._reported = 0  # number of steps so far, and number of steps before the last frame
+        self.steps = self._reported = 0  # number of steps so far, and number of steps before the last frame
         self.world = 0
         self.pushed: int | None = None
         device, n = env.obs.device, env.nworld
@@ -157,7 +157,7 @@ class Live:
 
     def _after_step(self) -> None:
         env = self.env
-        self.made += 1
+        self.steps += 1
         ended, reward = self._ended.copy_(env.done), self._reward.copy_(env.reward)
         if not env.autoreset:  # without resets, ``done`` stays set after the episode, and the return must not grow
             ended.logical_and_(~self._over)
@@ -173,8 +173,8 @@ class Live:
 
     def _note_ends(self, ended: torch.Tensor) -> None:
         env, reason = self.env, self.env.done_reason
-        made = torch.full_like(self.returns, self.made)
-        end = torch.stack([made, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
+        steps = torch.full_like(self.returns, self.steps)
+        end = torch.stack([steps, reason.double(), self.returns, self._length + 1.0, env.success.double()], dim=1)
         torch.where(ended[:, None], end, self._ends, out=self._ends)
         if env.autoreset:
             self.returns.masked_fill_(ended, 0.0)
@@ -182,7 +182,7 @@ class Live:
         # unlike indexing with a tensor, gather does not wait for the device
         first = torch.argmax(fault.to(torch.int8)).view(1)
         count = self._fault[3:] + fault.sum()
-        now = torch.cat([made[:1], reason.gather(0, first).double(), first.double(), count])
+        now = torch.cat([steps[:1], reason.gather(0, first).double(), first.double(), count])
         torch.where(fault.any(), now, self._fault, out=self._fault)
 
     # the history
@@ -295,6 +295,9 @@ class Live:
         self._points = 0
         parts = states, past.states[earlier, self.world], self._ends[self.world], self._fault, self._curves[newest]
         rows, back, end, fault, points = (part.cpu().numpy() for part in parts)
-        news = [tuple(each[1:].tolist()) if each[0] > self._reported else None for each in (end, fault)]
-        self._reported = self.made
-        return Rows(rows, back, self.returns[self.world].item(), news[0], news[1], points)
+        is_new = end[0] > self._reported, fault[0] > self._reported
+        self._reported = self.steps
+        return Rows(
+            rows, back, self.returns[self.world].item(), tuple(end[1:].tolist()) if is_new[0] else None,
+            tuple(fault[1:].tolist()) if is_new[1] else None, points,
+        )  # fmt: skip

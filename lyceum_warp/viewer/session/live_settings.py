@@ -16,21 +16,21 @@ def planner_numbers(controller: Any) -> Numbers:
     """Return the planner settings that the user can change."""
     if not isinstance(controller, Planner):
         return ()
-    found = ((name, getattr(controller.config, name)) for name in _SETTINGS)
-    return tuple((name, value) for name, value in found if isinstance(value, int | float))
+    settings = ((name, getattr(controller.config, name)) for name in _SETTINGS)
+    return tuple((name, value) for name, value in settings if isinstance(value, int | float))
 
 
 def task_numbers(env: Env) -> Numbers:
     """Return the task's float parameters, including the weights of reward terms."""
-    known = env.task.params
-    return tuple((n, v) for n, v in known.items() if isinstance(v, float) and n not in ("dt", "substep_dt"))
+    params = env.task.params.items()
+    return tuple((n, v) for n, v in params if isinstance(v, float) and n not in ("dt", "substep_dt"))
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
     """Make a planner with a new value of a setting, because an existing planner's CUDA graphs contain the old value."""
     kind = type(getattr(planner.config, name))
     env = planner.env
-    options = {key: given for key, given in env.options.given().items() if key not in _OF_THE_PLANNER}
+    options = {key: value for key, value in env.options.given().items() if key not in _OF_THE_PLANNER}
     return type(planner)(
         env.task.task, dataclasses.replace(planner.config, **{name: kind(value)}), value=planner.value,
         seed=planner.seeds[0], params=env.given_params, **(options | {"model": env.task.spec}),

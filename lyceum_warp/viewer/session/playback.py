@@ -39,36 +39,39 @@ def reasons(bits: int) -> str:
     return ", ".join(str(bit.name).lower().replace("_", " ") for bit in Done if bits & bit)
 
 
-def episodes_of(given: Any, env: Env) -> list[Episode]:
+def episodes_of(episodes: Any, env: Env) -> list[Episode]:
     """Load the episodes to play back."""
-    if isinstance(given, str | Path | Trajectory | torch.Tensor):
-        given = [given]
-    if isinstance(given, Mapping):
-        return [_episode(name, each, env) for name, each in given.items()]
-    if not isinstance(given, Sequence):
+    if isinstance(episodes, str | Path | Trajectory | torch.Tensor):
+        episodes = [episodes]
+    if isinstance(episodes, Mapping):
+        return [_episode(name, episode, env) for name, episode in episodes.items()]
+    if not isinstance(episodes, Sequence):
         raise ValueError(
-            f"episodes must be a list or a dict of trajectories, episode files or state tensors, not {described(given)}"
+            "episodes must be a list or a dict of trajectories, episode files or state tensors, "
+            f"not {described(episodes)}"
         )
-    names = [Path(each).name if isinstance(each, str | Path) else f"episode {i}" for i, each in enumerate(given)]
-    return [_episode(name, each, env) for name, each in zip(names, given, strict=True)]
+    return [
+        _episode(Path(episode).name if isinstance(episode, str | Path) else f"episode {i}", episode, env)
+        for i, episode in enumerate(episodes)
+    ]
 
 
-def _episode(name: str, given: Any, env: Env) -> Episode:
-    if isinstance(given, str | Path):
-        given = Trajectory.load(given)
-    if isinstance(given, Trajectory):
-        check_episode(env, given, name)
-        rewards, evals = (values.double().numpy() for values in (given.rewards, given.evals))
-        end = "success" if given.steps and given.succeeded else reasons(given.done_reason)
-        return Episode(name, given.states.numpy(), rewards, evals, end)
+def _episode(name: str, episode: Any, env: Env) -> Episode:
+    if isinstance(episode, str | Path):
+        episode = Trajectory.load(episode)
+    if isinstance(episode, Trajectory):
+        check_episode(env, episode, name)
+        end = "success" if episode.steps and episode.succeeded else reasons(episode.done_reason)
+        rewards, evals = episode.rewards.double().numpy(), episode.evals.double().numpy()
+        return Episode(name, episode.states.numpy(), rewards, evals, end)
     size = env.state_space.size
-    if not isinstance(given, torch.Tensor) or given.ndim != 2 or given.shape[1] != size or not len(given):
+    if not isinstance(episode, torch.Tensor) or episode.ndim != 2 or episode.shape[1] != size or not len(episode):
         raise ValueError(
             f"an episode of {env.task.name!r} must be a Trajectory, a file of a Trajectory, or states of shape (steps, "
-            f"{size}) as env.get_state() returns them, not {described(given)}"
+            f"{size}) as env.get_state() returns them, not {described(episode)}"
         )
-    unknown = np.full(len(given) - 1, np.nan)
-    states = given.detach().to("cpu", torch.float64).numpy().copy()
+    unknown = np.full(len(episode) - 1, np.nan)
+    states = episode.detach().to("cpu", torch.float64).numpy().copy()
     return Episode(name, states, unknown, unknown)
 
 

@@ -162,14 +162,14 @@ class Stage:
 
     def select(self, mode: Mode, controller: str | None) -> None:
         """Change the mode and the controller. The displayed world keeps its state."""
-        before, chosen = self.live, (self.mode, self.controller)
+        before, choice = self.live, (self.mode, self.controller)
         self.mode, self.controller = mode, controller
         if self.live is not before:
             self._transfer(before, self.live)
             before.end_push()
         for thread in self._threads.values():
             thread.forget()
-        if chosen != (mode, controller):
+        if choice != (mode, controller):
             self.live.past.drop_ahead()
             self.reset_controller()
             self.progress.clear()
@@ -248,19 +248,19 @@ class Stage:
         if not self.frames.ghosts.plan or thread is None or not isinstance(current, WorldControl):
             return None
         try:
-            seen = thread.follow(current.look())
+            traces = thread.follow(current)
         except Exception as error:
             self.frames.say(f"the paths of samples cannot be shown: {error}")
             return None
-        return seen if seen is not None and (self.paused or time.perf_counter() - seen.made < _OLD) else None
+        return traces if traces and (self.paused or time.perf_counter() - traces.time < _OLD) else None
 
     def _status(self, **fields: Any) -> Status:
         now = time.perf_counter()
         self.progress.append((now, self.steps))
-        begun, steps = self.progress[0]
+        start, steps = self.progress[0]
         measured = math.nan
-        if not self.paused and now - begun > 0.1:
-            measured = (self.steps - steps) * self.env.timestep / (now - begun)
+        if not self.paused and now - start > 0.1:
+            measured = (self.steps - steps) * self.env.timestep / (now - start)
         return Status(
             mode=self.mode, controller=self.controller if self.mode == "controller" else None,
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,

@@ -18,7 +18,7 @@ import warp as wp
 from lyceum_warp.algos import Planner
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import flat, torch_view
-from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView
+from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView, WorldControl
 
 SHARE = 0.15
 """The share of a core that the thread may use."""
@@ -35,9 +35,9 @@ def trace_point(model: mujoco.MjModel, name: str | None = None) -> tuple[str, in
         for kind, field in ((mujoco.mjtObj.mjOBJ_SITE, "site_xpos"), (mujoco.mjtObj.mjOBJ_BODY, "xpos")):
             if (index := mujoco.mj_name2id(model, kind, name)) >= 0:
                 return field, index
-        known = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(1, model.nbody)]
+        names = [model.site(i).name for i in range(model.nsite)] + [model.body(i).name for i in range(1, model.nbody)]
         raise ValueError(
-            f"the model has no site and no body {name!r} to trace: it has {', '.join(filter(None, known)) or 'none'}"
+            f"the model has no site and no body {name!r} to trace: it has {', '.join(filter(None, names)) or 'none'}"
         )
     driven = _driven_bodies(model)
     if not driven.any():
@@ -74,11 +74,10 @@ class Traces:
     """The paths of a plan and its samples."""
 
     paths: np.ndarray
-    """The paths, (samples + 1, points, 3), in metres. The last path is the plan's."""
-    best: int | None
+    """The paths, (samples + 1, points, 3), in metres: first the best sample's, and last the plan's."""
     final: np.ndarray
     """The state at the end of the plan."""
-    made: float
+    time: float
     """The time of the rollout on the clock ``time.perf_counter``."""
 
 
@@ -120,7 +119,7 @@ class TraceRollouts:
             path.append(self._positions[:, self._index].clone())
         paths = torch.stack(path, dim=1)[[*range(count), MOST_SAMPLES]].cpu().numpy()
         final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy().copy()
-        return Traces(paths, view.best, final, time.perf_counter())
+        return Traces(paths, final, time.perf_counter())
 
     def _step(self, action: torch.Tensor) -> None:
         """Make a step without events, as planners do."""
@@ -135,38 +134,36 @@ class TraceThread:
     def __init__(self, rollouts: TraceRollouts) -> None:
         self._rollouts = rollouts
         self._pool = ThreadPoolExecutor(1, "lyceum_warp traces")
-        self._running: Future[Traces] | None = None
-        self._waiting: PlanView | None = None
-        self._newest: Traces | None = None
+        self._rollout: Future[Traces] | None = None
+        self._traces: Traces | None = None
         self._next = 0.0
 
-    def follow(self, view: PlanView | None) -> Traces | None:
+    def follow(self, control: WorldControl) -> Traces | None:
         """Roll out a new plan when the thread is free, and return the last traces.
 
         Raises:
             Exception: A rollout failed. No further rollouts are made.
         """
-        self._waiting = self._waiting if view is None else view
-        if self._running is not None and self._running.done():
-            running, self._running = self._running, None
-            self._newest = running.result()
-        if self._waiting is not None and self._running is None and time.perf_counter() >= self._next:
-            self._running, self._waiting = self._pool.submit(self._roll_out, self._waiting), None
-        return self._newest
+        if self._rollout is not None and self._rollout.done():
+            rollout, self._rollout = self._rollout, None
+            self._traces = rollout.result()
+        if self._rollout is None and time.perf_counter() >= self._next and (plan := control.look()) is not None:
+            self._rollout = self._pool.submit(self._roll_out, plan)
+        return self._traces
 
     def forget(self) -> None:
         """Wait for a rollout in progress, and drop the traces."""
-        if self._running is not None:
-            wait([self._running])
-        self._running = self._waiting = self._newest = None
+        if self._rollout is not None:
+            wait([self._rollout])
+        self._rollout = self._traces = None
 
     def close(self) -> None:
         """End the thread after a rollout in progress."""
         self._pool.shutdown()
 
-    def _roll_out(self, view: PlanView) -> Traces:
+    def _roll_out(self, plan: PlanView) -> Traces:
         self._next = math.inf
-        begun = time.thread_time()  # CPU time, because wall time would include other programs
-        traces = self._rollouts(view)
-        self._next = time.perf_counter() + (time.thread_time() - begun) / SHARE
+        start = time.thread_time()  # CPU time, because wall time would include other programs
+        traces = self._rollouts(plan)
+        self._next = time.perf_counter() + (time.thread_time() - start) / SHARE
         return traces

@@ -127,7 +127,7 @@ class VideoTaker:
 
 def _shot(frame: Frame, count: int) -> Shot:
     paths = () if frame.traces is None else frame.traces
-    lines = [(path, BEST_COLOUR if i == frame.best else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
+    lines = [(path, BEST_COLOUR if i == 0 else TRACE_COLOUR, _WIDTH) for i, path in enumerate(paths)]
     lines += [(np.stack([arrow.start, arrow.end]), arrow.colour, 2 * _WIDTH) for arrow in frame.arrows]
     return Shot(
         state=frame.state, model_fields=frame.model_fields, lines=list(lines), frames=count,

@@ -48,12 +48,11 @@ class ExtraGeoms:
         """
         self._options.geomgroup = groups
         paths = [] if frame.traces is None else list(frame.traces)
-        first = [] if frame.best is None else [paths.pop(frame.best)]
-        lines = _lines(first, BEST_COLOUR, min(self.limit, MAX_LINES))
+        lines = _lines(paths[:1], BEST_COLOUR, min(self.limit, MAX_LINES))
         lines += _arrows(frame.arrows)
         bodies = self._ghosts(frame, self.limit - len(lines))
         left = min(self.limit - len(bodies), MAX_LINES) - len(lines)
-        return [*bodies, *lines, *_lines(paths, TRACE_COLOUR, left)]
+        return [*bodies, *lines, *_lines(paths[1:], TRACE_COLOUR, left)]
 
     def _ghosts(self, frame: Frame, limit: int) -> list[mujoco.MjvGeom]:
         data, scene, geoms = self._data, self._scene, []

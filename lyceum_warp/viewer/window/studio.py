@@ -40,17 +40,17 @@ class Screen:
     """A viewer. Any thread may call ``show_model`` and ``close`` at any time."""
 
     def __init__(self) -> None:
-        self._viewer_end, self._own_end = launch_thread.make_thread_endpoints()
+        self._viewer_end, self._sim_end = launch_thread.make_thread_endpoints()
 
     def show_model(self, model: mujoco.MjModel) -> None:
         """Show a copy of another model."""
-        self._own_end.send_to_viewer(messages.ModelEvent(model=model))
+        self._sim_end.send_to_viewer(messages.ModelEvent(model=model))
 
     def close(self) -> None:
         """End ``run``."""
-        self._own_end.send_to_viewer(messages.ExitEvent())
+        self._sim_end.send_to_viewer(messages.ExitEvent())
 
-    def run(self, own: Any, *, title: str, server: PageServer) -> None:
+    def run(self, panel: Any, *, title: str, server: PageServer) -> None:
         """Run until ``close`` is called."""
         replaced: list[str] = []
 
@@ -63,7 +63,7 @@ class Screen:
         web_server.serve = server.serve
         web_server.WebServer = _WebServer
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
-        viewer = _Viewer(config, self._viewer_end, plugins=[own], server=server)
+        viewer = _Viewer(config, self._viewer_end, plugins=[panel], server=server)
         if len(replaced) < 2:
             viewer.close()
             raise RuntimeError(f"mujoco.studio {mujoco.__version__} would listen on every address of this machine")

@@ -113,10 +113,9 @@ class Windows:
         if self._scene.nworld == 1:
             return
         imgui.SeparatorText(f"world, of {self._scene.nworld:,}")
-        imgui.PushItemWidth(90)
+        imgui.SetNextItemWidth(90)
         only_enter = int(imgui.InputTextFlags.EnterReturnsTrue)
         entered, world = imgui.InputInt("##world", self._actions.status.world, 0, 0, only_enter)
-        imgui.PopItemWidth()
         if entered:
             self._actions.do(commands.set_world, world)
         choices: tuple[commands.WorldChoice, ...] = ("previous", "next", "best", "worst")
@@ -133,16 +132,14 @@ class Windows:
             self._button(key, "\uf04b" if key == "Space" and status.paused else None)
             imgui.SameLine()
         imgui.NewLine()
-        imgui.PushItemWidth(90)
+        imgui.SetNextItemWidth(90)
         speed = combo("speed", [speed_name(speed) for speed in SPEEDS], SPEEDS.index(status.speed))
-        imgui.PopItemWidth()
         if speed is not None:
             self._actions.do(commands.set_speed, SPEEDS[speed])
         first, last = status.seekable
         if first < last:
-            imgui.PushItemWidth(-1)
+            imgui.SetNextItemWidth(-1)
             changed, step = imgui.SliderInt("##scrub", min(max(status.step, first), last), first, last, "step %d")
-            imgui.PopItemWidth()
             if changed:
                 self._actions.do(commands.seek, step)
 
@@ -311,22 +308,25 @@ class Windows:
 
     def _view(self) -> None:
         viewer = self._actions.viewer
-        if imgui.CollapsingHeader("rendering"):
-            ux.rendering_gui(viewer.model, viewer.vis_options, viewer.render_flags)
-        if imgui.CollapsingHeader("visualization"):
-            ux.visualization_gui(viewer.model, viewer.vis_options, viewer.camera)
-        if imgui.CollapsingHeader("groups"):
-            ux.groups_gui(viewer.model, viewer.vis_options)
-        if imgui.CollapsingHeader("sensors"):
-            ux.sensor_gui(viewer.model, viewer.data)
-        if imgui.CollapsingHeader("joints"):
-            self._joints()
-        if imgui.CollapsingHeader("controls"):
-            imgui.BeginDisabled()  # a controller determines them
-            ux.controls_gui(viewer.model, viewer.data, viewer.vis_options)
-            imgui.EndDisabled()
-        if imgui.CollapsingHeader("watch"):
-            ux.watch_gui(viewer.model, viewer.data, self._actions.cameras.state)
+        model, data, options = viewer.model, viewer.data, viewer.vis_options
+        sections: dict[str, Callable[[], object]] = {
+            "rendering": lambda: ux.rendering_gui(model, options, viewer.render_flags),
+            "visualization": lambda: ux.visualization_gui(model, options, viewer.camera),
+            "groups": lambda: ux.groups_gui(model, options),
+            "sensors": lambda: ux.sensor_gui(model, data),
+            "joints": self._joints,
+            "controls": self._controls,
+            "watch": lambda: ux.watch_gui(model, data, self._actions.cameras.state),
+        }
+        for title, build in sections.items():
+            if imgui.CollapsingHeader(title):
+                build()
+
+    def _controls(self) -> None:
+        viewer = self._actions.viewer
+        imgui.BeginDisabled()  # a controller determines them
+        ux.controls_gui(viewer.model, viewer.data, viewer.vis_options)
+        imgui.EndDisabled()
 
     def _joints(self) -> None:
         viewer, frame = self._actions.viewer, self._actions.frame
@@ -339,13 +339,7 @@ class Windows:
             self._actions.do(commands.perturb, forces, qpos=viewer.data.qpos.copy())
 
     def _help(self) -> None:
-        if imgui.BeginTable("##keys", 2):
-            for keys, what in [*((key, action.what) for key, action in ACTIONS.items()), *OTHER_KEYS]:
-                imgui.TableNextColumn()
-                imgui.TextUnformatted(keys)
-                imgui.TableNextColumn()
-                imgui.TextWrapped(what)
-            imgui.EndTable()
+        two_columns("##keys", [*((key, action.what) for key, action in ACTIONS.items()), *OTHER_KEYS])
 
 
 # helpers
@@ -394,8 +388,8 @@ class Curves:
         """Append points. If time decreases, for example after steps back, drop the points of later times."""
         for part in np.split(rows, np.flatnonzero(np.diff(rows[:, 0]) < 0) + 1):
             if len(part):
-                kept = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
-                self.rows = np.concatenate([kept, part])[-MAX_POINTS:]
+                earlier = self.rows[: np.searchsorted(self.rows[:, 0], part[0, 0])]
+                self.rows = np.concatenate([earlier, part])[-MAX_POINTS:]
 
     def thinned(self, points: int, seconds: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the minima, means and maxima of the curves, each as at most ``points`` rows.

@@ -43,7 +43,7 @@ def test_faults_and_ends_of_episodes_are_shown_as_messages(shared_env: SharedEnv
     session.stage.frame()
     while not env.done[0].item():
         session.stage.advance()
-    steps = session.stage.live.made
+    steps = session.stage.live.steps
     (message,) = session.stage.frame().messages
     assert message.startswith(f"the episode ended after {steps} steps (terminated), return ")
     session.obey(command(set_mode, "controller", "bad"))
