@@ -142,7 +142,7 @@ def play(env: lw.Env, policy: Any, commands: Sequence[Sequence[float]], steps: i
 def worlds(folder: Path, nworld: int, options: Options, **params: Any) -> lw.Env:
     place = {"engine": "mujoco", "device": "cpu", "nthread": options.threads, "physics": "exact"}
     env_options = place | {"horizon": 0, "seed": 1000}
-    return run_worlds(Run.open(folder), env_options, params, nworld=nworld, task=options.task, trust=False)
+    return run_worlds(Run.open(folder), env_options, params, nworld=nworld, task=options.task)
 
 
 def calm(env: lw.Env) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     run = Run.open(lw.pretrained_run(case.task))
     threads = {} if options.threads is None else {"nthread": options.threads}
     try:
-        env = run_worlds(run, threads, {}, nworld=1, task=None, trust=False)
+        env = run_worlds(run, threads, {}, nworld=1)
     except (FileNotFoundError, ImportError) as error:
         raise Skipped(f"{case.task}: {error}") from error
     return lw.transfer(env, lw.load(run), case.episodes, seed=case.seed, device=case.device).to_dict()

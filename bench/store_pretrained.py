@@ -42,12 +42,12 @@ def store(folder: Path, which: str) -> Path:
     )
     (out / "config.json").write_text(json.dumps(config, indent=1))
     stored = Run.open(out)
-    env = run_worlds(stored, {}, {}, nworld=EPISODES, task=None, trust=False)
+    env = run_worlds(stored, {}, {}, nworld=EPISODES)
     if env.horizon == 0:
         env = env.replicate(horizon=ENDLESS_STEPS)
     policy = lw.load(stored)
     returns = evaluate(env, policy, EPISODES, seed=SEED).returns
-    few = run_worlds(stored, {}, {}, nworld=FEW, task=None, trust=False)
+    few = run_worlds(stored, {}, {}, nworld=FEW)
     few.rand_reset(SEED)
     total = torch.zeros(FEW)
     for _ in range(FIRST):

@@ -66,10 +66,10 @@ def main(
 ) -> None:  # fmt: skip
     """Train, or continue a run with --resume."""
     learner = RandomSearch(lw.make(task, nworld=nworld, horizon=horizon, seed=seed), seed=seed)
-    run = lw.train(
-        learner, out, iterations=iterations, resume=resume, video_every=video_every,
-        callback=lambda it: print(f"iteration {it.iteration}: return {it.mean_return:.1f}"),
-    )  # fmt: skip
+    callbacks = [lambda it: print(f"iteration {it.iteration}: return {it.mean_return:.1f}")]
+    if video_every:
+        callbacks.append(lw.Videos(video_every))
+    run = lw.train(learner, lw.Run.open(out) if resume else out, iterations, callbacks=callbacks)
     print(f"best policy: return {run.best_score()[1]:.1f} in {run.folder}")
 
 

@@ -130,8 +130,8 @@ def main(
     """Train, or continue a run with --resume, and evaluate the policy."""
     learner = TD3(lw.make(task, nworld=nworld, seed=seed), seed=seed)
     run = lw.train(
-        learner, out, iterations=iterations, resume=resume,
-        callback=lambda it: print(f"iteration {it.iteration}: {it.numbers['episodes']} episodes ended"),
+        learner, lw.Run.open(out) if resume else out, iterations,
+        callbacks=[lambda it: print(f"iteration {it.iteration}: {it.numbers['episodes']} episodes ended")],
     )  # fmt: skip
     few = lw.make(task, nworld=8, horizon=1000)
     print(f"return {lw.evaluate(few, lw.load(run), 8, seed=1).returns.mean():.1f}, in {run.folder}")

@@ -115,9 +115,22 @@ from lyceum_warp.kernels.rotations import (
 from lyceum_warp.kernels.velocities import body_velocity as body_velocity, local_velocity as local_velocity
 from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
+from lyceum_warp.training.callbacks import (
+    Callback as Callback,
+    Minutes as Minutes,
+    TargetReturn as TargetReturn,
+    TransferTest as TransferTest,
+    Videos as Videos,
+)
 from lyceum_warp.training.loop import train as train
-from lyceum_warp.training.runs.folder import load as load, load_curriculum as load_curriculum, load_value as load_value
+from lyceum_warp.training.runs.folder import (
+    Run as Run,
+    load as load,
+    load_curriculum as load_curriculum,
+    load_value as load_value,
+)
 from lyceum_warp.training.runs.pretrained_runs import pretrained_run as pretrained_run
+from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
 from lyceum_warp.tuning.search import Tuning as Tuning, tune as tune
 from lyceum_warp.viewer.show import view as view
 

@@ -54,7 +54,7 @@ def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
 
 
 def six_iterations(folder: Path) -> Path:
-    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, keep_every=2)
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 6, keep_every=2)
     return folder
 
 

@@ -25,14 +25,6 @@ ParamWords = Annotated[
     ),
 ]
 
-Trust = Annotated[
-    bool,
-    tyro.conf.arg(
-        help="Trust a run that you did not make on this machine. From now on, commands may execute the run's task and "
-        "read the files that the run names.",
-    ),
-]
-
 CameraWords = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(

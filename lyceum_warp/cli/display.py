@@ -1,9 +1,8 @@
 """Print the output of commands: progress, tables, and the paths of plots and videos."""
 
-import contextlib
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import rich.box
@@ -15,7 +14,7 @@ from rich.table import Table
 from lyceum_warp.algos import Iteration, Learner
 from lyceum_warp.controllers import ControlProgress, Trajectory
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.training import Display as TrainingDisplay, Run
+from lyceum_warp.training import Callback, Run
 from lyceum_warp.viz import one_line
 
 _TABLE_ROWS = 15
@@ -35,21 +34,22 @@ def note(line: str) -> None:
     print(f"lyceum-warp: {line}", file=sys.stderr)
 
 
-class Display(TrainingDisplay):
+class Display(Callback):
     """Shows the progress of training: a live bar on a terminal, otherwise one line per iteration."""
 
     def __init__(self, console: Console) -> None:
-        self.console, self.total, self.mean = console, 0, math.nan
-        self.other: LongWork | None = None
+        self.console = console
+        self.total = 0
+        self.mean = math.nan
+        self.long_work: LongWork | None = None
         self.progress = Progress(
             BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
             TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left"),
             console=console, disable=not console.is_terminal,
         )  # fmt: skip
 
-    @contextlib.contextmanager
-    def training(self, run: Run, learner: Learner, iterations: int) -> Iterator[None]:
-        """Print the task, its worlds and the run folder, and show a progress bar until the ``with`` block ends."""
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Print the task, its worlds and the run folder, and show a progress bar."""
         env, size = learner.env, learner.team.size
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
@@ -59,21 +59,28 @@ class Display(TrainingDisplay):
         )  # fmt: skip
         self.total = iterations
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
-        with self.progress:
-            yield
-        if kinds := ", ".join(f"{number:,d} {kind}" for kind, number in env.fault_counts.items() if number):
+        self.progress.start()
+
+    def end(self, run: Run, learner: Learner) -> None:
+        """Print the faults."""
+        counts = learner.env.fault_counts
+        if kinds := ", ".join(f"{number:,d} {kind}" for kind, number in counts.items() if number):
             say(f"faults by their kind (lw.Done): {kinds}; lyceum-warp check names the function of a bad reward")
+
+    def close(self) -> None:
+        """End the progress bar."""
+        self.progress.stop()
 
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
         if it.mean_return is not None:
             self.mean = it.mean_return
-        shown = self.mean if self.console.is_terminal else math.nan if it.mean_return is None else self.mean
+        mean_return = self.mean if self.console.is_terminal or it.mean_return is not None else math.nan
         row = _known(it.row())
         # the return is unknown until the first episode ends
         reward = f"reward {row['reward_mean']:.3g} a step" if "reward_mean" in row else ""
         result = f"return {row['return_mean']:.4g}" if "return_mean" in row else reward
-        mean = "" if math.isnan(shown) else f"(mean policy {shown:.4g})"
+        mean = "" if math.isnan(mean_return) else f"(mean policy {mean_return:.4g})"
         success = f"success {row['success']:.0%}" if "success" in row else ""
         bad = [counted(number, what) for column, what in _COUNTED.items() if (number := row.get(column))]
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
@@ -94,11 +101,11 @@ class Display(TrainingDisplay):
         if self.console.is_terminal:
             self.progress.update(self.bar, text=f"{text}: {done}/{total} {unit}")
             return
-        if self.other is None or (self.other.text, self.other.unit) != (text, unit):
-            self.other = LongWork(text, unit, self.console)
-        self.other(done, total)
+        if self.long_work is None or (self.long_work.text, self.long_work.unit) != (text, unit):
+            self.long_work = LongWork(text, unit, self.console)
+        self.long_work(done, total)
         if done >= total:
-            self.other = None
+            self.long_work = None
 
 
 _COUNTED = {"faults": "fault", "outliers": "outlier", "skipped_updates": "skipped update"}

@@ -21,7 +21,7 @@ from lyceum_warp.algos import (
     transfer,
 )
 from lyceum_warp.binding import file_name, find_task, task_name
-from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, Trust, given, parameter, parameters
+from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, given, parameter, parameters
 from lyceum_warp.cli.display import console, say, table, tried
 from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
@@ -72,8 +72,8 @@ class Eval:
     """The policy to evaluate: auto (the better of the last and the best policy in new episodes), last, best, or the
     number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
-    """The name or file of a task to use instead of the run's task. Physics and parameters then come from this task. Its
-    observations and actions must have the same sizes.
+    """The name or file of a task to use instead of the run's task. A different task has its own physics and parameters,
+    and observations and actions of the same sizes.
     """
     param: ParamWords = ()
     episodes: int = 32
@@ -98,7 +98,6 @@ class Eval:
     """
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes. Each episode is one file, such as episode-000.npz."""
-    trust: Trust = False
     env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
     physics: Physics = Physics()
 
@@ -116,12 +115,12 @@ class Eval:
         run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
         options = given(self.env) | given(self.physics)
-        env = run_worlds(run, options, parameters(self.param), nworld=nworld, task=self.task, trust=self.trust)
+        env = run_worlds(run, options, parameters(self.param), nworld=nworld, task=self.task)
         find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
             env = evaluation_worlds(env, nworld)
-        which = better_policy(run, self.which, task=self.task, trust=self.trust)
+        which = better_policy(run, self.which, task=self.task)
         policy = load(run, which=which, device=env.obs.device)
         check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
         curricula, origin_of_memory = self._curricula(run, which, env)
@@ -179,13 +178,13 @@ class Eval:
         return curricula, "as given"
 
 
-def better_policy(run: Run, which: str, *, task: str | None = None, trust: bool = False) -> str:
+def better_policy(run: Run, which: str, *, task: str | None = None) -> str:
     """Return "last" or "best" for ``AUTO``, and print the choice; return any other ``which`` as it is."""
     if which != AUTO:
         return which
 
     def worlds() -> Env:
-        env = run_worlds(run, options_on_cores(), {}, nworld=EPISODES, task=task, trust=trust)
+        env = run_worlds(run, options_on_cores(), {}, nworld=EPISODES, task=task)
         return env if env.horizon else evaluation_worlds(env, EPISODES)
 
     if not run.best.is_file():
@@ -242,12 +241,11 @@ def _print_transfer(verdict: Transfer) -> None:
 
 
 def run_worlds(
-    run: Run, options: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None, trust: bool
+    run: Run, options: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None = None
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
-    A different task has its own defaults. With the engine auto and no device, the worlds run on the CPU. For ``trust``,
-    see ``run_env``.
+    A different task has its own defaults. With the engine auto and no device, the worlds run on the CPU.
     """
     saved = Configuration.of(run)
     defaults = saved.options.changed({"seed": 0})
@@ -259,7 +257,7 @@ def run_worlds(
     if "device" not in options:
         merged = merged.changed(options_for_few_worlds(merged.engine, merged.device))
     try:
-        env = run_env(run, merged, params, task=task, trust=trust)
+        env = run_env(run, merged, params, task=task)
     except (ValueError, FileNotFoundError) as error:
         run.note_settings(error)
         raise

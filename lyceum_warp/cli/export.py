@@ -7,7 +7,6 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.algos import check_export, export_policy
-from lyceum_warp.cli.arguments import Trust
 from lyceum_warp.cli.display import note, say
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.engines import options_on_cores
@@ -34,13 +33,14 @@ class Export:
     which: str = AUTO
     """The policy to export: auto (the better of the last and the best policy in new episodes), last, best, or the
     number of a saved iteration."""
-    trust: Trust = False
+    task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
+    """The file of the run's task, if it has moved, or a different task."""
 
     def run(self) -> None:
         path = self.to or self.folder / "policy.onnx"
         check_export(path)
         run = Run.open(self.folder)
-        which = better_policy(run, self.which, trust=self.trust)
+        which = better_policy(run, self.which, task=self.task)
         policy = load(run, which=which)
         export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
         say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
@@ -48,7 +48,7 @@ class Export:
     def _env(self, run: Run, which: str) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""
         try:
-            env = run_worlds(run, options_on_cores(), {}, nworld=1, task=None, trust=self.trust)
+            env = run_worlds(run, options_on_cores(), {}, nworld=1, task=self.task)
             start_episodes(env, None, load_curriculum(run, which=which))
             return env
         except (ValueError, FileNotFoundError, ImportError) as error:

@@ -5,6 +5,7 @@ import datetime
 import json
 import logging
 import signal
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +19,6 @@ from lyceum_warp.cli.arguments import (
     OptionFlags,
     ParamWords,
     Physics,
-    Trust,
     given,
     parameters,
 )
@@ -29,8 +29,14 @@ from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import (
     ALGORITHMS,
     EPISODES,
+    Callback,
     Configuration,
+    Minutes,
     Run,
+    TargetReturn,
+    TensorBoard,
+    TransferTest,
+    Videos,
     choose_policy,
     learning_curve,
     load,
@@ -39,15 +45,15 @@ from lyceum_warp.training import (
     saved_networks,
     train,
 )
-from lyceum_warp.viz import parsed_camera, policy_video
+from lyceum_warp.viz import find_camera, parsed_camera, policy_video
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
 """Settings that --resume may change, with their default values."""
 
-_KEPT = {
-    "from_run": "--from", "task": "TASK", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads",
-    "out": "--out",
+_RUN_FLAGS = {
+    "from_run": "--from", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads", "out": "--out",
 }  # fmt: skip
+"""Flags that --resume refuses, because a run keeps these settings."""
 
 
 def _default_texts() -> dict[str, str]:
@@ -108,7 +114,9 @@ class Train:
     USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device")
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
-    """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class."""
+    """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
+    --resume, it replaces the file of the run's own task.
+    """
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
     """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). The default is the
     algorithm that the task suggests: ppo for walking robots, npg for others.
@@ -168,7 +176,6 @@ class Train:
     options that the task defines. After training on CPU cores, --transfer also adds a test on the Warp engine.
     Compiling the kernels of this engine may take minutes.
     """
-    trust: Trust = False
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
     plot: bool = True
@@ -181,16 +188,14 @@ class Train:
 
     def run(self) -> int:
         if self.resume is not None:
-            for name, flag in _KEPT.items():
+            for name, flag in _RUN_FLAGS.items():
                 if getattr(self, name) is not None:
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
-        folder = self.resume or self.from_run
-        if self.trust and folder is None:
-            raise ValueError("--trust has no effect without --resume or --from: omit it")
         if self.take_over and self.resume is None:
             raise ValueError("--take-over has no effect without --resume: omit it")
+        folder = self.resume or self.from_run
         source = None if folder is None else Run.open(folder)
         saved = {} if source is None else source.config
         settings: dict[str, Any] = {}
@@ -198,7 +203,8 @@ class Train:
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
         if self.resume is None:
             settings["target_return"] = self.target_return
-        if parsed_camera(self.camera) is not None and not (self.video or settings["video_every"]):
+        camera = parsed_camera(self.camera)
+        if camera is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         with join(self.env.device or saved.get("device", "cpu")) as team:
             if not team.leads:  # only one process prints messages
@@ -206,13 +212,15 @@ class Train:
             with team.together():  # check all options before the folder is created
                 configuration = self.configuration(source, team)
                 learner, folder, entries = self._learner(configuration, source, team)
+                find_camera(learner.env.model, camera)
+                callbacks = self._callbacks(settings)
             leads, total = team.leads, configuration.iterations
             hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
             try:
                 run = train(
-                    learner, folder, camera=parsed_camera(self.camera), resume=self.resume is not None,
-                    take_over=self.take_over, minutes=self.minutes, transfer=self.transfer, entries=entries,
-                    display=Display(console), iterations=total, **settings,
+                    learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
+                    keep_every=settings["keep_every"], save_every=settings["save_every"], take_over=self.take_over,
+                    entries=settings | entries,
                 )  # fmt: skip
             except Interrupted as signalled:
                 if leads and (path := folder / "policy.pt").exists():
@@ -234,6 +242,21 @@ class Train:
                 say(f"stopped after {learner.iteration} of {total} iterations: {limit}; {hint}")
             return self._report(run, learner)
 
+    def _callbacks(self, settings: Mapping[str, Any]) -> list[Callback]:
+        display = Display(console)
+        callbacks: list[Callback] = [display]
+        if settings["target_return"] is not None:
+            callbacks.insert(0, TargetReturn(settings["target_return"]))
+        if settings["tensorboard"]:
+            callbacks.append(TensorBoard())
+        if every := settings["video_every"]:
+            callbacks.append(Videos(every, camera=parsed_camera(self.camera), progress=display.work))
+        if self.transfer is not False:
+            callbacks.append(TransferTest(slow=self.transfer is True, progress=display.work))
+        if self.minutes is not None:
+            callbacks.append(Minutes(self.minutes))
+        return callbacks
+
     def configuration(self, source: Run | None, team: Team) -> Configuration:
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
         base = self._suggestion(team) if source is None else Configuration.of(source)
@@ -241,8 +264,8 @@ class Train:
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
                 f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: resume "
-                "it in Python by lw.train(..., resume=True), or begin a new run from its policy by --from and "
-                "--algorithm"
+                "it in Python by lw.train(learner, lw.Run.open(folder), ...), or begin a new run from its policy by "
+                "--from and --algorithm"
             )
         options = self._given("nworld", "seed") | given(self.env) | given(self.physics)
         if "solver" in options:
@@ -294,21 +317,21 @@ class Train:
         entries: dict[str, Any] = {}
         if source is not None:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
-            chosen = configuration.algorithm
-            if policy is not None and isinstance(policy, SquashedPolicy) != (chosen == "sac"):
+            algorithm = configuration.algorithm
+            if policy is not None and isinstance(policy, SquashedPolicy) != (algorithm == "sac"):
                 raise ValueError(
-                    f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit {chosen}: "
-                    f"omit --algorithm {chosen}"
+                    f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit "
+                    f"{algorithm}: omit --algorithm {algorithm}"
                 )
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
-        learner = configuration.learner(team, run=source, networks=(policy, value), task=self.task, trust=self.trust)
+        learner = configuration.learner(team, run=source, networks=(policy, value), task=self.task)
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
             for name, value in given(self.hyperparameters).items():
-                if (found := getattr(fitted, name)) != value:
+                if (fitted_value := getattr(fitted, name)) != value:
                     raise ValueError(
-                        f"the networks in {self.from_run or self.resume} have {name} {found}, not {value}: omit "
+                        f"the networks in {self.from_run or self.resume} have {name} {fitted_value}, not {value}: omit "
                         f"--{name.replace('_', '-')}"
                     )
         if source is not None and self.task is None and self.resume is None:

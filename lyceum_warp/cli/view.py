@@ -9,7 +9,7 @@ import tyro
 
 from lyceum_warp.algos import MPPI, check_sizes, task_config
 from lyceum_warp.binding import task_names
-from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, Trust, given, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
@@ -65,7 +65,6 @@ class View:
     port: int | None = None
     """Port of the page; by default the first free port from 8080 on."""
     param: ParamWords = ()
-    trust: Trust = False
     place: Annotated[Placement, tyro.conf.arg(name="world")] = Placement()
     """Engine and device of the displayed worlds. With --mppi, the planner's worlds use them instead."""
     physics: Physics = Physics()
@@ -84,7 +83,7 @@ class View:
             return dataclasses.replace(self, what=(str(folder),), pretrained=False).run()
         torch.set_num_threads(1)
         kind = _kind(self.what)
-        for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run")), ("trust", ("run",))):
+        for flag, fits in (("follow", ("run",)), ("mppi", ("task", "run"))):
             if getattr(self, flag) and kind not in fits:
                 raise ValueError(
                     f"--{flag} needs a {' or a '.join(fits)}, and {self.what[0]} is not one: omit the flag"
@@ -106,8 +105,8 @@ class View:
                 raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
             run = Run.open(self.what[0])
             nworld = 16 if self.nworld is None else self.nworld
-            env = run_worlds(run, options, params, nworld=nworld, task=self.task, trust=self.trust)
-            which = "last" if self.follow else better_policy(run, self.which, task=self.task, trust=self.trust)
+            env = run_worlds(run, options, params, nworld=nworld, task=self.task)
+            which = "last" if self.follow else better_policy(run, self.which, task=self.task)
             policy = load(run, which=which, device=env.obs.device)
             check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
             start_episodes(env, self.seed, None if self.task else load_curriculum(run, which=which))

@@ -1,5 +1,12 @@
+from lyceum_warp.training.callbacks import (
+    Callback as Callback,
+    Minutes as Minutes,
+    TargetReturn as TargetReturn,
+    TransferTest as TransferTest,
+    Videos as Videos,
+)
 from lyceum_warp.training.curve import learning_curve as learning_curve
-from lyceum_warp.training.loop import Display as Display, train as train
+from lyceum_warp.training.loop import train as train
 from lyceum_warp.training.runs.checkpoints import (
     network_of as network_of,
     read_checkpoint as read_checkpoint,
@@ -31,3 +38,4 @@ from lyceum_warp.training.runs.task_copy import (
     run_env as run_env,
     task_copy as task_copy,
 )
+from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard

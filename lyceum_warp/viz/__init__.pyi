@@ -9,7 +9,7 @@ from lyceum_warp.viz.extra import NoVideoError as NoVideoError
 from lyceum_warp.viz.page import write_states as write_states
 from lyceum_warp.viz.pictures import WorldPictures as WorldPictures
 from lyceum_warp.viz.policy_videos import (
-    Videos as Videos,
+    NamedProgress as NamedProgress,
     one_line as one_line,
     policy_video as policy_video,
 )
@@ -20,10 +20,6 @@ from lyceum_warp.viz.style import (
     finish_axes as finish_axes,
     new_figure as new_figure,
     save_png as save_png,
-)
-from lyceum_warp.viz.tensorboard import (
-    TensorBoard as TensorBoard,
-    check_tensorboard as check_tensorboard,
 )
 from lyceum_warp.viz.video import (
     Recorder as Recorder,

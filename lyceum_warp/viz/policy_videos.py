@@ -1,22 +1,19 @@
-"""Make videos of a policy, during and after training."""
+"""Make videos of a policy."""
 
 import contextlib
 import functools
-import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
 import torch
 
-from lyceum_warp.algos import Iteration, Learner, Policy, acting, evaluation_worlds, moved
+from lyceum_warp.algos import Policy, acting, evaluation_worlds, moved
 from lyceum_warp.controllers import policy_episodes
 from lyceum_warp.env import Curriculum, Env
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.video import Progress, write_video
-
-log = logging.getLogger(__name__)
 
 NamedProgress: TypeAlias = Callable[[str, str, int, int], object]
 """A progress callback, called with a description, a unit, the units done so far, and the total number of units."""
@@ -43,33 +40,6 @@ def policy_video(
         )  # fmt: skip
     rendering = None if progress is None else functools.partial(progress, "rendering the video", "frames")
     return write_video(one, episode.states, path, camera=camera, progress=rendering)
-
-
-class Videos:
-    """Writes a video of the mean policy every few iterations.
-
-    After an error, for example because the machine cannot render, training continues without videos.
-    """
-
-    def __init__(
-        self, learner: Learner, folder: Path, every: int, seed: int, *, camera: CameraChoice = None,
-        progress: NamedProgress | None = None,
-    ) -> None:  # fmt: skip
-        self.learner, self.folder, self.every, self.seed = learner, folder, every, seed
-        self.camera, self.progress = camera, progress
-
-    def __call__(self, iteration: Iteration) -> None:
-        """Write a video after an iteration, if one is due."""
-        if not self.every or iteration.iteration % self.every:
-            return
-        path = self.folder / f"{iteration.iteration:06d}.mp4"
-        try:
-            policy_video(
-                self.learner.env, self.learner.policy, path, self.seed, camera=self.camera, progress=self.progress
-            )
-        except Exception as error:  # an error of any kind must not end the training
-            log.warning("no further videos (%s)", one_line(error))
-            self.every = 0
 
 
 def one_line(error: BaseException) -> str:

@@ -228,7 +228,7 @@ def test_many_consecutive_non_finite_updates_end_a_run(env: lw.Env, tmp_path: Pa
     npg = unnormalized(env, enlarge)
     before = mean_actions(npg.policy)
     with pytest.raises(FloatingPointError) as raised:
-        lw.train(npg, tmp_path / "run", iterations=20)
+        lw.train(npg, tmp_path / "run", 20)
     message = str(raised.value)
     assert message.startswith(
         "the step of the policy and the fit of the value function in iteration 10 are not finite, as in the 9 "

@@ -162,7 +162,7 @@ def test_action_density_integrates_to_one() -> None:
 
 
 def test_run_contains_policy_critics_and_replay_buffer(env: lw.Env, tmp_path: Path) -> None:
-    run = lw.train(made(env), tmp_path / "run", iterations=2)
+    run = lw.train(made(env), tmp_path / "run", 2)
     assert run.config["algorithm"] == "sac"
     assert run.config["sac"]["replay"] == 78  # as given, although the buffer has room for 20 steps of 4 worlds
     policy, value = lw.load(run, which="best"), lw.load_value(run)
@@ -173,7 +173,7 @@ def test_run_contains_policy_critics_and_replay_buffer(env: lw.Env, tmp_path: Pa
     torch.testing.assert_close(exported(obs), policy.act(obs))
     min((run.folder / "replay").iterdir()).unlink()
     with pytest.raises(ValueError, match="lacks steps 4 to .* of the replay buffer"):
-        lw.train(made(env), run.folder, iterations=3, resume=True)
+        lw.train(made(env), run, 3)
 
 
 def test_training_continues_from_given_networks(env: lw.Env) -> None:

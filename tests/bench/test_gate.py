@@ -14,7 +14,7 @@ import lyceum_warp as lw
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = lw.PPOConfig(hidden=(4,), value_hidden=(4,), num_steps=4, mean_every=0)
     learner = lw.PPO(lw.make("go1_velocity", nworld=2), config=config)
-    return lw.train(learner, tmp_path_factory.mktemp("gate") / "run", iterations=1).folder
+    return lw.train(learner, tmp_path_factory.mktemp("gate") / "run", 1).folder
 
 
 def test_experiment_gate_evaluates_each_policy_only_once(

@@ -29,16 +29,16 @@ def first(npg: lw.NPG) -> lw.Iteration:
 @contextlib.contextmanager
 def shown_on(console: Console, npg: lw.NPG, total: int = 10) -> Iterator[display.Display]:
     shown = display.Display(console)
-    with shown.training(Run(Path("run"), {}), npg, total):
-        console.file.truncate(0)
-        console.file.seek(0)
-        yield shown
+    shown.begin(Run(Path("run"), {}), npg, total)
+    console.file.truncate(0)
+    console.file.seek(0)
+    yield shown
+    shown.close()
 
 
 def test_first_line_shows_task_worlds_algorithm_and_folder(npg: lw.NPG) -> None:
     console = Console(file=io.StringIO(), width=120, highlight=False)
-    with display.Display(console).training(Run(Path("run"), {}), npg, 10):
-        pass
+    display.Display(console).begin(Run(Path("run"), {}), npg, 10)
     expected = "half_cheetah: 17 observations, 6 actions; 4 worlds, mujoco engine on cpu, npg; run in run\n"
     assert console.file.getvalue() == expected
 

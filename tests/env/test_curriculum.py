@@ -28,7 +28,7 @@ def make(nworld: int, **options: object) -> lw.Env:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Train for three iterations, in which every world plays one episode."""
     folder = tmp_path_factory.mktemp("runs") / "ladder"
-    lw.train(lw.PPO(make(4), config=CONFIG), folder, iterations=3, keep_every=1)
+    lw.train(lw.PPO(make(4), config=CONFIG), folder, 3, keep_every=1)
     return folder
 
 

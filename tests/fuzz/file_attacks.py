@@ -74,7 +74,7 @@ KINDS = {
     "policy.pt": Kind("run/policy.pt", _checkpoint, ("load", "load", "eval", "view", "from")),
     "best.pt": Kind("run/best.pt", _checkpoint, ("load best", "resume", "from best")),
     "evaluation.json": Kind("run/evaluation.json", mutations.mutated_json, ("eval",)),
-    "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone", "load alone")),
+    "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone",)),
     "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
     "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),
     "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("the model of the task",)),
@@ -90,8 +90,8 @@ def _both(run: Path, which: str = "last") -> None:
         load(run, which=which)
 
 
-def _resume(run: Path) -> None:
-    command("train", "--resume", run, "--trust", "--iterations", "3", "--no-video", "--no-plot")
+def _resume(run: Path, *task: Path) -> None:
+    command("train", *task, "--resume", run, "--iterations", "3", "--no-video", "--no-plot")
 
 
 def _episodes(path: Path) -> None:
@@ -105,17 +105,16 @@ READERS: dict[str, Callable[[], object]] = {
     "open": lambda: (Run.open(CASE / "run").task_name, Run.open(CASE / "run").rows()),
     "load": lambda: _both(CASE / "run"),
     "load best": lambda: _both(CASE / "run", "best"),
-    "load alone": lambda: _both(CASE / "run"),
-    "eval": lambda: command("eval", CASE / "run", "--trust", "--episodes", 2),
-    "eval kept": lambda: command("eval", CASE / "kept", "--trust", "--episodes", 2),
-    "view": lambda: command("view", CASE / "run", "--trust", "--nworld", 1),
+    "eval": lambda: command("eval", CASE / "run", "--episodes", 2),
+    "eval kept": lambda: command("eval", CASE / "kept", "--task", _COPY, "--episodes", 2),
+    "view": lambda: command("view", CASE / "run", "--nworld", 1),
     "resume": lambda: _resume(CASE / "run"),
     "resume alone": lambda: _resume(CASE / "run"),
     "resume previous": lambda: _resume(CASE / "run"),
-    "resume kept": lambda: _resume(CASE / "kept"),
+    "resume kept": lambda: _resume(CASE / "kept", _COPY),
     "from": lambda: command("train", "--from", CASE / "run", *_NEW),
     "from best": lambda: command("train", "--from", CASE / "run", "--which", "best", *_NEW),
-    "from kept": lambda: command("train", "--from", CASE / "kept", *_NEW),
+    "from kept": lambda: command("train", _COPY, "--from", CASE / "kept", *_NEW),
     "episodes": lambda: _episodes(CASE / "episodes"),
     "view episodes": lambda: command("view", CASE / "episodes"),
     "make": lambda: lw.make(SLIDE_PY, model=CASE / "model.xml").step(),
@@ -124,10 +123,11 @@ READERS: dict[str, Callable[[], object]] = {
     "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "spaces"),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
-WITHOUT = {"load alone": "run/policy.pt", "resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
+WITHOUT = {"resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
 """Files that a case deletes first, so that the command must read another file."""
 SLIDE_PY = str(BASE / "slide.py")
-_NEW = ("--trust", "--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
+_COPY = CASE / "kept/task/slide.py"
+_NEW = ("--out", "case/new", "--iterations", "1", "--no-video", "--no-plot")
 
 
 class RefusedError(Exception):

@@ -49,8 +49,9 @@ class Call:
     def names(self) -> list[str]:
         """Return the names of the arguments that cases replace."""
         variable = (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
-        found = [name for name, p in inspect.signature(self.function).parameters.items() if p.kind not in variable]
-        return [name for name in dict.fromkeys((*found, *self.more)) if name != "video_every"]
+        parameters = inspect.signature(self.function).parameters
+        names = [name for name, parameter in parameters.items() if parameter.kind not in variable]
+        return list(dict.fromkeys((*names, *self.more)))
 
 
 @functools.cache
@@ -87,7 +88,7 @@ CALLS = {
     "CEM": Call(lw.CEM, _planner, (*SETTINGS, *_OPTIONS)),
     "NPG": Call(lw.NPG, lambda: {"env": _env(nworld=2)}),
     "evaluate": Call(lw.evaluate, lambda: {"env": _env(nworld=2), "policy": _npg().policy, "episodes": 2}),
-    "train": Call(lw.train, lambda: {"learner": _npg(), "folder": "run", "iterations": 1}),
+    "train": Call(lw.train, lambda: {"learner": _npg(), "run": "run", "iterations": 1}),
     "control": Call(lw.control, lambda: {"env": _plant(), "controller": _still}),
     "control_async": Call(lw.control_async, lambda: {"env": _plant(), "controller": _still}),
     "Rollout": Call(lw.Rollout, lambda: {"env": _env(nworld=2), "steps": 2}),
@@ -129,8 +130,6 @@ def call(name: str, words: dict[str, Any]) -> None:
     text = str(refusal)
     named = [*words, *(word.replace("_", " ").removesuffix("s") for word in words), *map(_shown, words.values())]
     named += [repr(part) for value in words.values() if isinstance(value, (dict, tuple)) for part in value]
-    if "resume" in words:
-        named.append("there is no run in run")
     if not any(part in text for part in (*named, *(str(v) for v in words.values() if len(str(v)) > 3))):
         raise ProblemError(f"{shown}: the message has neither the argument's name nor its value", refusal)
 
@@ -144,7 +143,7 @@ def warm_up() -> None:
     HERE.mkdir(exist_ok=True)
     os.chdir(HERE)
     if not Path("good").exists():
-        lw.train(_npg(), "good", iterations=1)
+        lw.train(_npg(), "good", 1)
     for name in CALLS:
         call(name, {})
 

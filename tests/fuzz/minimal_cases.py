@@ -111,7 +111,7 @@ KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
     "a period of 2^63 seconds": ("control_async", {"period": 2**63}),
     "a rollout of 10^9 steps": ("Rollout", {"steps": 10**9}),
     "a run that is a list": ("load", {"run": []}),
-    "resume that is a number": ("train", {"resume": 7}),
+    "callbacks that are a number": ("train", {"callbacks": 7}),
 }
 """Each case is a call and its arguments. The error must name an argument or its value."""
 

@@ -106,7 +106,7 @@ def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[s
 def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runtime = pytest.importorskip("onnxruntime")
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)
-    run = lw.train(lw.NPG(lw.make("point_mass", nworld=2, frame_skip=3), config=config), tmp_path / "run", iterations=1)
+    run = lw.train(lw.NPG(lw.make("point_mass", nworld=2, frame_skip=3), config=config), tmp_path / "run", 1)
 
     def metadata() -> dict[str, str]:
         assert main(["export", str(run.folder)]) == 0

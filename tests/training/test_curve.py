@@ -11,7 +11,9 @@ def test_learning_curve_of_a_task_with_metrics_has_a_panel_for_them(tmp_path: Pa
     for number, metrics in enumerate(({}, {"metrics/forward": 1.0, "metrics/effort": float("nan")})):
         run = Run.create(tmp_path / str(number), {"task": "point_mass", "seed": 3})
         for i in (1, 2):
-            run.append({"samples": i, "return_mean": 1.0, "return_std": 0.5, "eval_mean": 1.0, **metrics})
+            run.append(
+                {"iteration": i, "samples": i, "return_mean": 1.0, "return_std": 0.5, "eval_mean": 1.0, **metrics}
+            )
         assert learning_curve(run) == run.folder / "curve.png"
         header = (run.folder / "curve.png").read_bytes()[:24]
         assert header[:8] == b"\x89PNG\r\n\x1a\n"

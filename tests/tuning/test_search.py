@@ -62,7 +62,7 @@ def test_stored_results_are_not_reused_for_other_options(
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "point_mass"
     env = lw.make("point_mass", nworld=2, nthread=1, success_distance=0.05)
-    lw.train(lw.NPG(env, config=CONFIG), folder, iterations=1)
+    lw.train(lw.NPG(env, config=CONFIG), folder, 1)
     return folder
 
 

@@ -31,15 +31,15 @@ def policy_content(
     content: dict[str, Any] = {"lyceum_warp": FORMAT, "iteration": iteration}
     if curriculum is not None and (memory := {name: dict(rows) for name, rows in vars(curriculum).items() if rows}):
         content["curriculum"] = memory
-    for name, module in (("policy", policy), ("value", value)):
-        if module is not None:
-            kind = type(module)
-            own = {} if isinstance(module, _CLASSES[name]) else {"class": f"{kind.__module__}.{kind.__qualname__}"}
+    for name, network in (("policy", policy), ("value", value)):
+        if network is not None:
             content[name] = {
-                **own,
-                "shape": getattr(module, "shape", None),
-                "state": {key: tensor.detach().cpu().clone() for key, tensor in module.state_dict().items()},
+                "shape": getattr(network, "shape", None),
+                "state": {key: tensor.detach().cpu().clone() for key, tensor in network.state_dict().items()},
             }
+            if not isinstance(network, _CLASSES[name]):
+                kind = type(network)
+                content[name]["class"] = f"{kind.__module__}.{kind.__qualname__}"
     return content
 
 
@@ -51,8 +51,8 @@ def write_content(path: Path, content: Mapping[str, Any], **options: Any) -> Non
         temporary.write_bytes(buffer.getbuffer())
 
 
-def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Module | None = None) -> nn.Module:
-    """Make a network from a file's content, or load the file's weights into a given network.
+def network_of(content: Mapping[str, Any], path: Path, name: str, network: nn.Module | None = None) -> nn.Module:
+    """Make a network from a file's content, or load the file's weights into ``network``.
 
     ``name`` is "policy" or "value".
     """
@@ -60,49 +60,49 @@ def network_of(content: Mapping[str, Any], path: Path, name: str, given: nn.Modu
         raise ValueError(f"{path} has no value function: its algorithm learns none, or the file is from rsl_rl")
     saved = content[name]
     try:
-        module = given
-        if module is None and "like" in saved:
-            raise ValueError(f"rsl_rl saved this policy without its activation: pass policy={saved['like']}")
-        if module is None:
+        if network is None:
+            if "like" in saved:
+                raise ValueError(f"rsl_rl saved this policy without its activation: pass policy={saved['like']}")
             with torch.device("meta"):  # compare shapes before allocating memory
-                module = _made(name, saved)
-        if different := _difference(module, saved["state"]):
-            fix = _FIX if given is None else "pass a policy with the same structure as the run's policy"
-            raise ValueError(f"its {name} has different parameters ({different}): {fix}")
-        if given is None and (wrong := [part for part, x in saved["state"].items() if not x.isfinite().all()]):
-            raise ValueError(f"its {name}'s {wrong[0]!r} is not finite: {_FIX}")
-        module = _made(name, saved) if given is None else given
-        module.load_state_dict(saved["state"])
+                _check_shapes(name, _new_network(name, saved), saved["state"], _FIX)
+            if infinite := [part for part, tensor in saved["state"].items() if not tensor.isfinite().all()]:
+                raise ValueError(f"its {name}'s {infinite[0]!r} is not finite: {_FIX}")
+            network = _new_network(name, saved)
+        else:
+            _check_shapes(name, network, saved["state"], "pass a policy with the same structure as the run's policy")
+        network.load_state_dict(saved["state"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     except (KeyError, TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
         raise ValueError(f"{path} contains no {name} of lyceum_warp ({first_sentence(error)}): {_FIX}") from error
-    return module
+    return network
 
 
-def _made(name: str, saved: Mapping[str, Any]) -> nn.Module:
+def _new_network(name: str, saved: Mapping[str, Any]) -> nn.Module:
     """Make a network with the class and shape in a file. The class must be part of this package."""
     kind: Any = _CLASSES[name]
-    own, shape = saved.get("class"), saved["shape"]
-    if own is not None:
-        # the file could name any module, and importing a module runs its code; earlier releases had other modules
-        public = own.startswith("lyceum_warp.") and shape is not None
-        kind = getattr(algos, own.rpartition(".")[2], None) if public else None
+    spelling, shape = saved.get("class"), saved["shape"]
+    if spelling is not None:
+        # The file could name any module, and importing a module runs its code. Release 0.2.0 had other module names.
+        class_name = spelling.rpartition(".")[2]
+        public = spelling.startswith("lyceum_warp.") and shape is not None
+        kind = getattr(algos, class_name, None) if public else None
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
-            fix = f": give one, as in lw.load(run, policy={own.rpartition('.')[2]}(...))" if name == "policy" else ""
-            raise ValueError(f"the {name} has a custom class, {own}{fix}")
-    module: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
-    return module
+            fix = f": give one, as in lw.load(run, policy={class_name}(...))" if name == "policy" else ""
+            raise ValueError(f"the {name} has a custom class, {spelling}{fix}")
+    network: nn.Module = kind.like(shape) if hasattr(kind, "like") else kind(**shape)
+    return network
 
 
-def _difference(module: nn.Module, state: Mapping[str, torch.Tensor]) -> str:
-    own, saved = ({name: tuple(part.shape) for name, part in s.items()} for s in (module.state_dict(), state))
-    saved = {name: own[name] for name in getattr(module, "LATER", ())} | saved
-    for name in {**own, **saved}:
-        if own.get(name) != saved.get(name):
-            one, other = (f"{shape}" if shape is not None else "absent" for shape in (saved.get(name), own.get(name)))
-            return f"{name!r} is {one} in the file, and {other} in the network that takes it"
-    return ""
+def _check_shapes(name: str, network: nn.Module, state: Mapping[str, torch.Tensor], fix: str) -> None:
+    shapes = {part: tuple(tensor.shape) for part, tensor in network.state_dict().items()}
+    saved = {part: tuple(tensor.shape) for part, tensor in state.items()}
+    for part in {**shapes, **saved}:
+        if shapes.get(part) != saved.get(part):
+            raise ValueError(
+                f"its {name} has different parameters ({part!r} is {saved.get(part, 'absent')} in the file, and "
+                f"{shapes.get(part, 'absent')} in the network that takes it): {fix}"
+            )
 
 
 def read_checkpoint(

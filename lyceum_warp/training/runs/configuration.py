@@ -26,12 +26,12 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, 
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
-    kept = ["horizon", "graphs", "fields", "dynamics"]
+    names = ["horizon", "graphs", "fields", "dynamics"]
     if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
-        kept.append("nthread")
-    others = {name: value for name, value in options.given().items() if name in kept}
+        names.append("nthread")
+    entries = {name: value for name, value in options.given().items() if name in names}
     if isinstance(options.model, str | Path):
-        others["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
+        entries["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     return {
         "algorithm": learner.algorithm,
@@ -40,7 +40,7 @@ def describe(learner: Learner) -> dict[str, Any]:
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
-        "options": others,
+        "options": entries,
         "nworld": env.nworld * learner.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
@@ -72,21 +72,20 @@ class Configuration:
         """Read a run's configuration. If the file of a table is missing or has changed, use the run's copy."""
         config = run.config
         try:
-            # earlier releases stored --param options in "params", or wrote no "physics"
-            words = {**config.get("physics", {}), **config.get("options", {}), **config["params"]}
-            words.pop("unroll", None)  # earlier releases had this option, which did not affect results
-            base = EnvOptions(
+            options = EnvOptions(
                 engine=config["engine"], device=config["device"], nworld=config["nworld"], seed=config["seed"]
             )  # fmt: skip
-            options, params = EnvOptions.split(words, base)
-            params |= {param: str(copy) for param, copy in table_copies(run).items()}
             name: str = config["algorithm"]
             return cls(
-                task=config["task"], params=params, options=options, algorithm=name,
+                task=config["task"],
+                params=config["params"] | {table: str(copy) for table, copy in table_copies(run).items()},
+                options=options.changed(config["physics"] | config["options"]),
+                algorithm=name,
                 hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
-                seed=config.get(f"{name}_seed"), threads=config["threads"],
+                seed=config.get(f"{name}_seed"),
+                threads=config["threads"],
                 iterations=config.get("iterations", 100),
-            )  # fmt: skip
+            )
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             text = f"{run.folder / 'config.json'} is not the configuration of a training run ({error})"
             raise ValueError(text) from error
@@ -98,19 +97,20 @@ class Configuration:
         run: Run | None = None,
         networks: tuple[Any, Any] = (None, None),
         task: str | None = None,
-        trust: bool = False,
     ) -> Learner:
         """Make the learner of one of the processes.
 
         With a run, the learner uses the run's task, unless ``task`` names another task. Without a run, it uses the task
-        of this configuration. New networks are made if none are given. For ``trust``, see ``run_env``.
+        of this configuration. New networks are made if none are given.
         """
         try:
             # OpenMP aborts the process if it cannot create the threads
             torch.set_num_threads(whole_number("threads", self.threads, low=1, high=1024))
             nworld = team.share(self.options.nworld)
-            own = {"nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device}
-            options = self.options.changed(own)
+            placement = {
+                "nworld": nworld, "first_world": team.rank * nworld, "device": team.device or self.options.device,
+            }  # fmt: skip
+            options = self.options.changed(placement)
             engine = engine_name(options.engine, options.device)
             if options.nthread is None and team.neighbours > 1 and engine == "mujoco":
                 options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
@@ -119,7 +119,7 @@ class Configuration:
                 env = Env(self.task, options, **self.params)
             else:
                 # only rank 0 checks trust, because other machines may have no record of the run
-                env = run_env(run, options, self.params, task=task, trust=trust or not team.leads)
+                env = run_env(run, options, self.params, task=task, trust=not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
             return learner

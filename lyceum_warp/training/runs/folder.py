@@ -119,8 +119,8 @@ class Run:
     ) -> "Run":
         """Create a run folder with a copy of the task, the configuration and the versions.
 
-        The folder is deleted if an error occurs. If the run uses the user's own files, it is recorded as trusted (see
-        ``lyceum_warp.training.runs.trust``), so that later commands execute the task.
+        The folder is deleted if an error occurs. The task's code is recorded (see ``lyceum_warp.training.runs.trust``),
+        so that later commands execute it.
 
         Args:
             folder: A new or empty folder.
@@ -130,9 +130,9 @@ class Run:
         """
         folder = Path(folder)
         cls.check_free(folder)
-        found = versions(config.get("device", "cpu"))
-        run, task = cls(folder, {"format": FORMAT, **config, "versions": found}), folder / f"{_TASK}.tmp"
-        text = json.dumps(run.config, indent=2)  # this may fail, so do it before the folder is created
+        entries = {"format": FORMAT, **config, "versions": versions(config.get("device", "cpu"))}
+        text = json.dumps(entries, indent=2)  # this may fail, so do it before the folder is created
+        run, task = cls(folder, json.loads(text)), folder / f"{_TASK}.tmp"
         try:
             shutil.rmtree(task, ignore_errors=True)
             folder.mkdir(parents=True, exist_ok=True)
@@ -147,7 +147,7 @@ class Run:
         except BaseException:  # for example, the disk is full, or a signal ends the program
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        if files or "model" in run.config.get("options", {}):
+        if "file" in run.config.get("kept", {}):
             remember(folder, run.config)
         return run
 
@@ -207,19 +207,18 @@ class Run:
 
         New columns are empty in earlier rows. None becomes an empty cell. Floats are written with all digits.
         """
-        known: list[str] = []
+        columns: list[str] = []
         rows: list[list[str]] = []
         if self.metrics.exists():
             with self.metrics.open(newline="") as file:
                 reader = csv.reader(file)
-                known = next(reader, [])
-                if not row.keys() <= set(known):
+                columns = next(reader, [])
+                if not row.keys() <= set(columns):
                     rows = list(reader)
-        columns = list(dict.fromkeys([*known, *row]))
-        if columns != known:
-            empty = [""] * (len(columns) - len(known))
+        if new := [name for name in row if name not in columns]:
+            columns += new
             with replaced(self.metrics) as temporary, temporary.open("w", newline="") as file:
-                csv.writer(file).writerows([columns, *(cells + empty for cells in rows)])
+                csv.writer(file).writerows([columns, *(cells + [""] * len(new) for cells in rows)])
         with self.metrics.open("a", newline="") as file:
             csv.writer(file).writerow(map(row.get, columns))  # csv writes None as an empty cell
 
@@ -245,13 +244,12 @@ class Run:
         """Delete the rows of all iterations after ``iteration`` from the metrics table, and an incomplete last row."""
         if not self.metrics.exists():
             return
-        numbers = [row.get("iteration") or number for number, row in enumerate(self.rows(), 1)]
-        kept = sum(number <= iteration for number in numbers)
+        count = sum((row.get("iteration") or 0) <= iteration for row in self.rows())
         with self.metrics.open(newline="") as file:
             lines = [line for line in file if line.strip()]
-        if len(lines) > kept + 1:
+        if len(lines) > count + 1:
             with replaced(self.metrics) as temporary:
-                temporary.write_text("".join(lines[: kept + 1]), newline="")
+                temporary.write_text("".join(lines[: count + 1]), newline="")
 
     # policies
 
@@ -270,24 +268,22 @@ class Run:
             ValueError: ``which`` is neither a name nor a number.
         """
         if which == "last":
-            # earlier releases stored the policy only in the checkpoint
-            return self.policy if self.policy.is_file() else self.checkpoint
-        if which == "best":
+            path = self.policy
+        elif which == "best":
             path = self.best
         elif isinstance(which, int | str) and str(which).isdigit():
             path = self.numbered(int(which))
         else:
             raise ValueError(f"no policy is named {which!r}: pass 'last', 'best' or the number of an iteration")
         if not path.is_file():
-            raise FileNotFoundError(
-                f"the run in {self.folder} has no policy {which!r}: it has {self._known_policies()}"
-            )
+            raise FileNotFoundError(f"the run in {self.folder} has no policy {which!r}: it has {self._policies()}")
         return path
 
-    def _known_policies(self) -> str:
-        known = ["'last'"] * self.policy_file().is_file() + ["'best'"] * self.best.is_file()
+    def _policies(self) -> str:
+        """List the run's policies, for an error message."""
+        names = ["'last'"] * self.policy.is_file() + ["'best'"] * self.best.is_file()
         numbers = sorted(int(path.stem) for path in self.numbered(0).parent.glob("*.pt") if path.stem.isdigit())
-        return ", ".join([*known, *map(str, numbers)]) or "none yet"
+        return ", ".join([*names, *map(str, numbers)]) or "none yet"
 
     def best_score(self) -> tuple[int, float] | None:
         """Read the iteration and the score of the best policy. Return None if there is no best policy."""

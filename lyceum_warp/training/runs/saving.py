@@ -36,7 +36,8 @@ class Saver:
         save_every: int = 0,
         saved: int = -1,
     ) -> None:
-        self.run, self.learner, self.keep_every, self.save_every = run, learner, keep_every, save_every
+        self.run, self.learner = run, learner
+        self.keep_every, self.save_every = keep_every, save_every
         self.saved = saved
         best = None if run is None else run.best_score()
         self._best = -math.inf if best is None else best[1]
@@ -44,34 +45,29 @@ class Saver:
         self._seconds, self._when = 0.0, time.perf_counter()
         self._stored = learner.replay.stored if learner.replay is not None and saved >= 0 else 0
 
-    def write(self, iteration: Iteration) -> float | None:
-        """Write an iteration's metrics, and its policy if it is the best so far or needs a numbered file.
-
-        Returns:
-            The return by which policies are compared, or None if the iteration has none.
-        """
-        assert self.run is not None
-        self.run.check()
-        self.run.append(iteration.row())
-        learner, name = self.learner, self.learner.best_by
+    def write(self, iteration: Iteration) -> None:
+        """Write an iteration's metrics, and its policy if it is the best so far or needs a numbered file."""
+        learner, run, name = self.learner, self.run, self.learner.best_by
+        if run is None:
+            return
+        run.check()
+        run.append(iteration.row())
         score = getattr(iteration, name)
-        score = None if score is None or math.isnan(score) else score
-        better = score is not None and score > self._best
+        better = score is not None and score > self._best  # a score may be NaN
         numbered = self.keep_every > 0 and learner.iteration % self.keep_every == 0
         # return_mean belongs to the policy that sampled the episodes, before the update
         sampled = name == "return_mean"
         before = self._before
         if better or numbered or sampled:
             self._before = self._content()
-        if better and score is not None:
+        if better:
             self._best = score
             content = before if sampled else self._before
-            write_content(self.run.best, {**content, "score": {"name": name, "value": score}})
+            write_content(run.best, {**content, "score": {"name": name, "value": score}})
         if numbered:
-            path = self.run.numbered(learner.iteration)
+            path = run.numbered(learner.iteration)
             path.parent.mkdir(exist_ok=True)
             write_content(path, self._before)
-        return score
 
     def _content(self) -> dict[str, Any]:
         learner = self.learner

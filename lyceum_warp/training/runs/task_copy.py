@@ -17,7 +17,7 @@ from lyceum_warp.binding import data_files, find_model, package_task_names, sour
 from lyceum_warp.core import EnvOptions, ModelFile, Task, read_spec
 from lyceum_warp.env import Env
 from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.training.runs.trust import check_trust
+from lyceum_warp.training.runs.trust import is_trusted, remember
 
 log = logging.getLogger(__name__)
 
@@ -38,63 +38,64 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     Returns:
         The entry ``kept`` of config.json, and the files of the folder ``task``, by their paths in this folder.
     """
-    task, given = env.task.task, env.options.model is not None
-    loaded, own = source_files(task), not task.__module__.startswith("lyceum_warp.")
-    file = next(iter(loaded), None)
-    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": given}
+    task, model_given = env.task.task, env.options.model is not None
+    sources, private = source_files(task), not task.__module__.startswith("lyceum_warp.")
+    file = next(iter(sources), None)
+    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": model_given}
     files: dict[str, Path | bytes] = {}
     if file is not None:
-        kept["source_hash"] = _digest(loaded[file])
-    if own or given:
-        main, model = _model_files(env)
-        sources: Files = {**loaded, **_data_copies(task)[0]} if own else {}
+        kept["source_hash"] = _digest(sources[file])
+    if private or model_given:
+        model_file, model = _model_files(env)
+        code: Files = {}
+        if private:
+            code = {**sources, **{path: path for path, reason in _data_files(task).items() if not reason}}
         # relative paths stay the same, so that the copied task finds the copied model
-        names = _names_in_copy([*sources, *model])
+        names = _names_in_copy([*code, *model])
         if file is not None and names.get(file, "").count("/") > _APART:
-            names = _names_in_copy(sources) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
-        files = {names[path]: content for path, content in {**sources, **model}.items()}
-        if own and file is not None:
+            names = _names_in_copy(code) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
+        files = {names[path]: content for path, content in {**code, **model}.items()}
+        if private and file is not None:
             kept["modules"] = {
-                path.relative_to(file.parent).as_posix(): _digest(source)
-                for path, source in sources.items()
+                path.relative_to(file.parent).as_posix(): _digest(content)
+                for path, content in code.items()
                 if path != file
             }
-            kept["file"], kept["program"] = names[file], task.__module__ == "__main__"
-        if main is not None:
-            kept["model"] = names[main]
+            kept["file"] = names[file]
+            kept["program"] = task.__module__ == "__main__"
+        if model_file is not None:
+            kept["model"] = names[model_file]
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
     return kept, files
 
 
-def _data_copies(task: type[Task]) -> tuple[Files, dict[str, list[Path]]]:
-    """Return the data files that a task reads and that a run can copy, and the others by the reason against a copy.
+def _data_files(task: type[Task]) -> dict[Path, str]:
+    """Map each data file that a task reads to the reason why a run cannot copy it, or to "".
 
     The copy of the task's file finds only files below its own folder.
     """
-    loaded = source_files(task)
-    folder, data = next((file.parent for file in loaded), Path()), data_files(loaded)
+    sources = source_files(task)
+    folder, data = next((file.parent for file in sources), Path()), data_files(sources)
     large = sum(path.stat().st_size for path in data) > _LARGEST
-    copies: Files = {}
-    uncopied: dict[str, list[Path]] = {}
+    reasons = {}
     for path, stamp in data.items():
         if folder not in path.parents:
             reason = f"move it into {folder}, and read it by a path that starts with Path(__file__).parent"
         elif stamps([path]) != {path: stamp}:
             reason = "it has changed since it was read, so make a new environment"
-        elif large:
-            reason = f"the data files are larger than {_LARGEST // 2**20} MiB"
         else:
-            copies[path] = path
-            continue
-        uncopied.setdefault(reason, []).append(path)
-    return copies, uncopied
+            reason = f"the data files are larger than {_LARGEST // 2**20} MiB" if large else ""
+        reasons[path] = reason
+    return reasons
 
 
 def note_uncopied_data(env: Env) -> None:
     """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
-    for reason, (path, *others) in _data_copies(env.task.task)[1].items():
+    reasons = _data_files(env.task.task)
+    for reason in filter(None, dict.fromkeys(reasons.values())):
+        path, *others = (path for path in reasons if reasons[path] == reason)
         more = f" and of {len(others)} more files" if others else ""
         log.warning("the run has no copy of %s%s, which the task %r reads: %s", path, more, env.task.name, reason)
 
@@ -162,67 +163,75 @@ def run_env(
     """Make an environment for a run's task, or for another given task.
 
     If a file or a model has been moved or changed since the run started, the run's copy is used, and a warning is
-    logged. Tasks of the package are used in their current version. With ``trust``, the task is executed and files are
-    read even if this user did not make the run on this machine.
+    logged. Tasks of the package are used in their current version. The run's code is executed only if this user has
+    run it on this machine before, if ``task`` names it, or with ``trust``.
 
     Raises:
-        ValueError: The task does not fit the run, or the run is not trusted.
+        ValueError: The task does not fit the run, or the run's code is not trusted.
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
-    kept, chosen = run.config.get("kept", {}), run.config["task"]
-    saved, tables = run.config["params"], (run.task_folder / TABLES).absolute()
-    read: list[str | Path] = [
-        value for name, value in params.items()
-        if is_table(value) and (value is saved.get(name) or tables in Path(value).absolute().parents)
-    ]  # fmt: skip
+    kept = run.config.get("kept", {})
     _note_tables(run, params, "the run's own copy is used, {}", copies=True)
-    read += [options.model] if isinstance(options.model, str) else []
-    if task is not None:
-        if read:
-            check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
+    if task is None:
+        task = _run_task(run, trust=trust)
+    elif "file" in kept and Path(task.partition(":")[0]).resolve() == (run.task_folder / kept["file"]).resolve():
+        remember(run.folder, run.config)
+    else:
         return Env(task, options, **params)
-    if chosen is None or kept.get("program"):
-        where = "a notebook" if chosen is None else chosen.partition(":")[0]
-        raise ValueError(
-            f"the run in {run.folder} was started by {where}, which also defines its task {run.task_name!r}: pass a "
-            "file that only defines the task (eval --task my_task.py, train my_task.py --from), or resume the run in "
-            "that program (resume=True)"
-        )
-    path, colon, attribute = chosen.partition(":")
-    copy = run.task_folder / kept.get("file", "")
-    read += [run.task_folder / kept["model"]] if "model" in kept else []
-    if copy.is_file() or path not in package_task_names():
-        check_trust(run.folder, run.config, copy if copy.is_file() else path, runs=True, trust=trust)
-    elif read:
-        check_trust(run.folder, run.config, read[0], runs=False, trust=trust)
-    if copy.is_file() and (changes := _source_changes(Path(path), kept)):
-        new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
-        log.warning("%s: the run's own copy is used, %s%s", changes[0], copy, new)
-        chosen = f"{copy}{colon}{attribute}"
     copy = run.task_folder / kept.get("model", "")
     if not copy.is_file():
-        return Env(chosen, options, **params)
-    if kept.get("model_given") and not isinstance(options.model, str):  # the run's model was made in Python
-        return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
-    try:
-        env = Env(chosen, options, **params)
-        if not _model_changed(run, env):
-            return env
+        return Env(task, options, **params)
+    if not kept.get("model_given") or isinstance(options.model, str):
         reason = "has changed since the run began"
-    except FileNotFoundError:
-        reason = "is no longer where it was"
-    log.warning("the model of the task %r %s: the run's own copy is used, %s", run.task_name, reason, copy)
-    return Env(chosen, options.changed({"model": read_spec(copy)}), **params)
+        try:
+            env = Env(task, options, **params)
+            if not _model_changed(run, env):
+                return env
+        except FileNotFoundError:
+            reason = "is no longer where it was"
+        log.warning("the model of the task %r %s: the run's own copy is used, %s", run.task_name, reason, copy)
+    return Env(task, options.changed({"model": read_spec(copy)}), **params)
 
 
-def _source_changes(file: Path, kept: Mapping[str, Any], loaded: Mapping[Path, bytes] | None = None) -> list[str]:
+def _run_task(run: Run, *, trust: bool) -> str:
+    """Return the name of a run's task, its file, or the run's copy of the file if the file has moved or changed."""
+    kept, task = run.config.get("kept", {}), run.config["task"]
+    if task is None or kept.get("program"):
+        program = "a notebook" if task is None else task.partition(":")[0]
+        raise ValueError(
+            f"the run in {run.folder} was started by {program}, which also defines its task {run.task_name!r}: pass a "
+            "file that only defines the task (eval --task my_task.py, train my_task.py --from), or resume the run in "
+            "that program (lw.train(learner, lw.Run.open(folder), iterations))"
+        )
+    path, colon, attribute = task.partition(":")
+    if path in package_task_names():
+        return str(task)
+    copy = run.task_folder / kept.get("file", "")
+    code = copy if copy.is_file() else path
+    if not (trust or is_trusted(run.folder, run.config)):
+        raise ValueError(
+            f"{run.folder / 'config.json'} names the task {task}, whose code you have not run on this machine: read "
+            f"{code}, and then name it as the task (eval --task {code}, train {code} --resume {run.folder})"
+        )
+    if not copy.is_file() or not (changes := _source_changes(Path(path), kept)):
+        return str(task)
+    new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
+    log.warning("%s: the run's own copy is used, %s%s", changes[0], copy, new)
+    return f"{copy}{colon}{attribute}"
+
+
+def _source_changes(file: Path, kept: Mapping[str, Any], sources: Mapping[Path, bytes] | None = None) -> list[str]:
+    """Describe the changes of a task's file and of the files that it uses since a run began.
+
+    ``sources`` has the code that was loaded, which may have changed since then.
+    """
     changes = []
-    for name, hashed in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
+    for name, digest in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
         path = file.parent / name
-        content = (loaded or {}).get(path)
+        content = (sources or {}).get(path)
         if content is None and not path.is_file():
             changes.append(f"{path} does not exist any more")
-        elif hashed not in (None, _digest(path if content is None else content)):
+        elif digest not in (None, _digest(path if content is None else content)):
             changes.append(f"{path} has changed since the run began")
     return changes
 
@@ -232,11 +241,11 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
 
     The compiled model depends on the physics. Set ``model`` to False if the physics differ on purpose.
     """
-    kept, loaded = run.config.get("kept", {}), source_files(env.task.task)
-    file = next(iter(loaded), None)
-    # if the task's file is the training script, a change may have nothing to do with the task
-    hashed = None if kept.get("program") else kept.get("source_hash")
-    for change in _source_changes(file, {**kept, "source_hash": hashed}, loaded) if file is not None else ():
+    kept, sources = run.config.get("kept", {}), source_files(env.task.task)
+    file = next(iter(sources), None)
+    if kept.get("program"):  # a change of the training script may have nothing to do with the task
+        kept = {**kept, "source_hash": None}
+    for change in _source_changes(file, kept, sources) if file is not None else ():
         log.warning("%s", f"{change}: the new version is used" if "changed" in change else change)
     _note_tables(run, env.given_params, "the new version is used", copies=False)
     if model and _model_changed(run, env):
@@ -248,9 +257,9 @@ def _model_changed(run: Run, env: Env) -> bool:
 
     With another version of MuJoCo, the result is False, because a new version may compile the model differently.
     """
-    known, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
+    digest, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
-    return same_version and known not in (None, _model_hash(env))
+    return same_version and digest not in (None, _model_hash(env))
 
 
 def _digest(content: bytes | Path) -> str:
@@ -260,25 +269,25 @@ def _digest(content: bytes | Path) -> str:
 
 def _model_hash(env: Env) -> str:
     """Hash the compiled model, except for fields with paths."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for owner in (env.task.model, env.task.model.opt):
         for name in sorted(dir(owner)):
             if name.startswith("_") or name.endswith("pathadr") or name in ("paths", "npaths", "nbuffer"):
                 continue
             value = getattr(owner, name)
             if isinstance(value, np.ndarray):
-                found.update(name.encode() + np.ascontiguousarray(value).tobytes())
+                digest.update(name.encode() + np.ascontiguousarray(value).tobytes())
             elif isinstance(value, bytes | int | float):
-                found.update(f"{name}{value!r}".encode())
-    return found.hexdigest()[:16]
+                digest.update(f"{name}{value!r}".encode())
+    return digest.hexdigest()[:16]
 
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:
     """Get the main file and all files of a task's model. A model made in Python is written as MJCF."""
-    task, given = env.task.task, env.options.model
-    source = given if given is not None else task.model
+    task, model = env.task.task, env.options.model
+    source = task.model if model is None else model
     if isinstance(source, str | Path):
-        source = find_model(source, None if given is not None else task)
+        source = find_model(source, task if model is None else None)
     if isinstance(source, ModelFile):
         source = source.path()
     if isinstance(source, Path):
@@ -313,9 +322,9 @@ def _dependencies(source: Path) -> list[Path]:
 
 
 def _spec_dependencies(spec: mujoco.MjSpec, folder: Path) -> list[Path]:
-    parts = (*spec.meshes, *spec.hfields, *spec.skins)
-    names = [Path(spec.meshdir, part.file) for part in parts if part.file]
+    assets = (*spec.meshes, *spec.hfields, *spec.skins)
+    names = [Path(spec.meshdir, asset.file) for asset in assets if asset.file]
     for texture in spec.textures:
         names += [Path(spec.texturedir, name) for name in (texture.file, *texture.cubefiles) if name]
-    found = dict.fromkeys(Path(os.path.normpath(folder / name)) for name in names)
-    return [path for path in found if path.is_file()]
+    paths = dict.fromkeys(Path(os.path.normpath(folder / name)) for name in names)
+    return [path for path in paths if path.is_file()]

@@ -151,10 +151,10 @@ def test_rare_extreme_observation_of_one_world_leaves_the_scales_of_all(
 
 def test_policy_that_is_not_gaussian_is_saved_and_exported(env: lw.Env, tmp_path: Path) -> None:
     drift, shown = Drift(env), []
-    run = lw.train(drift, tmp_path / "run", iterations=2, callback=shown.append, display=Display(console))
+    run = lw.train(drift, tmp_path / "run", 2, callbacks=[shown.append, Display(console)])
     assert len(shown) == 2 and len(list(curve_table(run.rows()).columns)) == 2
     assert run.config["drift"] == {"size": 0.1} and Run.open(run.folder).best_score() is None
-    again = lw.train(Drift(env), run.folder, iterations=4, resume=True)
+    again = lw.train(Drift(env), run, 4)
     assert [row["iteration"] for row in again.rows()] == [1, 2, 3, 4]
     assert lw.evaluate(env, drift.policy, 2).lengths.tolist() == [256.0, 256.0]
     path = lw.export_policy(drift.policy, tmp_path / "policy.pt2")

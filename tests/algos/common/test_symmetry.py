@@ -34,7 +34,7 @@ def asymmetry(policy: Callable[[torch.Tensor], torch.Tensor], env: lw.Env) -> fl
 def test_symmetric_policy_is_equivariant_before_and_after_loading(env: lw.Env, tmp_path: Path) -> None:
     """The normaliser's statistics are not symmetric, but the policy is."""
     ppo = learner(env, "exact")
-    run = lw.train(ppo, tmp_path / "run", iterations=2)
+    run = lw.train(ppo, tmp_path / "run", 2)
     policy = lw.load(run)
     assert policy.normalizer.shift[1].abs() > 1e-3
     assert asymmetry(ppo.policy, env) == asymmetry(policy, env) == 0.0
@@ -121,7 +121,7 @@ def test_symmetric_policies_stay_symmetric_under_sac(symmetry: str, env: lw.Env,
     env.rand_reset(1)
     sac = lw.SAC(env, config=config, seed=1)
     before = asymmetry(sac.policy.act, env)
-    policy = lw.load(lw.train(sac, tmp_path / "run", iterations=2))
+    policy = lw.load(lw.train(sac, tmp_path / "run", 2))
     assert asymmetry(policy.act, env) == asymmetry(sac.policy.act, env)
     if symmetry == "exact":
         # the scaling of actions causes rounding errors

@@ -14,7 +14,7 @@ from lyceum_warp.training.runs.configuration import describe
 
 BASE = {
     "algorithm": "npg", "task": "hopper", "engine": "auto", "device": "cpu", "nworld": 3, "seed": 2, "threads": 1,
-    "params": {"ctrl_cost_weight": 2}, "npg": {"hidden": [8]},
+    "params": {"ctrl_cost_weight": 2}, "physics": {}, "options": {}, "npg": {"hidden": [8]},
 }  # fmt: skip
 
 
@@ -41,10 +41,9 @@ def test_learner_is_recreated_from_its_configuration(kind: str) -> None:
 @pytest.mark.parametrize(
     ("saved", "options"),
     [
-        (None, PhysicsOptions()),  # the run was made before this option existed
-        ({"integrator": None, "solver": {}, "deterministic": False, "unroll": False}, PhysicsOptions()),
+        ({"integrator": None, "solver": {}, "deterministic": False}, PhysicsOptions()),
         (
-            {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True, "unroll": False},
+            {"integrator": "euler", "solver": {"iterations": 7}, "deterministic": True},
             PhysicsOptions(integrator="euler", solver={"iterations": 7}, deterministic=True),
         ),
         ({"solver": None, "njmax": 30}, PhysicsOptions(njmax=30)),
@@ -52,20 +51,10 @@ def test_learner_is_recreated_from_its_configuration(kind: str) -> None:
 )
 def test_physics_of_a_run_are_read_from_its_configuration(saved: dict[str, object], options: PhysicsOptions) -> None:
     for physics in (saved, options.given()):
-        found = read(BASE if physics is None else BASE | {"physics": physics})
-        assert found.options == EnvOptions(device="cpu", nworld=3, seed=2, physics=options)
-        assert found.params == {"ctrl_cost_weight": 2}
-        assert found.hyperparameters == lw.NPGConfig(hidden=(8,))
-
-
-def test_options_in_params_of_an_old_configuration_are_read_as_options() -> None:
-    params = {"mass": 2, "horizon": 9, "nthread": 2, "frame_skip": 3, "graphs": False}
-    found = read(BASE | {"engine": "warp", "device": "cuda:0", "params": params, "options": {"horizon": 5}})
-    assert found.params == {"mass": 2}
-    assert found.options.given() == {
-        "engine": "warp", "device": "cuda:0", "horizon": 9, "nthread": 2, "graphs": False, "frame_skip": 3,
-        "nworld": 3, "seed": 2,
-    }  # fmt: skip
+        configuration = read(BASE | {"physics": physics})
+        assert configuration.options == EnvOptions(device="cpu", nworld=3, seed=2, physics=options)
+        assert configuration.params == {"ctrl_cost_weight": 2}
+        assert configuration.hyperparameters == lw.NPGConfig(hidden=(8,))
 
 
 def test_processes_on_one_machine_share_its_cores(monkeypatch: pytest.MonkeyPatch) -> None:

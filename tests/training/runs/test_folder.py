@@ -155,7 +155,7 @@ def test_path_without_a_run_names_what_is_there(
 
 
 def test_error_of_an_invalid_setting_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", iterations=1)
+    run = lw.train(algorithm(lw.make("point_mass", nworld=2)), tmp_path / "run", 1)
     run.amend(engine="x")
     assert cli.main(["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]) == 2
     refused(capsys, "'x'", f"with the settings in {run.folder / 'config.json'}")

@@ -51,7 +51,7 @@ def test_run_of_another_process_is_resumed_only_with_take_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"
-    lw.train(algorithm(lw.make("point_mass", nworld=2)), run, iterations=2)
+    lw.train(algorithm(lw.make("point_mass", nworld=2)), run, 2)
     with locked(run) as process:
         before = {path: path.read_bytes() for path in run.iterdir()}
         capsys.readouterr()
@@ -59,7 +59,7 @@ def test_run_of_another_process_is_resumed_only_with_take_over(
         refused(capsys, f"is being written by {process}", "--take-over")
         npg = algorithm(lw.make("point_mass", nworld=2))
         with pytest.raises(ValueError, match=f"is being written by {process}"):
-            lw.train(npg, run, iterations=4, resume=True)
+            lw.train(npg, lw.Run.open(run), 4)
         assert before == {path: path.read_bytes() for path in run.iterdir()}
         assert cli.main(["train", "--resume", str(run), "--iterations", "4", "--take-over", *QUIET]) == 0
     assert len(metrics(run)) == 4 and not (run / "lock").exists()
@@ -95,7 +95,7 @@ def test_writer_stops_writing_after_its_lock_was_taken_over(tmp_path: Path) -> N
 
     with contextlib.ExitStack() as taker:
         with pytest.raises(ValueError, match=f"the run in {folder} was taken over by process {os.getpid()} on "):
-            lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, save_every=1, callback=callback)
+            lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 6, save_every=1, callbacks=[callback])
         assert found == {path: path.read_bytes() for path in folder.rglob("*.*")}
         assert (folder / "lock").exists()
     assert not (folder / "lock").exists()

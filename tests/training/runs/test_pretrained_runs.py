@@ -23,7 +23,7 @@ def test_pretrained_policy_matches_its_task_and_reaches_its_return(task: str) ->
         pytest.importorskip("dm_control", reason="dm_control brings the models")
     run = Run.open(pretrained_run(task))
     first = run.config["evaluated"]["first_steps"]
-    env = run_worlds(run, {}, {}, nworld=first["worlds"], task=None, trust=False)
+    env = run_worlds(run, {}, {}, nworld=first["worlds"])
     policy = load(run)
     check_sizes(policy, env)
     env.rand_reset(run.config["evaluated"]["seed"])

@@ -28,7 +28,7 @@ def numbers(folder: Path) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
     folder = tmp_path_factory.mktemp("whole") / "run"
-    lw.train(made(), folder, iterations=5)
+    lw.train(made(), folder, 5)
     return numbers(folder)
 
 
@@ -55,8 +55,8 @@ def test_run_continues_identically_after_a_save_was_killed_at_any_point(
 
     with pytest.raises(Killed), pytest.MonkeyPatch.context() as patched:
         patched.setattr(owner, name, killed)
-        lw.train(sac, tmp_path / "run", iterations=5, save_every=1)
-    lw.train(made(), tmp_path / "run", iterations=5, resume=True, save_every=1)
+        lw.train(sac, tmp_path / "run", 5, save_every=1)
+    lw.train(made(), Run.open(tmp_path / "run"), 5, save_every=1)
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
     assert len(list((tmp_path / "run" / "replay").iterdir())) == 20
 
@@ -69,11 +69,11 @@ def test_an_interrupted_run_continues_identically(whole: list[dict[str, Any]], t
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # child processes of a shell may ignore SIGINT
     try:
         with pytest.raises(KeyboardInterrupt):
-            lw.train(made(), tmp_path / "run", iterations=5, callback=interrupting)
+            lw.train(made(), tmp_path / "run", 5, callbacks=[interrupting])
     finally:
         signal.signal(signal.SIGINT, before)
     assert Run.open(tmp_path / "run").read()["iteration"] == 3
-    lw.train(made(), tmp_path / "run", iterations=5, resume=True)
+    lw.train(made(), Run.open(tmp_path / "run"), 5)
     np.testing.assert_equal(numbers(tmp_path / "run"), whole)
 
 
@@ -89,11 +89,11 @@ def test_save_writes_only_files_of_the_buffer_that_have_grown(
 
     monkeypatch.setattr(replay_files, "write_content", noted)
     folder = tmp_path / "run"
-    lw.train(made(replay=800), folder, iterations=2, save_every=1)
+    lw.train(made(replay=800), folder, 2, save_every=1)
     ends = [int(name.rpartition("-")[2]) for name in written]
     assert ends == [4, 8, 12, 16, 20, 24]
     (folder / "checkpoint.pt").write_bytes(b"")  # after a power loss, only previous.pt remains
-    lw.train(made(replay=800), folder, iterations=3, resume=True, save_every=1)
+    lw.train(made(replay=800), Run.open(folder), 3, save_every=1)
     assert "previous.pt, of iteration 1, is used instead" in caplog.text
-    lw.train(made(replay=800), tmp_path / "other", iterations=3)
+    lw.train(made(replay=800), tmp_path / "other", 3)
     np.testing.assert_equal(numbers(folder), numbers(tmp_path / "other"))

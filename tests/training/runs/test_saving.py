@@ -51,7 +51,7 @@ def test_run_ends_with_its_last_save_intact_if_a_file_cannot_be_written(six: Pat
 
     try:
         with pytest.raises(OSError) as raised:
-            lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, iterations=6, callback=limit, save_every=2)
+            lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 6, callbacks=[limit], save_every=2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     error = raised.value
@@ -71,11 +71,10 @@ def test_command_prints_one_line_if_the_folder_cannot_be_written(
     refused(capsys, f"{tmp_path / 'file'}", "Not a directory")
     folder, write = tmp_path / "run", Saver.write
 
-    def deleting(saver: Saver, iteration: lw.Iteration) -> float | None:
-        score = write(saver, iteration)
+    def deleting(saver: Saver, iteration: lw.Iteration) -> None:
+        write(saver, iteration)
         if iteration.iteration == 2:
             shutil.rmtree(folder)
-        return score
 
     monkeypatch.setattr(Saver, "write", deleting)
     assert cli.main([*arguments, "--out", str(folder), *QUIET, "--save-every", "100"]) == 2

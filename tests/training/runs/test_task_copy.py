@@ -16,7 +16,7 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.env import Env
 from lyceum_warp.training import Configuration, Run, run_env, task_copy
 
-TASK = Path(__file__).parents[2] / "data" / "runs_0_1" / "task_file" / "task"
+TASK = Path(__file__).parents[2] / "data" / "runs_0_2" / "task_file" / "task"
 SOURCE, SCENE, PART = ((TASK / name).read_text() for name in ("slide.py", "robot/scene.xml", "robot/parts/block.xml"))
 
 SMALL = lw.NPGConfig(samples=40, hidden=(4,), value_hidden=(4,), mean_every=1, mean_episodes=2)
@@ -162,7 +162,7 @@ def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytes
     spec = lw.gymnasium_model("hopper.xml").spec()
     spec.option.gravity = [0.0, 0.0, -30.0]
     env = lw.make("hopper", nworld=2, model=spec, horizon=20)
-    lw.train(lw.NPG(env, config=SMALL), tmp_path / "run", iterations=1)
+    lw.train(lw.NPG(env, config=SMALL), tmp_path / "run", 1)
     before = returns(capsys, str(tmp_path / "run"))
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2", "--task", "hopper"]) == 0
     assert before not in capsys.readouterr().out
@@ -172,18 +172,18 @@ def test_run_saves_a_model_that_was_made_in_python(tmp_path: Path, capsys: pytes
 def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     file, table, out = folder / "mine" / "slide.py", folder / "mine" / "goal.npy", folder / "run"
 
-    def train(iterations: int, **words: Any) -> None:
+    def train(run: Path | Run, iterations: int) -> None:
         env = lw.make(str(file), nworld=2, goal=table, horizon=10)
-        lw.train(lw.NPG(env, config=SMALL), out, iterations=iterations, **words)
+        lw.train(lw.NPG(env, config=SMALL), run, iterations)
 
-    train(1)
+    train(out, 1)
     assert Run.open(out).config["params"] == {"goal": str(table)}
-    train(2, resume=True)
+    train(Run.open(out), 2)
     assert not caplog.messages
     part = folder / "mine" / "robot" / "parts" / "block.xml"
     part.write_text(PART.replace('type="slide"', 'type="slide" damping="9"'))
     file.write_text(SOURCE.replace("-wp.abs(", "7.0 - wp.abs("))
-    train(3, resume=True)
+    train(Run.open(out), 3)
     changed = "has changed since the run began: the new version is used"
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
 
@@ -208,20 +208,20 @@ def test_relative_path_of_a_table_does_not_depend_on_the_working_directory(
 ) -> None:
     monkeypatch.chdir(folder / "mine")
     env = lw.make("slide.py", nworld=2, goal="goal.npy", horizon=10)
-    lw.train(lw.NPG(env, config=SMALL), folder / "run", iterations=1)
+    lw.train(lw.NPG(env, config=SMALL), folder / "run", 1)
     monkeypatch.chdir(folder)
     np.save("goal.npy", np.array([9.0, 0.4]))
     assert np.allclose(env_of(folder / "run").task.params["goal"], [0.3, 0.4]) and not caplog.messages
     monkeypatch.chdir(folder / "mine")
     np.save("goal.npy", np.array([9.0, 0.4]))
     env = lw.make("slide.py", nworld=2, goal="goal.npy", horizon=10)
-    lw.train(lw.NPG(env, config=SMALL), folder / "run", iterations=2, resume=True)
+    lw.train(lw.NPG(env, config=SMALL), Run.open(folder / "run"), 2)
     (message,) = caplog.messages
     assert message == f"{folder / 'mine' / 'goal.npy'} has changed since the run began: the new version is used"
 
 
 def test_eval_of_a_run_from_a_notebook_needs_a_given_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", iterations=1)
+    lw.train(lw.NPG(lw.make("point_mass", nworld=2), config=SMALL), tmp_path / "run", 1)
     Run.open(tmp_path / "run").amend(task=None)
     assert cli.main(["eval", str(tmp_path / "run")]) == 2
     refused(
@@ -271,7 +271,7 @@ def test_a_run_copies_the_source_that_it_started_with(folder: Path) -> None:
                 env.replicate(nworld=1).step()
 
         edit()
-        lw.train(lw.NPG(env, config=SMALL), folder / name, iterations=len(EDITS) - 1, callback=edit)
+        lw.train(lw.NPG(env, config=SMALL), folder / name, len(EDITS) - 1, callbacks=[edit])
         for file, text in original.items():
             assert (folder / name / "task" / file.name).read_text() == text
         return metrics(folder / name)
@@ -365,7 +365,7 @@ def test_run_names_data_that_it_cannot_copy(
     env = lw.make(str(mine / "slide.py"), nworld=2)
     if where == "changed":
         np.save(path, 3)
-    lw.train(lw.NPG(env, config=SMALL), reading / "run", iterations=1)
+    lw.train(lw.NPG(env, config=SMALL), reading / "run", 1)
     (message,) = caplog.messages
     assert message.startswith(f"the run has no copy of {path}, which the task 'slide' reads: ")
     assert {file.name for file in (reading / "run" / "task").rglob("*") if file.is_file()} >= {"offset.csv"}

@@ -1,0 +1,194 @@
+"""Run code beside training: stopping rules, videos and the transfer test."""
+
+import functools
+import json
+import logging
+import math
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from lyceum_warp.algos import EXACT, Iteration, Learner, evaluation_seed, task_physics, transfer
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.validate import check_flag, positive_number, whole_number
+from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.viz import CameraChoice, NamedProgress, check_video, find_camera, one_line, policy_video
+
+log = logging.getLogger(__name__)
+
+
+@document_attributes
+class Callback:
+    """Base class of callbacks for ``lw.train``. Every method is optional.
+
+    A function of the iteration is a callback, too. With several processes, only rank 0 calls callbacks.
+
+    Example:
+        >>> class Log(lw.Callback):
+        ...     def begin(self, run, learner, iterations):
+        ...         self.file = (run.folder / "log.txt").open("a")
+        ...
+        ...     def __call__(self, iteration):
+        ...         print(iteration.iteration, iteration.return_mean, file=self.file)
+        ...
+        ...     def close(self):
+        ...         self.file.close()
+    """
+
+    settings: Mapping[str, Any] = {}
+    """Entries for the run's config.json, as JSON values."""
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Prepare for training up to a number of iterations. A resumed learner has the state of the checkpoint.
+
+        If this method raises an error, training does not begin: a new run's folder is deleted, and a resumed run stays
+        as it was.
+        """
+
+    def __call__(self, iteration: Iteration) -> object:
+        """Handle an iteration, whose row is already in metrics.csv. Training ends if the result is True.
+
+        If this method raises an error, the run is saved, and the error is raised again.
+        """
+
+    def end(self, run: Run, learner: Learner) -> None:
+        """Finish after the last iteration. This method is not called after an error or a signal."""
+
+    def close(self) -> None:
+        """Release what ``begin`` has opened. This method is called last, even after an error."""
+
+
+class TargetReturn(Callback):
+    """Ends training when the return that selects the best policy reaches a number.
+
+    The iteration and the return are stored in config.json. A later call of ``lw.train`` needs a larger number.
+
+    Raises:
+        ValueError: ``target`` is not a number, or the run has already reached it.
+    """
+
+    def __init__(self, target: float) -> None:
+        if not isinstance(target, int | float) or math.isnan(target):
+            raise ValueError(f"target must be a number, not {target!r}")
+        self.target = float(target)
+        self.settings = {"target_return": self.target}
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Check that the run has not reached the target."""
+        self._run, self._name = run, learner.best_by
+        reached = run.config.get("reached")
+        if reached is not None and reached["return"] >= self.target:
+            raise ValueError(
+                f"the run in {run.folder} is finished, because its return reached {reached['return']:.6g} in iteration "
+                f"{reached['iteration']}: use a larger target return, or inf for none"
+            )
+
+    def __call__(self, iteration: Iteration) -> bool:
+        """Compare an iteration's return with the target."""
+        score = getattr(iteration, self._name)
+        if score is None or math.isnan(score) or score < self.target:
+            return False
+        self._run.amend(reached={"iteration": iteration.iteration, "return": score})
+        return True
+
+
+class Minutes(Callback):
+    """Ends training before an iteration that would probably exceed a time limit.
+
+    An iteration is expected to take as long as the longest one so far, not counting the first one, which may compile
+    kernels. The first iteration always runs. Pass this callback last, so that it counts the time of all others.
+
+    Raises:
+        ValueError: ``minutes`` is not a positive number.
+    """
+
+    def __init__(self, minutes: float) -> None:
+        self.limit = 60 * positive_number("minutes", minutes, "minutes")
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Start the clock."""
+        self._start = self._now = time.monotonic()
+        self._longest = 0.0
+        self._second = learner.iteration + 2
+
+    def __call__(self, iteration: Iteration) -> bool:
+        """Compare the time at the end of the next iteration with the limit."""
+        before, self._now = self._now, time.monotonic()
+        seconds = self._now - before
+        self._longest = seconds if iteration.iteration <= self._second else max(seconds, self._longest)
+        return self._now + self._longest > self._start + self.limit
+
+
+class Videos(Callback):
+    """Writes a video of the policy every few iterations, such as ``videos/000100.mp4`` in the run's folder.
+
+    If a video fails, a warning is logged, and training continues without videos.
+
+    Args:
+        every: Iterations between videos.
+        camera: The name or index of a camera in the model, a ``lyceum_warp.viz.FreeCamera``, or "free" for MuJoCo's
+            default camera.
+        progress: Called with a description of the work, its unit, the units done so far and their total number.
+
+    Raises:
+        ValueError: ``every`` is not a positive number, or the model has no such camera.
+        NoVideoError: Videos need the extra ``viz``.
+    """
+
+    def __init__(self, every: int, *, camera: CameraChoice = None, progress: NamedProgress | None = None) -> None:
+        check_video()
+        self.every, self.camera, self.progress = whole_number("every", every, low=1), camera, progress
+        self.settings = {"video_every": self.every}
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Check that the model has the camera."""
+        find_camera(learner.env.model, self.camera)
+        self._folder, self._learner, self._failed = run.folder / "videos", learner, False
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Write a video after an iteration, if one is due."""
+        if self._failed or iteration.iteration % self.every:
+            return
+        env, path = self._learner.env, self._folder / f"{iteration.iteration:06d}.mp4"
+        seed = evaluation_seed(env.options.seed + 1)
+        try:
+            policy_video(env, self._learner.policy, path, seed, camera=self.camera, progress=self.progress)
+        except Exception as error:  # an error of any kind must not end the training
+            log.warning("no further videos (%s)", one_line(error))
+            self._failed = True
+
+
+class TransferTest(Callback):
+    """Runs ``lw.transfer`` on 64 pairs of episodes at the end of training, and writes the run's ``transfer.json``.
+
+    By default, only quick comparisons are made. After training on a GPU, the policy's results on the Warp engine are
+    compared with those on the C engine. After training with physics other than "exact", they are compared with those
+    in "exact" physics. If the test fails, a warning is logged.
+
+    Args:
+        slow: Whether to compare the two engines and all physics options of the task in any case.
+        progress: As in ``Videos``.
+    """
+
+    def __init__(self, *, slow: bool = False, progress: NamedProgress | None = None) -> None:
+        check_flag("slow", slow)
+        self.slow, self.progress = slow, progress
+
+    def end(self, run: Run, learner: Learner) -> None:
+        """Run the test, unless there is nothing to compare."""
+        env = learner.env
+        on_gpu = env.device.is_cuda and env.engine.name == "warp"
+        if not (self.slow or on_gpu or task_physics(env)[1] != EXACT):
+            return
+        progress = self.progress and functools.partial(self.progress, "judging the policy's transfer", "steps")
+        try:
+            verdict = transfer(
+                env, learner.policy, 64, seed=env.options.seed + 1, warp=on_gpu or self.slow, physics=self.slow,
+                progress=progress,
+            )  # fmt: skip
+        except Exception as error:  # an error must not discard the training
+            log.warning("no verdict on transfer (%s)", one_line(error))
+            return
+        with replaced(run.transfer) as temporary:
+            temporary.write_text(json.dumps({"iteration": learner.iteration, **verdict.to_dict()}, indent=2))

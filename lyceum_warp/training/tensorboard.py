@@ -1,0 +1,154 @@
+"""Write a run's curves for TensorBoard, with the extra ``tensorboard``."""
+
+import importlib.util
+import math
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.algos import Iteration, Learner
+from lyceum_warp.env import Env
+from lyceum_warp.training.callbacks import Callback
+from lyceum_warp.training.runs.folder import Run
+
+_GROUPS = {
+    "mean_": "mean_policy", "return_": "return", "value_": "value", "time_": "time", "metrics/": "metrics",
+    "step_metrics/": "Episode_Metrics",
+}  # fmt: skip
+"""Maps the prefix of a column in metrics.csv to the curve's group. mjlab also uses Episode_Metrics for means per
+step."""
+
+_TAGS = {
+    # names that rsl_rl uses
+    "return_mean": "Train/mean_reward", "length_mean": "Train/mean_episode_length", "std_mean": "Policy/mean_std",
+    "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
+    "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
+    "time_update": "Perf/learning_time",
+    # columns whose group does not follow from a prefix in _GROUPS
+    "iteration": "time/iteration", "samples": "time/samples", "samples_per_second": "time/samples_per_second",
+    "terminal_reward": "episode/terminal_reward", "eval_mean": "episode/eval",
+    "success": "episode/success", "faults": "episode/faults", "outliers": "episode/outliers",
+    "skipped_updates": "policy/skipped_updates", "reward_mean": "return/reward",
+    "explained_variance": "value/explained_variance",
+}  # fmt: skip
+"""Maps a column of metrics.csv to the curve's name."""
+
+
+class TensorBoard(Callback):
+    """Writes a run's iterations to files for TensorBoard. The horizontal axis counts iterations from 0.
+
+    Every number of an iteration becomes a curve. Curves that rsl_rl or mjlab also write have the same names, units and
+    axes, so that runs can be overlaid. These curves are in the groups Train/, Loss/, Policy/, Perf/, Episode_Metrics/
+    and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/,
+    episode/, mean_policy/, policy/, value/, time/ and metrics/.
+
+    Existing curves in the folder are continued. Values from the first new iteration on are overwritten.
+
+    Example:
+        >>> lw.train(NPG(env), "runs/mine", callbacks=[lw.TensorBoard()])
+        >>> with lw.TensorBoard("runs/own_loop") as board:
+        ...     for it in NPG(env):
+        ...         board(it)
+
+    Args:
+        folder: The folder, which need not exist. Pass this folder, or a parent folder, to ``tensorboard --logdir``.
+            ``lw.train`` replaces it by the run's folder.
+        env: The environment of the run; ``lw.train`` passes that of the learner. Episode_Reward/NAME is the sum of a
+            reward term over an episode, divided by the time limit in seconds. Episode_Termination/NAME is the mean
+            number of episodes that the function NAME ends per step of all worlds.
+
+    Raises:
+        ImportError: The package tensorboard is not installed.
+    """
+
+    settings: Mapping[str, Any] = {"tensorboard": True}
+
+    def __init__(self, folder: str | Path = ".", env: Env | None = None) -> None:
+        if importlib.util.find_spec("tensorboard") is None:
+            raise ImportError(
+                "curves for TensorBoard need the package tensorboard: pip install 'lyceum-warp[tensorboard]'"
+            )
+        self._folder = Path(folder)
+        self._terms: dict[str, tuple[str, float]] = {} if env is None else _terms(env)
+        self._file: Any = None
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Write into the run's folder."""
+        self._folder, self._terms = run.folder, _terms(learner.env)
+
+    def __enter__(self) -> "TensorBoard":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Add an iteration without its non-finite numbers. The return is NaN if no episode has ended."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        values = []
+        for column, number in (_total_fps(iteration) | iteration.row()).items():
+            if number is not None and math.isfinite(number):
+                name, scale = self._terms.get(column, (tag(column), 1.0))
+                values.append(Summary.Value(tag=name, simple_value=scale * number))
+        self._write(Summary(value=values), iteration.iteration - 1)
+
+    def close(self) -> None:
+        """Close the file. A later iteration opens a new file."""
+        if self._file is not None:
+            file, self._file = self._file, None
+            file.close()
+
+    def _write(self, summary: Any, step: int) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        if self._file is None:
+            self._open(step)
+        self._add(Event(step=step, summary=summary))
+        self._file.flush()
+
+    def _open(self, step: int) -> None:
+        """Open a file without torch's writer, whose thread would hide the error of a full disk."""
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        from torch.utils.tensorboard import RecordWriter
+
+        self._folder.mkdir(parents=True, exist_ok=True)
+        number = len(list(self._folder.glob("events.out.tfevents.*")))  # TensorBoard reads files in alphabetical order
+        name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
+        self._file = RecordWriter((self._folder / name).open("xb"))
+        self._add(Event(file_version="brain.Event:2"))
+        if number:  # this event makes TensorBoard discard the points of earlier files from `step` on
+            self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+
+    def _add(self, event: Any) -> None:
+        event.wall_time = time.time()
+        self._file.write(event.SerializeToString())
+
+
+def _terms(env: Env) -> dict[str, tuple[str, float]]:
+    """Return mjlab's names for columns, each with a factor that converts to mjlab's unit."""
+    task, seconds = env.task.task, env.horizon * env.timestep
+    rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
+    return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
+        f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld))
+        for name in (*task.terminations, *task.truncations)
+    }
+
+
+def _total_fps(iteration: Iteration) -> dict[str, float]:
+    """Compute the samples per second, excluding the time of evaluations."""
+    times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
+    seconds = sum(filter(None, times.values()))
+    return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}
+
+
+def tag(column: str) -> str:
+    """Return the name of the curve for a column of ``metrics.csv``."""
+    if column in _TAGS:
+        return _TAGS[column]
+    for beginning, group in _GROUPS.items():
+        if column.startswith(beginning):
+            return f"{group}/{column.removeprefix(beginning)}"
+    return f"policy/{column}"
