@@ -28,15 +28,15 @@ def register(task: str | Path | type[Task]) -> str:
         ValueError: The task does not exist.
         FileNotFoundError: The task file does not exist.
     """
-    known = isinstance(task, str) and task in task_names()
-    name = str(task) if known else task_name(find_task(task))
+    registered = isinstance(task, str) and task in task_names()
+    name = str(task) if registered else task_name(find_task(task))
     id = f"lyceum/{''.join(map(str.capitalize, re.split('[_/]', name)))}-v0"
     gymnasium.registry.pop(id, None)  # Gymnasium warns about an id that is registered twice
     gymnasium.register(
         id,
         entry_point="lyceum_warp.gym:GymnasiumEnv",
         vector_entry_point="lyceum_warp.gym:GymnasiumVectorEnv",
-        kwargs={"task": name if known else find_task(task)},
+        kwargs={"task": name if registered else find_task(task)},
     )
     return id
 

@@ -7,23 +7,16 @@ import torch
 
 from lyceum_warp.core import Task
 from lyceum_warp.env import Env, make
-from lyceum_warp.support.validate import whole_number
-
-_OTHER_WORDS = {"nworld": "num_envs", "autoreset": "autoreset_mode (in adapters that have it)"}
-"""The options of ``lw.make`` that adapters refuse. Each value names the argument to use instead."""
 
 
 def environment_of(
-    task: str | type[Task] | Env, num_envs: int | None, words: Mapping[str, Any], *, autoreset: bool
+    task: str | type[Task] | Env, num_envs: int | None, options: Mapping[str, Any], *, autoreset: bool
 ) -> Env:
     """Make an adapter's environment from a task, or check the given environment."""
     if not isinstance(task, Env):
-        for word in _OTHER_WORDS.keys() & words.keys():
-            raise ValueError(f"{word}= is not an argument of an adapter: use {_OTHER_WORDS[word]}")
-        return make(task, nworld=1 if num_envs is None else whole_number("num_envs", num_envs, low=1),
-                    autoreset=autoreset, **words)  # fmt: skip
-    if words:
-        raise ValueError(f"the environment already has its options: pass {', '.join(words)} to lw.make")
+        return make(task, nworld=1 if num_envs is None else num_envs, autoreset=autoreset, **options)
+    if options:
+        raise ValueError(f"the environment already has its options: pass {', '.join(options)} to lw.make")
     if num_envs not in (None, task.nworld):
         raise ValueError(f"the environment has {task.nworld} worlds, not num_envs={num_envs}: omit num_envs")
     if task.autoreset is not autoreset:

@@ -25,14 +25,14 @@ class DmEnvironment(dm_env.Environment):  # type: ignore[misc]
     Args:
         task: A task, as in ``lw.make``, or an environment with one world, made with ``autoreset=False``.
         flat_observation: Whether an observation is a dict with a single array, "observations".
-        **words: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
+        **options: Options and parameters for ``lw.make``; ``seed=0`` gives the same episodes in every run.
 
     Raises:
         FileNotFoundError: The package with the task's model is not installed.
     """
 
-    def __init__(self, task: str | type[Task] | Env, *, flat_observation: bool = False, **words: Any) -> None:
-        self._world = GymnasiumEnv(task, dict_obs=False, **words)
+    def __init__(self, task: str | type[Task] | Env, *, flat_observation: bool = False, **options: Any) -> None:
+        self._world = GymnasiumEnv(task, dict_obs=False, **options)
         self.env = self._world.env
         self._parts = {"observations": slice(None)} if flat_observation else self.env.obs_space.parts
         self._ended = True

@@ -55,7 +55,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         camera: The camera for pictures, as in ``lyceum_warp.viz.video.write_video``.
         render_size: Width and height of pictures in pixels, even numbers.
         max_episode_steps: Steps after which an episode is truncated; by default the task's horizon.
-        **words: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
+        **options: Options and parameters for ``lw.make``, such as ``device="cuda"`` or ``ctrl_cost_weight=1e-2``.
 
     Raises:
         FileNotFoundError: The package with the task's model is not installed.
@@ -74,22 +74,18 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         camera: CameraChoice = None,
         render_size: tuple[int, int] = (480, 480),
         max_episode_steps: int | None = None,
-        **words: Any,
+        **options: Any,
     ) -> None:
         if autoreset_mode is None:
-            made_without = isinstance(task, Env) and not task.autoreset
-            autoreset_mode = AutoresetMode.DISABLED if made_without else AutoresetMode.SAME_STEP
-        try:
-            self.autoreset_mode = AutoresetMode(autoreset_mode)
-        except ValueError:
-            known = ", ".join(mode.value for mode in AutoresetMode)
-            raise ValueError(f"there is no autoreset_mode {autoreset_mode!r}: use one of {known}") from None
+            disabled = isinstance(task, Env) and not task.autoreset
+            autoreset_mode = AutoresetMode.DISABLED if disabled else AutoresetMode.SAME_STEP
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"there is no render_mode {render_mode!r}: use 'rgb_array', or None for no pictures")
         if max_episode_steps is not None:
-            words["horizon"] = max_episode_steps
+            options["horizon"] = max_episode_steps
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
-        self.env = env = environment_of(task, num_envs, words, autoreset=same_step)
+        self.env = env = environment_of(task, num_envs, options, autoreset=same_step)
         self.num_envs = env.nworld
         self.render_mode = render_mode
         self.metadata = {
@@ -104,7 +100,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._torch, self._copy = torch, copy
-        self._seeded = isinstance(task, Env) or "seed" in words
+        self._seeded = isinstance(task, Env) or "seed" in options
         self._ended = env.done.clone()
         self._reset_once = False
 
@@ -127,13 +123,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             ResetNeeded: A partial reset came before the first full reset.
             ValueError: The seed is not a whole number, or an option is unknown or has the wrong shape or type.
         """
-        mask, own_seed = self._mask(options), None
+        mask = self._mask(options)
+        world_seed = None
         if seed is not None or not self._seeded:
-            drawn = self.np_random_seed if seed is None else seed
-            own_seed = whole_number("seed", drawn, low=0, high=2**128) % 2**31
+            value = self.np_random_seed if seed is None else seed
+            world_seed = whole_number("seed", value, low=0, high=2**128) % 2**31
         self._seeded = True
         super().reset(seed=seed)
-        self.env.rand_reset(own_seed, mask)
+        self.env.rand_reset(world_seed, mask)
         self._ended.copy_(self.env.done)
         self._reset_once = True
         obs, *_, infos = self._results()
@@ -210,18 +207,18 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         tables = {}
         if env.metrics:
             tables = {"metrics": torch_view(env.worlds.metrics), "episode_metrics": env.episode_metric_sums}
-        found = self._given({
-            "obs": self._shown(groups), "reward": env.reward, "terminated": env.terminated,
+        results = self._converted({
+            "obs": self._observation(groups), "reward": env.reward, "terminated": env.terminated,
             "truncated": env.truncated, "infos": infos, "tables": tables,
         })  # fmt: skip
-        for name, table in found.pop("tables").items():
-            found["infos"][name] = dict(zip(env.metrics, table.T, strict=True))
-        return tuple(found.values())
+        for name, table in results.pop("tables").items():
+            results["infos"][name] = dict(zip(env.metrics, table.T, strict=True))
+        return tuple(results.values())
 
-    def _shown(self, groups: Any) -> Any:
+    def _observation(self, groups: Any) -> Any:
         return dict(groups) if self._dict_obs else groups["policy"]
 
-    def _given(self, buffers: Any) -> Any:
+    def _converted(self, buffers: Any) -> Any:
         """Convert buffers in nested dicts to arrays or tensors for the caller."""
         if self._torch:
             return _mapped(buffers, lambda buffer: buffer.clone() if self._copy else buffer)
@@ -232,13 +229,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return _mapped(copies, torch.Tensor.numpy)
 
     def _add_final(self, infos: dict[str, Any], ended: Any) -> None:
-        final_info, last = dict(infos), self._shown(self.env.final_obs_groups)
+        final_info = dict(infos)
+        last = self._observation(self.env.final_obs_groups)
         if self._torch:
-            final_obs = self._given(last)
+            final_obs = self._converted(last)
         elif ended.any():
             (worlds,) = ended.nonzero()
             index = torch.from_numpy(worlds).to(self.device)
-            rows = self._given(_mapped(last, itemgetter(index)))
+            rows = self._converted(_mapped(last, itemgetter(index)))
             final_obs = np.full(self.num_envs, None, dtype=object)
             for i, world in enumerate(worlds):
                 final_obs[world] = _mapped(rows, itemgetter(i))
@@ -264,8 +262,8 @@ def check_array(actions: Any, shape: tuple[int, ...]) -> None:
     """Check that actions are an array of floats with the given shape."""
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind != "f":
         array = isinstance(actions, np.ndarray)
-        given = f"a {actions.dtype} array of shape {actions.shape}" if array else described(actions)
-        raise ValueError(f"actions must be a float32 array of shape {tuple(shape)}, not {given}")
+        text = f"a {actions.dtype} array of shape {actions.shape}" if array else described(actions)
+        raise ValueError(f"actions must be a float32 array of shape {tuple(shape)}, not {text}")
 
 
 def _box(space: Space) -> gymnasium.spaces.Box:

@@ -7,7 +7,6 @@ import torch
 from lyceum_warp.adapters.adapted_env import environment_of
 from lyceum_warp.core import FAULTS, Task
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import described
 
 try:
     from rsl_rl.env import VecEnv
@@ -28,7 +27,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     Args:
         task: A task, as in ``lw.make``, or an environment with automatic resets.
         num_envs: Number of worlds; by default one, or the number in the given environment.
-        words: Options and parameters, as for ``lw.make``.
+        options: Options and parameters, as for ``lw.make``.
 
     Raises:
         ImportError: rsl_rl was not installed when this module was imported.
@@ -42,8 +41,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     cfg: dict[str, Any]
     """The task, its parameters, the engine and the number of worlds, for rsl_rl's logs."""
 
-    def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **words: Any) -> None:
-        self.env = env = environment_of(task, num_envs, words, autoreset=True)
+    def __init__(self, task: str | type[Task] | Env, num_envs: int | None = None, **options: Any) -> None:
+        self.env = env = environment_of(task, num_envs, options, autoreset=True)
         self.num_envs, self.num_actions = env.nworld, env.action_space.size
         self.max_episode_length = env.horizon or 2**31 - 1
         self.device = env.obs.device
@@ -51,10 +50,8 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
             "task": env.task.name, "params": env.given_params, "engine": env.engine.name, "nworld": env.nworld,
             "physics": env.options.physics.given(), "horizon": env.horizon,
         }  # fmt: skip
-        self._obs, self._final_obs = (
-            TensorDict(groups, batch_size=[env.nworld], device=self.device)
-            for groups in (env.obs_groups, env.final_obs_groups)
-        )
+        self._obs = TensorDict(env.obs_groups, batch_size=[env.nworld], device=self.device)
+        self._final_obs = TensorDict(env.final_obs_groups, batch_size=[env.nworld], device=self.device)
         self._metrics = torch.zeros(len(env.metrics), device=self.device)
         self._episodes = torch.zeros((), device=self.device)
 
@@ -69,10 +66,6 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
     @episode_length_buf.setter
     def episode_length_buf(self, steps: torch.Tensor) -> None:
         env = self.env
-        if not isinstance(steps, torch.Tensor) or steps.shape != (env.nworld,) or steps.is_floating_point():
-            raise ValueError(
-                f"episode_length_buf must be whole numbers of shape {(env.nworld,)}, not {described(steps)}"
-            )
         if env.horizon == 0:
             raise ValueError(
                 f"episodes of {env.task.name!r} have no time limit, so they cannot begin at a random step: call "
@@ -125,7 +118,7 @@ class RslRlVecEnv(VecEnv):  # type: ignore[misc]
         if not env.metrics:
             return {}
         ended, sums = env.done.sum(), env.episode_metric_sums.masked_fill(~env.done.unsqueeze(-1), 0.0).sum(0)
-        kept = torch.minimum(self._episodes, (RECENT - ended).clamp_min(0))
-        self._episodes = kept + ended
-        self._metrics = (kept * self._metrics + sums) / self._episodes.clamp_min(1.0)
+        earlier = torch.minimum(self._episodes, (RECENT - ended).clamp_min(0))
+        self._episodes = earlier + ended
+        self._metrics = (earlier * self._metrics + sums) / self._episodes.clamp_min(1.0)
         return {f"metrics/{name}": mean for name, mean in zip(env.metrics, self._metrics.unbind(), strict=True)}

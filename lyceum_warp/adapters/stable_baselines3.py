@@ -81,19 +81,20 @@ class StableBaselines3VecEnv(VecEnv):
         obs, rewards, terminations, truncations, infos = self._worlds.step(self._actions)
         self._returns += rewards
         self._lengths += 1
-        done, listed = terminations | truncations, list[dict[str, Any]]({} for _ in range(self.num_envs))
+        done = terminations | truncations
+        dicts: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if done.any():
             final, seconds = infos["final_info"], round(time.time() - self._start, 6)
             final.pop("metrics", None)
             for world in done.nonzero()[0].tolist():
-                listed[world] = {
+                dicts[world] = {
                     "terminal_observation": infos["final_obs"][world],
                     "TimeLimit.truncated": not terminations[world],
                     "episode": {"r": self._returns[world].item(), "l": self._lengths[world].item(), "t": seconds},
                     **_of_world(final, world),
                 }
             self._returns[done], self._lengths[done] = 0.0, 0
-        return obs, rewards, done, listed
+        return obs, rewards, done, dicts
 
     def close(self) -> None:
         """End the rendering subprocess."""
@@ -117,7 +118,7 @@ class StableBaselines3VecEnv(VecEnv):
             value = parameters.values[attr_name]
             rows = list(value) if attr_name in parameters.per_world else [value] * self.num_envs
             return [rows[i] for i in self._get_indices(indices)]
-        return self._chosen(getattr(self.env if hasattr(self.env, attr_name) else self, attr_name), indices)
+        return self._values(getattr(self.env if hasattr(self.env, attr_name) else self, attr_name), indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set a parameter of the task in all worlds, or an attribute of this adapter.
@@ -134,13 +135,13 @@ class StableBaselines3VecEnv(VecEnv):
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the ``Env`` once, and return its result for each world, as ``get_attr`` does."""
-        return self._chosen(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
+        return self._values(getattr(self.env, method_name)(*method_args, **method_kwargs), indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: Any = None) -> list[bool]:
         """Return True for Monitor, because this adapter provides its statistics, and False for any other wrapper."""
-        return self._chosen(wrapper_class is Monitor, indices)
+        return self._values(wrapper_class is Monitor, indices)
 
-    def _chosen(self, value: Any, indices: Any) -> list[Any]:
+    def _values(self, value: Any, indices: Any) -> list[Any]:
         rows = per_world(value, self.num_envs)
         return [rows[i] for i in self._get_indices(indices)]
 

@@ -106,8 +106,8 @@ def train(
             else:
                 run = Run(Path(run), describe(learner) | settings)
                 if leads:
-                    kept, files = task_copy(learner.env)
-                    run = Run.create(run.folder, run.config | {"kept": kept}, files=files)
+                    manifest, files = task_copy(learner.env)
+                    run = Run.create(run.folder, run.config | {"kept": manifest}, files=files)
                     undo.callback(shutil.rmtree, run.folder, ignore_errors=True)
                     run.check = stack.enter_context(run_lock(run.folder))
                     note_uncopied_data(learner.env)
@@ -147,13 +147,13 @@ def _learn(learner: Learner, saver: Saver, iterations: int, callbacks: Sequence[
             except Exception as raised:
                 error = raised
             ended = ended or error is not None or learner.iteration >= iterations
-            numbers = max(signals, default=0), ended, error is not None, saver.due()
-            signal, last, failed, due = team.largest(*map(int, numbers))
+            failed = error is not None
+            signal, last, any_failed, due = team.largest(max(signals, default=0), ended, failed, saver.due())
             if signal or last or due:
                 saver.save()
             if error is not None:
                 raise error
-            if failed:
+            if any_failed:
                 raise SystemExit(2)
             if signal and team.size > 1:
                 raise Interrupted(signal)
@@ -195,7 +195,7 @@ def _changed_versions(run: Run) -> dict[str, Any]:
 def _check_equal(run: Run, learner: Learner) -> None:
     """Check that a learner has the settings of a run. Its device, threads and processes may differ."""
     before, after = _fixed_settings(run.config), _fixed_settings(json.loads(json.dumps(describe(learner))))
-    before["run"]["task"] = run.config.get("kept", {}).get("name", learner.env.task.name)
+    before["run"]["task"] = run.manifest.get("name", learner.env.task.name)
     after["run"]["task"] = learner.env.task.name
     for name, copy in table_copies(run).items():  # ``note_changes`` reports a changed table
         if after["params"].get(name) == str(copy):

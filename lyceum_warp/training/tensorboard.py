@@ -93,7 +93,11 @@ class TensorBoard(Callback):
             if number is not None and math.isfinite(number):
                 name, scale = self._terms.get(column, (tag(column), 1.0))
                 values.append(Summary.Value(tag=name, simple_value=scale * number))
-        self._write(Summary(value=values), iteration.iteration - 1)
+        step = iteration.iteration - 1
+        if self._file is None:
+            self._open(step)
+        self._add(step=step, summary=Summary(value=values))
+        self._file.flush()
 
     def close(self) -> None:
         """Close the file. A later iteration opens a new file."""
@@ -101,30 +105,23 @@ class TensorBoard(Callback):
             file, self._file = self._file, None
             file.close()
 
-    def _write(self, summary: Any, step: int) -> None:
-        from tensorboard.compat.proto.event_pb2 import Event
-
-        if self._file is None:
-            self._open(step)
-        self._add(Event(step=step, summary=summary))
-        self._file.flush()
-
     def _open(self, step: int) -> None:
-        """Open a file without torch's writer, whose thread would hide the error of a full disk."""
-        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+        """Open a file without torch's writer, whose thread would print a traceback if the disk is full."""
+        from tensorboard.compat.proto.event_pb2 import SessionLog
         from torch.utils.tensorboard import RecordWriter
 
         self._folder.mkdir(parents=True, exist_ok=True)
         number = len(list(self._folder.glob("events.out.tfevents.*")))  # TensorBoard reads files in alphabetical order
         name = f"events.out.tfevents.{int(time.time()):010d}.{number:04d}.{os.getpid()}"
         self._file = RecordWriter((self._folder / name).open("xb"))
-        self._add(Event(file_version="brain.Event:2"))
-        if number:  # this event makes TensorBoard discard the points of earlier files from `step` on
-            self._add(Event(step=step, session_log=SessionLog(status=SessionLog.START)))
+        self._add(file_version="brain.Event:2")
+        # this event makes TensorBoard discard the points of earlier files from `step` on
+        self._add(step=step, session_log=SessionLog(status=SessionLog.START))
 
-    def _add(self, event: Any) -> None:
-        event.wall_time = time.time()
-        self._file.write(event.SerializeToString())
+    def _add(self, **event: Any) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+
+        self._file.write(Event(wall_time=time.time(), **event).SerializeToString())
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:

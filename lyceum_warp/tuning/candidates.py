@@ -32,42 +32,41 @@ def candidates(env: Env) -> list[Setting]:
     """List the settings to try one by one."""
     option, limits = env.task.model.opt, env.options.physics.solver or {}
     cone, integrator = _name(CONES, option.cone), _name(INTEGRATORS, option.integrator)
-    found = [
+    settings = [
         Setting(f"{name}={limit}", name, {"solver": {**limits, name: limit}})
-        for name, tried in (("iterations", _ITERATIONS), ("ls_iterations", _LS_ITERATIONS))
-        for limit in tried
+        for name, lower_limits in (("iterations", _ITERATIONS), ("ls_iterations", _LS_ITERATIONS))
+        for limit in lower_limits
         if limit < getattr(option, name)
     ]
     if option.noslip_iterations:
-        found.append(Setting("noslip_iterations=0", "noslip", {"solver": {**limits, "noslip_iterations": 0}}))
-    found += [Setting(f"cone {name}", "cone", {"cone": name}) for name in CONES if name != cone]
-    others = [name for name in ("euler", "implicitfast") if name != integrator]
-    found += [Setting(name, "integrator", {"integrator": name}) for name in others]
+        settings.append(Setting("noslip_iterations=0", "noslip", {"solver": {**limits, "noslip_iterations": 0}}))
+    settings += [Setting(f"cone {name}", "cone", {"cone": name}) for name in CONES if name != cone]
+    integrators = [name for name in ("euler", "implicitfast") if name != integrator]
+    settings += [Setting(name, "integrator", {"integrator": name}) for name in integrators]
     for substeps in _fewer(env.task.frame_skip):
         timestep = float(f"{env.timestep / substeps:.10g}")
-        words = {"frame_skip": substeps, "timestep": timestep}
+        physics = {"frame_skip": substeps, "timestep": timestep}
         name = f"{substeps} x {1e3 * timestep:.4g} ms"
-        found.append(Setting(name, "substeps", words))
+        settings.append(Setting(name, "substeps", physics))
         if integrator != "implicitfast":  # implicitfast stays stable with long time steps
-            found.append(Setting(f"{name}, implicitfast", "substeps", {**words, "integrator": "implicitfast"}))
-    found += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
+            settings.append(Setting(f"{name}, implicitfast", "substeps", {**physics, "integrator": "implicitfast"}))
+    settings += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
     if cone == "elliptic" and option.impratio != 1.0:
-        found.append(Setting("impratio=1", "impratio", {"impratio": 1.0}))
-    if (room := getattr(env.engine, "nconmax", None)) is not None:
-        halves = {"nconmax": max(1, room // 2), "njmax": max(1, env.engine.njmax // 2)}  # type: ignore[attr-defined]
-        found.append(Setting("half the contacts and constraints", "room", halves))
-    return found
+        settings.append(Setting("impratio=1", "impratio", {"impratio": 1.0}))
+    if (nconmax := getattr(env.engine, "nconmax", None)) is not None:
+        halves = {"nconmax": max(1, nconmax // 2), "njmax": max(1, env.engine.njmax // 2)}  # type: ignore[attr-defined]
+        settings.append(Setting("half the contacts and constraints", "room", halves))
+    return settings
 
 
 def not_tried(env: Env) -> list[str]:
     """List the settings that the search omits on the environment's engine, each with the reason."""
-    found = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
-    if env.engine.name == "warp":
-        if env.task.model.nv > _DENSE_LIMIT:
-            found.append(f"a dense Jacobian: MuJoCo Warp supports it up to {_DENSE_LIMIT} degrees of freedom")
-    else:
-        found.append("nconmax and njmax: the C engine allocates contacts and constraints as they appear")
-    return found
+    reasons = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
+    if env.engine.name != "warp":
+        reasons.append("nconmax and njmax: the C engine allocates contacts and constraints as they appear")
+    elif env.task.model.nv > _DENSE_LIMIT:
+        reasons.append(f"a dense Jacobian: MuJoCo Warp supports it up to {_DENSE_LIMIT} degrees of freedom")
+    return reasons
 
 
 def combined(settings: Iterable[Setting]) -> Setting | None:
@@ -79,44 +78,44 @@ def combined(settings: Iterable[Setting]) -> Setting | None:
     physics: dict[str, Any] = {}
     for setting in settings:
         limits = {**setting.physics.get("solver", {}), **physics.get("solver", {})}
-        rest = {name: value for name, value in setting.physics.items() if name != "solver"}
-        if not rest.keys() & physics.keys() and setting.group not in [part.group for part in parts]:
+        options = {name: value for name, value in setting.physics.items() if name != "solver"}
+        if not options.keys() & physics.keys() and setting.group not in [part.group for part in parts]:
             parts.append(setting)
-            physics |= rest | ({"solver": limits} if limits else {})
+            physics |= options | ({"solver": limits} if limits else {})
     name = "; ".join(part.name for part in parts)
     return Setting(name, "combination", physics, tuple(parts)) if len(parts) > 1 else None
 
 
 def flags(physics: Mapping[str, Any]) -> str:
     """Write a setting as command-line flags."""
-    words = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
-    words += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
-    return " ".join(words)
+    parts = [f"--solver {name}={limit}" for name, limit in physics.get("solver", {}).items()]
+    parts += [f"--{name.replace('_', '-')} {value}" for name, value in physics.items() if name != "solver"]
+    return " ".join(parts)
 
 
 def task_line(physics: Mapping[str, Any]) -> str:
     """Write a setting as Python code for a task: the attribute ``physics`` with one entry, "fast"."""
-    words = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
-    return f'physics = {{"fast": lw.PhysicsOptions({words})}}'
+    arguments = ", ".join(f"{name}={value!r}" for name, value in physics.items()).replace("'", '"')
+    return f'physics = {{"fast": lw.PhysicsOptions({arguments})}}'
 
 
 def _name(names: Mapping[str, Any], value: int) -> str | None:
-    return next((name for name, known in names.items() if int(known) == int(value)), None)
+    return next((name for name, number in names.items() if int(number) == int(value)), None)
 
 
 def _fewer(substeps: int) -> list[int]:
-    found = []
+    numbers = []
     while substeps > 1:
         substeps = (substeps + 1) // 2
-        found.append(substeps)
-    return found
+        numbers.append(substeps)
+    return numbers
 
 
 def _other_jacobian(env: Env) -> list[str]:
     """Return the other form of the Jacobian, dense or sparse, if the engine supports it."""
     nv, engine = env.task.model.nv, env.engine.name
-    now = _name(JACOBIANS, env.task.model.opt.jacobian)
-    if now == "auto":
-        now = "sparse" if nv >= _AUTO_SPARSE.get(engine, 60) else "dense"
-    other = "dense" if now == "sparse" else "sparse"
+    jacobian = _name(JACOBIANS, env.task.model.opt.jacobian)
+    if jacobian == "auto":
+        jacobian = "sparse" if nv >= _AUTO_SPARSE.get(engine, 60) else "dense"
+    other = "dense" if jacobian == "sparse" else "sparse"
     return [] if engine == "warp" and other == "dense" and nv > _DENSE_LIMIT else [other]

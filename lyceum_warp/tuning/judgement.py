@@ -70,13 +70,13 @@ def failures(reference: np.ndarray, returns: np.ndarray) -> Difference:
     return Difference(float(second.mean() - first.mean()), low, high, len(returns))
 
 
-def episodes_needed(found: Difference, half_width: float) -> int:
+def episodes_needed(difference: Difference, half_width: float) -> int:
     """Estimate how many episodes give an interval of a given half-width.
 
     It uses only the spread of the returns, and thus does not depend on the result (Stein's two-stage procedure).
     """
-    now = (found.high - found.low) / 2
-    return found.episodes if now <= half_width else math.ceil(min(found.episodes * (now / half_width) ** 2, 1e9))
+    ratio = (difference.high - difference.low) / 2 / half_width
+    return difference.episodes if ratio <= 1.0 else math.ceil(min(difference.episodes * ratio**2, 1e9))
 
 
 def buys(speedup: float, memory: float) -> bool:
@@ -98,16 +98,16 @@ def verdict(row: Mapping[str, Any], tolerance: str) -> str:
     if row["faults_per_million"] > 2 * row["reference_faults_per_million"]:
         return "faults"
     limit = TOLERANCES[tolerance]
-    found = [Difference(**part) for name in ("returns", "clearly_worse") for part in row.get(name, {}).values()]
-    if all(part.within(limit) for part in found):
+    differences = [Difference(**part) for name in ("returns", "clearly_worse") for part in row.get(name, {}).values()]
+    if all(difference.within(limit) for difference in differences):
         return "same"
-    return "different" if any(part.beyond(limit) for part in found) else "not shown"
+    return "different" if any(difference.beyond(limit) for difference in differences) else "not shown"
 
 
 def _verdict_on_ranks(row: Mapping[str, Any], least: float) -> str:
-    found = list(row["ranks"].values())
-    if any(part["high"] < least for part in found):
+    intervals = list(row["ranks"].values())
+    if any(interval["high"] < least for interval in intervals):
         return "ranks badly"
     if row["speedup"] < LEAST_GAIN:
         return "no gain"
-    return "same" if found and all(part["low"] >= least for part in found) else "not shown"
+    return "same" if intervals and all(interval["low"] >= least for interval in intervals) else "not shown"

@@ -36,33 +36,33 @@ class Rankings:
     """
 
     def __init__(
-        self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **words: Any
+        self, task: type[Task], *, states: int, repeats: int, samples: int = _SAMPLES, seed: int = 0, **options: Any
     ) -> None:
-        self.task, self.states, self.repeats, self.seed = task, states, repeats, seed
+        self.task, self.seed = task, seed
+        self.states, self.repeats = states, repeats
         # with several iterations, each planner would adapt its samples to its own physics
-        self.words = {"iterations": 1, "seed": seed, "samples": samples, **words}
+        self.options = {"iterations": 1, "seed": seed, "samples": samples, **options}
         self.exact, self.one = self._planner({}, states), self._planner({}, 1)
         self.reference = self.exact.env
         self.starts = self._find_states()
         self._exact = {kind: self._prepared(start) for kind, start in self.starts.items()}
 
     def _planner(self, physics: Any, plants: int) -> MPPI:
-        return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.words)
+        return MPPI(self.task, physics=PhysicsOptions(**physics), plants=plants, **self.options)
 
     def _find_states(self) -> dict[str, torch.Tensor]:
         plant = self.reference.replicate(nworld=self.states, autoreset=False)
         plant.rand_reset(self.seed)
-        found = {"standing": plant.get_state()}
+        standing = plant.get_state()
         self.exact.reset(self.seed)
         every = min(_REPLAN_EVERY, self.exact.horizon)
-        moving, counts = found["standing"].clone(), torch.linspace(*_MOVING_STEPS, self.states).round()
+        moving, counts = standing.clone(), torch.linspace(*_MOVING_STEPS, self.states).round()
         for step in range(int(counts.max())):
             if step % every == 0:
                 self.exact(plant.get_state(), shift=every if step else 0)
             plant.step(self.exact.actions[step % every].reshape(plant.action.shape))
-            if (taken := counts == step + 1).any():
-                moving[taken] = plant.get_state()[taken]
-        found["moving"] = moving
+            if (due := counts == step + 1).any():
+                moving[due] = plant.get_state()[due]
         plant.rand_reset(self.seed + 1)
         draw, fallen = random_actions(plant, self.seed), torch.zeros_like(plant.done)
         for _ in range(_FALLING_STEPS):
@@ -72,8 +72,7 @@ class Rankings:
                 break
         for _ in range(_LYING_STEPS):
             plant.step(next(draw))
-        found["fallen"] = plant.get_state()
-        return found
+        return {"standing": standing, "moving": moving, "fallen": plant.get_state()}
 
     def _prepared(self, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return a plan for each state, and the returns of the samples around each plan, (states, samples)."""
@@ -99,15 +98,15 @@ class Rankings:
         times, ratios = [], []
         start = self.starts["moving"][0]
         for repeat in range(self.repeats + 1):
-            exact, own = self._seconds(self.one, start), self._seconds(one, start)
+            exact, coarse = self._seconds(self.one, start), self._seconds(one, start)
             if repeat:  # the first plans are not timed, because they load kernels
-                times.append(own)
-                ratios.append(exact / own)
+                times.append(coarse)
+                ratios.append(exact / coarse)
         row |= {"plan_ms": 1e3 * statistics.median(times), "speedup": statistics.median(ratios), "ranks": {}}
         for kind, (plan, returns) in self._exact.items():
-            found = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
-            if len(found):
-                mean, half = mean_interval(found)
+            correlations = rank_correlations(returns, self._returns(planner, self.starts[kind], plan))
+            if len(correlations):
+                mean, half = mean_interval(correlations)
                 row["ranks"][kind] = {"mean": mean, "low": max(mean - half, -1.0), "high": min(mean + half, 1.0)}
         return row
 
@@ -124,15 +123,15 @@ def rank_correlations(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
 
     A row is left out if all of its numbers in ``first`` are equal.
     """
-    a, b = (_ranks(values.double()) for values in (first, second))
-    a, b = a - a.mean(1, keepdim=True), b - b.mean(1, keepdim=True)
+    a, b = _centred_ranks(first.double()), _centred_ranks(second.double())
+    varies = a.square().sum(1) > 0
     spread = a.square().sum(1) * b.square().sum(1)
-    known = a.square().sum(1) > 0
-    found = torch.where(spread > 0, (a * b).sum(1) / spread.clamp_min(1e-300).sqrt(), 0.0)
-    return found[known].cpu().numpy()
+    correlations = torch.where(spread > 0, (a * b).sum(1) / spread.clamp_min(1e-300).sqrt(), 0.0)
+    return correlations[varies].cpu().numpy()
 
 
-def _ranks(values: torch.Tensor) -> torch.Tensor:
+def _centred_ranks(values: torch.Tensor) -> torch.Tensor:
     less = values[:, :, None] > values[:, None, :]
     equal = values[:, :, None] == values[:, None, :]
-    return less.sum(2) + equal.sum(2) / 2
+    ranks = less.sum(2) + equal.sum(2) / 2
+    return ranks - ranks.mean(1, keepdim=True)

@@ -17,14 +17,14 @@ _VERSIONS = ("lyceum_warp", "mujoco", "mujoco_warp")
 
 def identity(env: Env, **more: Any) -> dict[str, Any]:
     """Describe the conditions of a search: task, machine, worlds and versions."""
-    kept, _ = task_copy(env)
+    manifest, _ = task_copy(env)
     params = {name: json_value(name, value) for name, value in env.given_params.items()}
-    task = {"task": kept, "params": params, "physics": env.options.physics.given(), "horizon": env.horizon}
-    known = versions(env.device.alias)
+    task = {"task": manifest, "params": params, "physics": env.options.physics.given(), "horizon": env.horizon}
+    machine = versions(env.device.alias)
     return {
         "task": env.task.name, "digest": hashlib.sha256(json.dumps(task, sort_keys=True).encode()).hexdigest()[:16],
-        "engine": env.engine.name, "device": known.get("gpu") or f"{known['cpu']}, {cpu_cores()} cores",
-        "nthread": env.options.nthread, "nworld": env.nworld, **{name: known[name] for name in _VERSIONS}, **more,
+        "engine": env.engine.name, "device": machine.get("gpu") or f"{machine['cpu']}, {cpu_cores()} cores",
+        "nthread": env.options.nthread, "nworld": env.nworld, **{name: machine[name] for name in _VERSIONS}, **more,
     }  # fmt: skip
 
 
@@ -41,10 +41,10 @@ class RowFile:
         for number, line in enumerate(self._lines, 1):
             try:
                 row = json.loads(line)
-                found, key = row["identity"], _key(row["physics"])
+                row_identity, key = row["identity"], _key(row["physics"])
             except (ValueError, TypeError, KeyError):
                 raise ValueError(f"line {number} of {path} is not a result of tune: use another file") from None
-            if found == self.identity:
+            if row_identity == self.identity:
                 self._rows[key] = row
 
     def get(self, physics: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -57,8 +57,9 @@ class RowFile:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with replaced(self.path) as temporary:
             temporary.write_text("".join(f"{line}\n" for line in self._lines))
-        self._rows[_key(row["physics"])] = kept = json.loads(self._lines[-1])
-        return kept
+        stored: dict[str, Any] = json.loads(self._lines[-1])
+        self._rows[_key(row["physics"])] = stored
+        return stored
 
 
 def _key(physics: Mapping[str, Any]) -> str:

@@ -11,7 +11,7 @@ from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_kind, check_word, whole_number
+from lyceum_warp.support.validate import check_word, whole_number
 from lyceum_warp.training import Configuration, Run, load
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
 from lyceum_warp.tuning.judgement import TOLERANCES, verdict
@@ -73,7 +73,7 @@ def tune(
     out: str | Path | None = None,
     seed: int = 0,
     progress: Callable[[Row], object] | None = None,
-    **words: Any,
+    **options: Any,
 ) -> Tuning:
     """Find the fastest physics options that do not change a task's returns.
 
@@ -102,16 +102,13 @@ def tune(
             tune/TASK.jsonl, or tune/TASK-planning.jsonl.
         seed: Seed of initial states and actions.
         progress: Called with each row of results.
-        words: Options and parameters for ``lw.make``; by default 256 worlds on the CPU, and 4096 worlds on a GPU.
+        options: Options and parameters for ``lw.make``; by default 256 worlds on the CPU, and 4096 worlds on a GPU.
 
     Raises:
         ValueError: An argument is unknown or not valid, or the run belongs to a different task.
         FileNotFoundError: A model, a task or a run is missing.
     """
     check_word("tolerance", tolerance, list(TOLERANCES))
-    for name, flag in (("short", short), ("planning", planning)):
-        check_flag(name, flag)
-    check_kind("progress", progress, Callable | None, "a function")
     if episodes is not None:
         whole_number("episodes", episodes, low=1)
     kind = find_task(task)
@@ -121,29 +118,31 @@ def tune(
         if run is not None:
             raise ValueError("planning=True compares samples of the planner and uses no run: omit planning or the run")
         states, repeats = (4, 3) if short else (16, 15)
-        if "nworld" in words:
-            words["samples"] = words.pop("nworld")
-        trials = Rankings(kind, states=episodes or states, repeats=repeats, seed=seed, **words)
+        if "nworld" in options:
+            options["samples"] = options.pop("nworld")
+        trials = Rankings(kind, states=episodes or states, repeats=repeats, seed=seed, **options)
         measured["planner"] = trials.exact.settings
     else:
-        options, params = EnvOptions.split(words)
-        if "nworld" not in words:
-            options = options.changed({"nworld": GPU_NWORLD if str(options.device).startswith("cuda") else NWORLD})
-        opened = None if run is None else Run.open(run)
-        if opened is not None:
-            if opened.task_name != task_name(kind):
+        env_options, params = EnvOptions.split(options)
+        if "nworld" not in options:
+            on_gpu = str(env_options.device).startswith("cuda")
+            env_options = env_options.changed({"nworld": GPU_NWORLD if on_gpu else NWORLD})
+        env_options = env_options.changed({"autoreset": False})
+        act = digest = None
+        if run is None:
+            env = Env(kind, env_options, **params)
+        else:
+            source = Run.open(run)
+            if source.task_name != task_name(kind):
                 raise ValueError(
-                    f"{run} is a run of the task {opened.task_name!r}, not of the task {task_name(kind)!r}"
+                    f"{run} is a run of the task {source.task_name!r}, not of the task {task_name(kind)!r}"
                 )
-            params = {**Configuration.of(opened).params, **params}
-        env, policy = Env(kind, options.changed({"autoreset": False}), **params), None
-        measured["policy"] = None
-        if opened is not None:
-            policy = load(opened, which=which, device=env.obs.device)
+            env = Env(kind, env_options, **{**Configuration.of(source).params, **params})
+            policy = load(source, which=which, device=env.obs.device)
             check_sizes(policy, env, f"the policy of {run}")
-            measured["policy"] = hashlib.sha256(opened.policy_file(which).read_bytes()).hexdigest()[:16]
-        own = None if policy is None else acting(policy)
-        trials = Trials(env, own, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
+            act, digest = acting(policy), hashlib.sha256(source.policy_file(which).read_bytes()).hexdigest()[:16]
+        measured["policy"] = digest
+        trials = Trials(env, act, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
     name = f"{file_name(task_name(kind))}{'-planning' * planning}.jsonl"
     file = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
     return _search(trials, file, tolerance, progress)
@@ -160,16 +159,16 @@ def _search(
         return row
 
     reference = row_of(Setting("", "", {}))
-    tried = [(setting, row_of(setting)) for setting in candidates(trials.reference)]
-    rows = [row for _, row in tried]
-    good = sorted((one for one in tried if one[1]["verdict"] == "same"), key=lambda one: -one[1]["speedup"])
-    settings = [setting for setting, _ in good]
-    while (both := combined(settings)) is not None:
-        row = row_of(both)
-        if row["name"] == both.name:
+    pairs = [(setting, row_of(setting)) for setting in candidates(trials.reference)]
+    rows = [row for _, row in pairs]
+    pairs.sort(key=lambda pair: -pair[1].get("speedup", 0.0))
+    settings = [setting for setting, row in pairs if row["verdict"] == "same"]
+    while (combination := combined(settings)) is not None:
+        row = row_of(combination)
+        if row["name"] == combination.name:
             rows.append(row)
         if row["verdict"] == "same":
             break
-        settings = settings[: settings.index(both.parts[-1])]
+        settings = settings[: settings.index(combination.parts[-1])]
     rows.sort(key=lambda row: -row.get("speedup", 0.0))
     return Tuning(rows, reference, not_tried(trials.reference), file.path)

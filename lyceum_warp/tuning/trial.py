@@ -57,7 +57,8 @@ class Trials:
     def __init__(
         self, reference: Env, policy: Policy | None, *, effort: Effort, seed: int = 0, episodes: int | None = None
     ) -> None:
-        self.reference, self.policy, self.effort, self.seed = reference, policy, effort, seed
+        self.reference, self.policy = reference, policy
+        self.effort, self.seed = effort, seed
         self.batches = None if episodes is None else math.ceil(episodes / reference.nworld)
         # failures that end episodes change the returns of many episodes, so the mean return shows them
         self.judges = {"returns": difference}
@@ -117,12 +118,13 @@ class Trials:
         model, size = self.reference.task.model, self.reference.engine.integration_size
         data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
         states = torch.cat(self._starts)[:, :size].cpu().numpy()
-        found = 0
-        for state in (chosen := states[:: max(1, len(states) // _CONTACT_STATES)]):
+        states = states[:: max(1, len(states) // _CONTACT_STATES)]
+        count = 0
+        for state in states:
             mujoco.mj_setState(model, data, state, kind)
             mujoco.mj_fwdPosition(model, data)
-            found += data.ncon > 0
-        return found / len(chosen)
+            count += data.ncon > 0
+        return count / len(states)
 
     # one setting
 
@@ -161,9 +163,9 @@ class Trials:
         count = self._block * env.nworld
         starts = [repeat % len(self._starts) for repeat in range(self.effort.repeats)]
         times = np.array([(self._seconds(self.reference, k), self._seconds(env, k)) for k in starts])
-        exact, own = times.T
-        low = min(np.quantile(exact / own, 0.25), exact.min() / own.min())
-        return count / float(np.median(own)), float(np.median(exact / own)), float(low)
+        exact, changed = times.T
+        low = min(np.quantile(exact / changed, 0.25), exact.min() / changed.min())
+        return count / float(np.median(changed)), float(np.median(exact / changed)), float(low)
 
     def _seconds(self, env: Env, k: int) -> float:
         actions = self._actions[k]
@@ -179,22 +181,22 @@ class Trials:
     def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
         """Record the velocities 1, 10 and 50 steps after ``_starts[k]``, (3, nworld, nv) float64; NaN after a fault."""
         env.set_state(self._starts[k] if start is None else start)
-        found, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
+        velocities, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
         for step, action in enumerate(self._actions[k], 1):
             env.step(action)
             bad |= env.done_reason & int(FAULTS) != 0
             if step in DIVERGENCE_STEPS:
-                found.append(env.get_state()[:, self._parts[1]].masked_fill(bad[:, None], torch.nan))
-        return torch.stack(found)
+                velocities.append(env.get_state()[:, self._parts[1]].masked_fill(bad[:, None], torch.nan))
+        return torch.stack(velocities)
 
     def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
         """Compare velocities with those of the unchanged task after 1, 10 and 50 steps.
 
         A state's distance is the root mean square over its relative differences. The result is the median over states.
         """
-        exact, found = torch.cat(self._exact, 1), torch.cat(velocities, 1)
+        exact, changed = torch.cat(self._exact, 1), torch.cat(velocities, 1)
         scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
-        return ((found - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
+        return ((changed - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Get pairs of returns, (2, episodes), and count faults and steps with and without the setting.
@@ -203,23 +205,23 @@ class Trials:
         """
         pairs: list[np.ndarray] = []
         faults, steps = np.zeros(2), np.zeros(2)
-        wanted = self.batches or 1
-        while len(pairs) < wanted:
+        batches = self.batches or 1
+        while len(pairs) < batches:
             batch = len(pairs)
             if (source, batch) not in self._returns:
                 start = time.perf_counter()
                 self._returns[source, batch] = self._episodes(self.reference, source, batch)
                 self._batch_seconds[source] = time.perf_counter() - start
-            own, exact = self._episodes(env, source, batch), self._returns[source, batch]
-            pairs.append(np.stack([exact[0], own[0]]))
-            faults += (own[1], exact[1])
-            steps += (own[2], exact[2])
+            changed, exact = self._episodes(env, source, batch), self._returns[source, batch]
+            pairs.append(np.stack([exact[0], changed[0]]))
+            faults += (changed[1], exact[1])
+            steps += (changed[2], exact[2])
             if batch == 0 and self.batches is None:
                 first = {name: judge(*pairs[0]) for name, judge in self.judges.items()}
-                if not any(found.beyond(TOLERANCES["loose"]) for found in first.values()):
+                if not any(difference.beyond(TOLERANCES["loose"]) for difference in first.values()):
                     most = max(1, int(self.effort.judging_seconds / self._batch_seconds[source]))
-                    needed = max(episodes_needed(found, _HALF_WIDTHS[name]) for name, found in first.items())
-                    wanted = min(most, math.ceil(needed / env.nworld))
+                    needed = max(episodes_needed(first[name], _HALF_WIDTHS[name]) for name in first)
+                    batches = min(most, math.ceil(needed / env.nworld))
         return np.concatenate(pairs, axis=1), faults, steps
 
     def _episodes(self, env: Env, source: str, batch: int) -> tuple[np.ndarray, int, int]:
@@ -234,7 +236,8 @@ class Trials:
         draw, policy = random_actions(env, seed), self.sources[source]
         total = torch.zeros(env.nworld, dtype=torch.float64, device=env.obs.device)
         alive = torch.ones(env.nworld, dtype=torch.bool, device=env.obs.device)
-        faults, steps = (torch.zeros((), dtype=torch.int64, device=env.obs.device) for _ in range(2))
+        faults = torch.zeros((), dtype=torch.int64, device=env.obs.device)
+        steps = torch.zeros_like(faults)
         for step in range(self.steps):
             env.step(next(draw) if policy is None else policy(env.obs))
             total += torch.where(alive, env.reward, 0.0)

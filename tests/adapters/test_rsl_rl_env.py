@@ -56,14 +56,9 @@ def test_setting_episode_lengths_moves_the_time_limit(env: lw.Env) -> None:
     assert extras["time_outs"].tolist() == [False, False, True, False]
 
 
-@pytest.mark.parametrize("steps, message", [
-    (torch.zeros(3, dtype=torch.long), r"must be whole numbers of shape \(4,\), not a int64 tensor of shape \(3,\)"),
-    (torch.zeros(4), "must be whole numbers of shape"),
-    (torch.tensor([0, 1, 10, 2]), "must be from 0 to 9, not from 0 to 10"),
-])  # fmt: skip
-def test_invalid_episode_lengths_raise_an_error(env: lw.Env, steps: torch.Tensor, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        RslRlVecEnv(env).episode_length_buf = steps
+def test_invalid_episode_lengths_raise_an_error(env: lw.Env) -> None:
+    with pytest.raises(ValueError, match="from 0 to 9, not from 0 to 10"):
+        RslRlVecEnv(env).episode_length_buf = torch.tensor([0, 1, 10, 2])
 
 
 def test_fault_counts_as_a_time_out_but_termination_does_not(shared_env: SharedEnv) -> None:

@@ -1,4 +1,4 @@
-"""List minimal inputs that once failed: files, arguments and command lines."""
+"""List minimal inputs that once failed: files and command lines."""
 
 import io
 import json
@@ -94,26 +94,6 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip
 """Each case is a kind of file, a reader and a change. If the change matters, the reader must reject the file."""
-
-KEYWORDS: dict[str, tuple[str, dict[str, Any]]] = {
-    "fields that are a tensor": ("make", {"fields": torch.tensor(3)}),
-    "physics that is a number of NumPy": ("make", {"physics": np.float32(2), "cone": "elliptic"}),
-    "iterations of 1e9": ("MPPI", {"iterations": 1e9}),
-    "a policy of other sizes": ("evaluate", {"policy": torch.nn.Linear(3, 2)}),
-    "a policy of 2^31 actions": ("GaussianPolicy", {"nact": 2**31 - 1}),
-    "a policy that is not a function": ("evaluate", {"policy": 3}),
-    "an environment that is a text": ("control_async", {"env": "hopper"}),
-    "a time feature of 10^9 powers": ("ValueFunction", {"time_orders": 10**9}),
-    "10^9 plants": ("CEM", {"plants": 10**9}),
-    "10^9 substeps in a step": ("CEM", {"frame_skip": 10**9}),
-    "10^9 episodes": ("evaluate", {"episodes": 10**9}),
-    "a horizon of 10^9 steps": ("OpenLoop", {"horizon": 10**9}),
-    "a period of 2^63 seconds": ("control_async", {"period": 2**63}),
-    "a rollout of 10^9 steps": ("Rollout", {"steps": 10**9}),
-    "a run that is a list": ("load", {"run": []}),
-    "callbacks that are a number": ("train", {"callbacks": 7}),
-}
-"""Each case is a call and its arguments. The error must name an argument or its value."""
 
 COMMANDS = {
     "a negative number of steps": "check point_mass --steps -5",

@@ -1,4 +1,4 @@
-"""Damage files, command lines and arguments at random.
+"""Damage files and command lines at random.
 
 A damaged input must either work or cause a documented error. A failure prints the case and the command that repeats it.
 """
@@ -9,14 +9,12 @@ from typing import Any
 
 import command_attacks
 import file_attacks
-import keyword_attacks
 import pytest
 from guarded import Outcome, attacks, replay
-from minimal_cases import COMMANDS, FILES, KEYWORDS
+from minimal_cases import COMMANDS, FILES
 
 PROGRAMS: dict[str, tuple[Collection[str], int, Collection[str]]] = {
     "file_attacks.py": (file_attacks.KINDS, 150, FILES),
-    "keyword_attacks.py": (keyword_attacks.CALLS, 200, KEYWORDS),
     "command_attacks.py": (command_attacks.SMALL, 50, COMMANDS),
 }
 """The kinds of random cases of each attack program, how many cases of each kind it runs, and its minimal cases."""
@@ -44,7 +42,7 @@ def test_random_cases_work_or_raise_a_one_line_error(outcomes: Any, program: str
     assert not bad, "\n".join([f"{len(bad)} of {len(found)} cases", *bad])
 
 
-@pytest.mark.quick("file_attacks.py", "keyword_attacks.py")
+@pytest.mark.quick("file_attacks.py")
 @pytest.mark.parametrize(("program", "name"), [(name, case) for name in PROGRAMS for case in PROGRAMS[name][2]])
 def test_minimal_case_raises_a_documented_error(outcomes: Any, program: str, name: str) -> None:
     outcome = outcomes(program, False)[name]

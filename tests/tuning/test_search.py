@@ -88,7 +88,6 @@ def test_each_invalid_argument_of_tune_raises_an_error(run: Path, tmp_path: Path
         ("hopper", {"run": tmp_path / "none"}, "there is no run in"),
         ("point_mass", {"run": run, "which": "worst"}, "no policy is named 'worst': pass 'last'"),
         ("hopper", {"episodes": 0}, "episodes must be a whole number from 1 .*, not 0"),
-        ("hopper", {"short": "yes"}, "short must be True or False, not 'yes'"),
         ("hopper", {"out": other, "nworld": 2}, "line 1 of .*notes.txt is not a result of tune: use another file"),
         ("hopper", {"gravity": 3}, "gravity"),
     ]

@@ -94,5 +94,5 @@ def _stored(run: Run) -> dict[str, Score]:
         policies = json.loads(run.evaluation.read_text())["policies"]
         rows = {which: [score[field.name] for field in dataclasses.fields(Score)] for which, score in policies.items()}
         return {which: Score(int(row[0]), *map(float, row[1:])) for which, row in rows.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return {}

@@ -39,7 +39,7 @@ _ENTRIES: dict[str, Any] = {
     "reached": dict, "kept": dict, "versions": dict, "resumed": list,
 }  # fmt: skip
 _REACHED: dict[str, Any] = {"iteration": _COUNT, "return": float | int}
-_KEPT: dict[str, Any] = {
+_MANIFEST: dict[str, Any] = {
     "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
     "program": bool,
 }  # fmt: skip
@@ -89,9 +89,15 @@ class Run:
         self.check = lambda: None
 
     @property
+    def manifest(self) -> dict[str, Any]:
+        """The entry ``kept`` of the configuration: the task's name, and the files and hashes of its copy."""
+        manifest: dict[str, Any] = self.config.get("kept", {})
+        return manifest
+
+    @property
     def task_name(self) -> str:
         """Name of the run's task."""
-        task = str(self.config.get("kept", {}).get("name") or self.config.get("task")).partition(":")[0]
+        task = str(self.manifest.get("name") or self.config.get("task")).partition(":")[0]
         return Path(task).stem if task.endswith(".py") else task
 
     @staticmethod
@@ -147,7 +153,7 @@ class Run:
         except BaseException:  # for example, the disk is full, or a signal ends the program
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        if "file" in run.config.get("kept", {}):
+        if "file" in run.manifest:
             remember(folder, run.config)
         return run
 
@@ -175,12 +181,13 @@ class Run:
                 f"run, or show the planner's episodes (lyceum-warp view {folder})"
             )
         algorithm = config.get("algorithm")
-        own = {str(algorithm): dict, f"{algorithm}_seed": _COUNT}
+        entries = _ENTRIES | {str(algorithm): dict, f"{algorithm}_seed": _COUNT}
         try:
-            for part, kinds in (None, _ENTRIES | own), ("reached", _REACHED), ("kept", _KEPT):
-                entries = config if part is None else config.get(part, {})
-                for name in kinds.keys() & entries.keys():
-                    kind, value = kinds[name], entries[name]
+            for part, kinds in (
+                (config, entries), (config.get("reached", {}), _REACHED), (config.get("kept", {}), _MANIFEST)
+            ):  # fmt: skip
+                for name in kinds.keys() & part.keys():
+                    kind, value = kinds[name], part[name]
                     if kind is _COUNT:
                         whole_number(name, value, low=0)
                     elif not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):

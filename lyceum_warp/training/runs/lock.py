@@ -26,10 +26,10 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
         ValueError: Another process has the lock.
     """
     path, here = folder / "lock", platform.node()
-    own = json.dumps({"host": here, "pid": os.getpid(), "token": uuid.uuid4().hex})
+    mark = json.dumps({"host": here, "pid": os.getpid(), "token": uuid.uuid4().hex})
 
     def check() -> None:
-        if (text := path.read_text()) != own:
+        if (text := path.read_text()) != mark:
             raise ValueError(f"the run in {folder} was taken over by {_owner(text)[0]}")
 
     if take_over:
@@ -53,7 +53,7 @@ def run_lock(folder: Path, *, take_over: bool = False) -> Iterator[Callable[[], 
             if not path.exists() or not os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 continue  # another process has deleted or replaced the file since it was opened
             file.truncate(0)
-            file.write(own)
+            file.write(mark)
             file.flush()
             try:
                 yield check

@@ -36,10 +36,10 @@ def pretrained_run(task: str) -> Path:
 
 def pretrained_text(run: Run) -> str:
     """Describe a pretrained policy in one line: its training, and the settings that differ from the task's defaults."""
-    config, found = run.config, run.config["evaluated"]
+    config, evaluation = run.config, run.config["evaluated"]
     settings = {**config["params"], **config["physics"], **config["options"]}
-    given = ", ".join(f"{name} {value}" for name, value in settings.items()) or "its defaults"
+    text = ", ".join(f"{name} {value}" for name, value in settings.items()) or "its defaults"
     return (
-        f"pretrained by {config['algorithm']} on {config['task']} with {given}: return {found['return']:.4g} ± "
-        f"{found['std']:.2g} in {found['episodes']} episodes of lyceum_warp {found['lyceum_warp']}"
+        f"pretrained by {config['algorithm']} on {config['task']} with {text}: return {evaluation['return']:.4g} ± "
+        f"{evaluation['std']:.2g} in {evaluation['episodes']} episodes of lyceum_warp {evaluation['lyceum_warp']}"
     )

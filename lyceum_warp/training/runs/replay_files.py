@@ -44,7 +44,7 @@ def clean_replay(folder: Path, replay: Replay) -> None:
             path.unlink(missing_ok=True)
 
 
-def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
+def read_replay(folder: Path, replay: Replay, stored: int, worlds: slice) -> None:
     """Restore the buffer of a checkpoint."""
     oldest = max(0, stored - replay.steps)
     for start, end in _parts(replay, oldest, stored):
@@ -56,7 +56,7 @@ def read_replay(folder: Path, replay: Replay, stored: int, own: slice) -> None:
         if content["first"] > max(start, oldest):
             raise ValueError(f"{longer[0]} lacks the replay buffer's steps before {content['first']}")
         steps = end - content["first"]
-        replay.set_rows(content["first"], {name: part[:steps, own] for name, part in content["rows"].items()})
+        replay.set_rows(content["first"], {name: part[:steps, worlds] for name, part in content["rows"].items()})
     replay.restore(stored)
 
 

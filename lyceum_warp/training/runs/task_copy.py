@@ -41,34 +41,30 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     task, model_given = env.task.task, env.options.model is not None
     sources, private = source_files(task), not task.__module__.startswith("lyceum_warp.")
     file = next(iter(sources), None)
-    kept: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": model_given}
-    files: dict[str, Path | bytes] = {}
-    if file is not None:
-        kept["source_hash"] = _digest(sources[file])
+    manifest: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": model_given}
+    code: Files = {}
+    model: Files = {}
+    model_file = None
+    if private:
+        code = {**sources, **{path: path for path, reason in _data_files(task).items() if not reason}}
     if private or model_given:
         model_file, model = _model_files(env)
-        code: Files = {}
+    # relative paths stay the same, so that the copied task finds the copied model
+    names = _names_in_copy([*code, *model])
+    if names.get(file, "").count("/") > _APART:
+        names = _names_in_copy(code) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
+    files = {names[path]: content for path, content in {**code, **model}.items()}
+    if file is not None:
+        manifest["source_hash"] = _digest(sources[file])
         if private:
-            code = {**sources, **{path: path for path, reason in _data_files(task).items() if not reason}}
-        # relative paths stay the same, so that the copied task finds the copied model
-        names = _names_in_copy([*code, *model])
-        if file is not None and names.get(file, "").count("/") > _APART:
-            names = _names_in_copy(code) | {path: f"model/{name}" for path, name in _names_in_copy(model).items()}
-        files = {names[path]: content for path, content in {**code, **model}.items()}
-        if private and file is not None:
-            kept["modules"] = {
-                path.relative_to(file.parent).as_posix(): _digest(content)
-                for path, content in code.items()
-                if path != file
-            }
-            kept["file"] = names[file]
-            kept["program"] = task.__module__ == "__main__"
-        if model_file is not None:
-            kept["model"] = names[model_file]
+            modules = {path.relative_to(file.parent).as_posix(): _digest(code[path]) for path in code if path != file}
+            manifest |= {"file": names[file], "modules": modules, "program": task.__module__ == "__main__"}
+    if model_file is not None:
+        manifest["model"] = names[model_file]
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
-    return kept, files
+    return manifest, files
 
 
 def _data_files(task: type[Task]) -> dict[Path, str]:
@@ -95,30 +91,35 @@ def note_uncopied_data(env: Env) -> None:
     """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
     reasons = _data_files(env.task.task)
     for reason in filter(None, dict.fromkeys(reasons.values())):
-        path, *others = (path for path in reasons if reasons[path] == reason)
-        more = f" and of {len(others)} more files" if others else ""
-        log.warning("the run has no copy of %s%s, which the task %r reads: %s", path, more, env.task.name, reason)
+        paths = [path for path in reasons if reasons[path] == reason]
+        more = f" and of {len(paths) - 1} more files" if len(paths) > 1 else ""
+        log.warning("the run has no copy of %s%s, which the task %r reads: %s", paths[0], more, env.task.name, reason)
 
 
-def _names_in_copy(paths: Collection[Path]) -> dict[Path, str]:
+def _names_in_copy(paths: Collection[Path]) -> dict[Path | None, str]:
     root = os.path.commonpath([path.parent for path in paths]) if paths else ""
     return {path: path.relative_to(root).as_posix() for path in paths}
 
 
 def json_value(name: str, value: Any) -> Any:
     """Convert a task parameter to a JSON value for config.json."""
-    if (table := _table(value)) is not None:
-        return str(Path(value).absolute()) if isinstance(value, str | Path) else f"{name}.npy" if table.size else []
-    if isinstance(value, bool | int | float | str):
+    if isinstance(value, bool | int | float) or (isinstance(value, str) and not is_table(value)):
         return value
-    return np.asarray(value.cpu() if hasattr(value, "cpu") else value).tolist()
+    table = _table(value)
+    if isinstance(table, Path):
+        return str(table.absolute())
+    return _array(value).tolist() if table is None else f"{name}.npy"
 
 
-def _table(value: Any) -> Any:
+def _array(value: Any) -> np.ndarray:
+    return np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+
+
+def _table(value: Any) -> Path | np.ndarray | None:
     """Get the file or the array of a table parameter. Return None for other parameters."""
     if is_table(value):
         return Path(value)
-    array = np.asarray(value.cpu() if hasattr(value, "cpu") else value)
+    array = _array(value)
     return array if array.dtype.kind in "fiu" and array.size > 64 else None
 
 
@@ -136,14 +137,6 @@ def table_copies(run: Run) -> dict[str, Path]:
         for name, copy in copies.items()
         if copy.is_file() and not (Path(tables[name]).is_file() and filecmp.cmp(tables[name], copy, shallow=False))
     }
-
-
-def _note_tables(run: Run, params: Mapping[str, Any], text: str, *, copies: bool) -> None:
-    """Log a warning for each changed table of which the copy, or the new version, is used."""
-    for name, copy in table_copies(run).items():
-        file = run.config["params"][name]
-        if Path(file).is_file() and name in params and json_value(name, params[name]) == str(copy if copies else file):
-            log.warning("%s has changed since the run began: %s", file, text.format(copy))
 
 
 def _npy(array: np.ndarray) -> bytes:
@@ -170,18 +163,18 @@ def run_env(
         ValueError: The task does not fit the run, or the run's code is not trusted.
         FileNotFoundError: The task or its model is missing, and the run has no copy.
     """
-    kept = run.config.get("kept", {})
-    _note_tables(run, params, "the run's own copy is used, {}", copies=True)
+    manifest = run.manifest
+    file = (run.task_folder / manifest.get("file", "")).resolve()
     if task is None:
         task = _run_task(run, trust=trust)
-    elif "file" in kept and Path(task.partition(":")[0]).resolve() == (run.task_folder / kept["file"]).resolve():
+    elif Path(task.partition(":")[0]).resolve() == file:
         remember(run.folder, run.config)
     else:
         return Env(task, options, **params)
-    copy = run.task_folder / kept.get("model", "")
+    copy = run.task_folder / manifest.get("model", "")
     if not copy.is_file():
         return Env(task, options, **params)
-    if not kept.get("model_given") or isinstance(options.model, str):
+    if not manifest.get("model_given") or isinstance(options.model, str):
         reason = "has changed since the run began"
         try:
             env = Env(task, options, **params)
@@ -195,8 +188,8 @@ def run_env(
 
 def _run_task(run: Run, *, trust: bool) -> str:
     """Return the name of a run's task, its file, or the run's copy of the file if the file has moved or changed."""
-    kept, task = run.config.get("kept", {}), run.config["task"]
-    if task is None or kept.get("program"):
+    manifest, task = run.manifest, run.config["task"]
+    if task is None or manifest.get("program"):
         program = "a notebook" if task is None else task.partition(":")[0]
         raise ValueError(
             f"the run in {run.folder} was started by {program}, which also defines its task {run.task_name!r}: pass a "
@@ -206,27 +199,27 @@ def _run_task(run: Run, *, trust: bool) -> str:
     path, colon, attribute = task.partition(":")
     if path in package_task_names():
         return str(task)
-    copy = run.task_folder / kept.get("file", "")
-    code = copy if copy.is_file() else path
+    copy = run.task_folder / manifest.get("file", "")
+    code = f"{copy if copy.is_file() else path}{colon}{attribute}"
     if not (trust or is_trusted(run.folder, run.config)):
         raise ValueError(
             f"{run.folder / 'config.json'} names the task {task}, whose code you have not run on this machine: read "
             f"{code}, and then name it as the task (eval --task {code}, train {code} --resume {run.folder})"
         )
-    if not copy.is_file() or not (changes := _source_changes(Path(path), kept)):
+    if not copy.is_file() or not (changes := _source_changes(Path(path), manifest)):
         return str(task)
     new = f"; give {path} as the task to use the new version" if Path(path).is_file() else ""
     log.warning("%s: the run's own copy is used, %s%s", changes[0], copy, new)
     return f"{copy}{colon}{attribute}"
 
 
-def _source_changes(file: Path, kept: Mapping[str, Any], sources: Mapping[Path, bytes] | None = None) -> list[str]:
+def _source_changes(file: Path, manifest: Mapping[str, Any], sources: Mapping[Path, bytes] | None = None) -> list[str]:
     """Describe the changes of a task's file and of the files that it uses since a run began.
 
     ``sources`` has the code that was loaded, which may have changed since then.
     """
     changes = []
-    for name, digest in {file.name: kept.get("source_hash"), **kept.get("modules", {})}.items():
+    for name, digest in {file.name: manifest.get("source_hash"), **manifest.get("modules", {})}.items():
         path = file.parent / name
         content = (sources or {}).get(path)
         if content is None and not path.is_file():
@@ -241,13 +234,18 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
 
     The compiled model depends on the physics. Set ``model`` to False if the physics differ on purpose.
     """
-    kept, sources = run.config.get("kept", {}), source_files(env.task.task)
+    manifest, sources = run.manifest, source_files(env.task.task)
     file = next(iter(sources), None)
-    if kept.get("program"):  # a change of the training script may have nothing to do with the task
-        kept = {**kept, "source_hash": None}
-    for change in _source_changes(file, kept, sources) if file is not None else ():
+    if manifest.get("program"):  # a change of the training script may have nothing to do with the task
+        manifest = {**manifest, "source_hash": None}
+    for change in _source_changes(file, manifest, sources) if file is not None else ():
         log.warning("%s", f"{change}: the new version is used" if "changed" in change else change)
-    _note_tables(run, env.given_params, "the new version is used", copies=False)
+    for name, copy in table_copies(run).items():
+        table = run.config["params"][name]
+        texts = {str(copy): f"the run's own copy is used, {copy}", table: "the new version is used"}
+        text = texts.get(str(json_value(name, env.given_params.get(name))))
+        if text is not None and Path(table).is_file():
+            log.warning("%s has changed since the run began: %s", table, text)
     if model and _model_changed(run, env):
         log.warning("the model of the task %r has changed since the run began: the new version is used", env.task.name)
 
@@ -257,7 +255,7 @@ def _model_changed(run: Run, env: Env) -> bool:
 
     With another version of MuJoCo, the result is False, because a new version may compile the model differently.
     """
-    digest, version = run.config.get("kept", {}).get("model_hash"), mujoco.__version__
+    digest, version = run.manifest.get("model_hash"), mujoco.__version__
     same_version = run.config.get("versions", {}).get("mujoco", version) == version
     return same_version and digest not in (None, _model_hash(env))
 

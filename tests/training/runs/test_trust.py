@@ -66,7 +66,7 @@ def test_code_of_another_user_runs_only_if_it_is_named(
     before = {path: path.read_bytes() for path in theirs.rglob("*.*") if path.is_file()}
     capsys.readouterr()
     assert cli.main(command) == 2
-    refused(capsys, f"{theirs / 'config.json'} names the task /home/other/told.py:Told", f"--task {copy}")
+    refused(capsys, f"{theirs / 'config.json'} names the task /home/other/told.py:Told", f"--task {copy}:Told")
     assert not witness.exists()
     assert before == {path: path.read_bytes() for path in theirs.rglob("*.*") if path.is_file()}
     assert cli.main([*command, *named]) == 0
