@@ -195,33 +195,26 @@ def _changed_versions(run: Run) -> dict[str, Any]:
 def _check_equal(run: Run, learner: Learner) -> None:
     """Check that a learner has the settings of a run. Its device, threads and processes may differ."""
     before, after = _fixed_settings(run.config), _fixed_settings(json.loads(json.dumps(describe(learner))))
-    before["run"]["task"] = run.manifest.get("name", learner.env.task.name)
-    after["run"]["task"] = learner.env.task.name
+    before["task"], after["task"] = run.manifest.get("name", learner.env.task.name), learner.env.task.name
     for name, copy in table_copies(run).items():  # ``note_changes`` reports a changed table
-        if after["params"].get(name) == str(copy):
-            after["params"][name] = run.config["params"][name]
-    for part, settings in before.items():
+        if after.get(f"params.{name}") == str(copy):
+            after[f"params.{name}"] = run.config["params"][name]
+    for name in before | after:
+        value, other = before.get(name), after.get(name)
         # this release may have hyperparameters that an older run lacks
-        for name in settings if part == "hyperparameters" else settings | after[part]:
-            value, other = settings.get(name), after[part].get(name)
-            if value != other:
-                raise ValueError(
-                    f"{run.folder / 'config.json'} has {name} {value}, not {other}, and a run keeps its settings: omit "
-                    f"{name}, or start a new run in another folder"
-                )
+        if value != other and (name in before or not name.startswith(f"{learner.algorithm}.")):
+            raise ValueError(
+                f"{run.folder / 'config.json'} has {name} {value}, not {other}, and a run keeps its settings: omit "
+                f"{name.rpartition('.')[2]}, or start a new run in another folder"
+            )
 
 
-def _fixed_settings(config: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return the settings of a configuration that a run keeps, by parts of the configuration."""
-    algorithm, options = config.get("algorithm"), config.get("options", {})
-    return {
-        "run": {
-            "algorithm": algorithm,
-            "engine": engine_name(config.get("engine", ""), config.get("device")),
-            "nworld": config.get("nworld"),
-            **{name: options.get(name) for name in ("horizon", "fields", "dynamics")},
-        },
-        "physics": config.get("physics", {}),
-        "params": dict(config.get("params", {})),
-        "hyperparameters": config.get(str(algorithm), {}),
-    }
+def _fixed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a configuration that a run keeps, by their names in config.json."""
+    settings = {name: config.get(name) for name in ("task", "algorithm", "nworld")}
+    settings["engine"] = engine_name(config.get("engine", ""), config.get("device"))
+    for name in ("horizon", "fields", "dynamics"):
+        settings[name] = config.get("options", {}).get(name)
+    for part in ("physics", "params", str(config.get("algorithm"))):
+        settings |= {f"{part}.{name}": value for name, value in config.get(part, {}).items()}
+    return settings

@@ -69,9 +69,9 @@ def test_resume_with_other_settings_prints_an_error(
     before = {path: path.read_bytes() for path in trained.iterdir()}
     for options, words in [
         (["--iterations", "4"], ["already has 4 iterations", "--iterations 8"]),
-        (["--iterations", "9", "--gamma", "0.9"], ["has gamma 0.995, not 0.9", "start a new run in another folder"]),
+        (["--iterations", "9", "--gamma", "0.9"], ["gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
-        (["--iterations", "9", "--param", "success_distance=1"], ["has success_distance None, not 1"]),
+        (["--iterations", "9", "--param", "success_distance=1"], ["success_distance None, not 1"]),
         (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo or sac, not of npg"]),
         (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "omit it"]),
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
@@ -126,8 +126,8 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     assert {(env.horizon, env.options.nthread) for env in made_envs} == {(16, 1)}
     capsys.readouterr()
     for other, words in [
-        (["--integrator", "rk4"], "has integrator euler, not rk4"),
-        (["--solver", "iterations=8"], "has solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
+        (["--integrator", "rk4"], "integrator euler, not rk4"),
+        (["--solver", "iterations=8"], "solver {'iterations': 7, 'ls_iterations': 9}, not {'iterations': 8,"),
     ]:
         assert cli.main([*resume, "4", *other]) == 2
         refused(capsys, words)

@@ -60,7 +60,7 @@ def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.E
     Run.open(other).amend(engine="warp")
     for folder, given, message in [
         (six, lw.make("cartpole", nworld=2), "has task point_mass, not cartpole"),
-        (other, env, "has engine warp, not mujoco"),
+        (other, env, "engine warp, not mujoco"),
     ]:
         with pytest.raises(ValueError, match=message):
             lw.train(algorithm(given), lw.Run.open(folder), 9)
@@ -211,7 +211,7 @@ def test_flags_with_default_values_override_the_settings_of_the_source_run(
     assert cli.main([*command, "--out", str(tmp_path / "no"), "--hidden", "64", "64"]) == 2
     refused(capsys, "have hidden (8,), not (64, 64)", "omit --hidden")
     assert cli.main(["train", "--resume", str(old), "--iterations", "9", "--gamma", "0.995"]) == 2
-    refused(capsys, "has gamma 0.9, not 0.995")
+    refused(capsys, "gamma 0.9, not 0.995")
 
 
 def test_evaluation_and_training_with_equal_seeds_have_different_initial_states(env: lw.Env) -> None:

@@ -59,22 +59,22 @@ def network_of(content: Mapping[str, Any], path: Path, name: str, network: nn.Mo
     if name not in content:
         raise ValueError(f"{path} has no value function: its algorithm learns none, or the file is from rsl_rl")
     saved = content[name]
+    fix = _FIX if network is None else "pass a policy with the same structure as the run's policy"
     try:
         if network is None:
             if "like" in saved:
                 raise ValueError(f"rsl_rl saved this policy without its activation: pass policy={saved['like']}")
             with torch.device("meta"):  # compare shapes before allocating memory
-                _check_shapes(name, _new_network(name, saved), saved["state"], _FIX)
+                _new_network(name, saved).load_state_dict(saved["state"], assign=True)
             if infinite := [part for part, tensor in saved["state"].items() if not tensor.isfinite().all()]:
                 raise ValueError(f"its {name}'s {infinite[0]!r} is not finite: {_FIX}")
             network = _new_network(name, saved)
-        else:
-            _check_shapes(name, network, saved["state"], "pass a policy with the same structure as the run's policy")
         network.load_state_dict(saved["state"])
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     except (KeyError, TypeError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"{path} contains no {name} of lyceum_warp ({first_sentence(error)}): {_FIX}") from error
+        text = " ".join(str(error).split())[:300]
+        raise ValueError(f"{path} contains no {name} of lyceum_warp that fits ({text}): {fix}") from error
     return network
 
 
@@ -94,17 +94,6 @@ def _new_network(name: str, saved: Mapping[str, Any]) -> nn.Module:
     return network
 
 
-def _check_shapes(name: str, network: nn.Module, state: Mapping[str, torch.Tensor], fix: str) -> None:
-    shapes = {part: tuple(tensor.shape) for part, tensor in network.state_dict().items()}
-    saved = {part: tuple(tensor.shape) for part, tensor in state.items()}
-    for part in {**shapes, **saved}:
-        if shapes.get(part) != saved.get(part):
-            raise ValueError(
-                f"its {name} has different parameters ({part!r} is {saved.get(part, 'absent')} in the file, and "
-                f"{shapes.get(part, 'absent')} in the network that takes it): {fix}"
-            )
-
-
 def read_checkpoint(
     path: Path, device: str | torch.device = "cpu", *, parts: tuple[str, ...] = ("iteration", "policy", "state")
 ) -> dict[str, Any]:
@@ -116,6 +105,7 @@ def read_checkpoint(
     """
     if not path.is_file():
         raise FileNotFoundError(f"there is no checkpoint {path}: train the run first")
+    device = torch.device(device)
     try:
         data = io.BytesIO(path.read_bytes())
         with zipfile.ZipFile(data) as archive:

@@ -16,7 +16,7 @@ from lyceum_warp.env import Curriculum
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.support.validate import check_kind, whole_number
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.training.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
 from lyceum_warp.training.runs.trust import remember
@@ -36,12 +36,11 @@ _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
     "algorithm": str, "nworld": _COUNT, "threads": _COUNT, "seed": _COUNT, "iterations": _COUNT, "keep_every": _COUNT,
     "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
-    "reached": dict, "kept": dict, "versions": dict, "resumed": list,
-}  # fmt: skip
-_REACHED: dict[str, Any] = {"iteration": _COUNT, "return": float | int}
-_MANIFEST: dict[str, Any] = {
-    "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str, "modules": dict,
-    "program": bool,
+    "reached": {"iteration": _COUNT, "return": float | int}, "versions": dict, "resumed": list,
+    "kept": {
+        "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
+        "modules": dict, "program": bool,
+    },
 }  # fmt: skip
 """Types of the entries of config.json. All entries are optional."""
 
@@ -181,17 +180,8 @@ class Run:
                 f"run, or show the planner's episodes (lyceum-warp view {folder})"
             )
         algorithm = config.get("algorithm")
-        entries = _ENTRIES | {str(algorithm): dict, f"{algorithm}_seed": _COUNT}
         try:
-            for part, kinds in (
-                (config, entries), (config.get("reached", {}), _REACHED), (config.get("kept", {}), _MANIFEST)
-            ):  # fmt: skip
-                for name in kinds.keys() & part.keys():
-                    kind, value = kinds[name], part[name]
-                    if kind is _COUNT:
-                        whole_number(name, value, low=0)
-                    elif not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-                        raise ValueError(f"{name} must be of type {getattr(kind, '__name__', kind)}, not {value!r}")
+            _check_entries(config, _ENTRIES | {str(algorithm): dict, f"{algorithm}_seed": _COUNT})
         except ValueError as error:
             raise ValueError(f"{path} is damaged: {error}") from error
         return cls(Path(folder), config)
@@ -340,6 +330,20 @@ class Run:
             raise
 
 
+def _check_entries(entries: Mapping[str, Any], kinds: Mapping[str, Any]) -> None:
+    """Check the types of JSON values. A dict of types describes a JSON object."""
+    for name in kinds.keys() & entries.keys():
+        kind, value = kinds[name], entries[name]
+        if kind is _COUNT:
+            whole_number(name, value, low=0)
+            continue
+        python_type = dict if isinstance(kind, dict) else kind
+        if not isinstance(value, python_type) or (isinstance(value, bool) and kind is not bool):
+            raise ValueError(f"{name} must be of type {getattr(python_type, '__name__', kind)}, not {value!r}")
+        if isinstance(kind, dict):
+            _check_entries(value, kind)
+
+
 def runs_in(folder: Path) -> list[str]:
     """Return the paths of the runs in a folder of runs."""
     return sorted(str(path.parent) for path in folder.glob(f"*/{_CONFIG}"))
@@ -382,7 +386,6 @@ def load(
         ValueError: The file is broken, was not written by lyceum_warp, or was written by a newer release. This error is
             also raised if ``policy`` is missing or does not fit the file.
     """
-    check_kind("policy", policy, torch.nn.Module | None, "as lw.GaussianPolicy(nobs, nact, network=...)")
     content, path = _content(run, which, device)
     return network_of(content, path, "policy", policy).to(device).eval().requires_grad_(False)
 
@@ -427,13 +430,6 @@ def load_curriculum(run: str | Path | Run, *, which: str | int = "last") -> Curr
 
 
 def _content(run: str | Path | Run, which: str | int, device: str | torch.device) -> tuple[dict[str, Any], Path]:
-    check_kind("run", run, str | Path | Run, "a run's folder")
-    check_kind("which", which, str | int, "as 'last', 'best' or 100")
-    check_kind("device", device, str | torch.device, "as 'cpu' or 'cuda:0'")
-    try:
-        torch.device(device)
-    except RuntimeError as error:
-        raise ValueError(f"there is no device {device!r}: use a device such as 'cpu' or 'cuda:0'") from error
     if isinstance(run, (str, Path)) and Path(run).is_file():
         if which != "last":
             raise ValueError(f"{run} is a file with one policy: pass the run's folder to choose {which!r}")

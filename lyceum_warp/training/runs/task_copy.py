@@ -46,7 +46,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     model: Files = {}
     model_file = None
     if private:
-        code = {**sources, **{path: path for path, reason in _data_files(task).items() if not reason}}
+        code = {**sources, **{path: path for path in _data_files(task)[0]}}
     if private or model_given:
         model_file, model = _model_files(env)
     # relative paths stay the same, so that the copied task finds the copied model
@@ -67,33 +67,27 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     return manifest, files
 
 
-def _data_files(task: type[Task]) -> dict[Path, str]:
-    """Map each data file that a task reads to the reason why a run cannot copy it, or to "".
+def _data_files(task: type[Task]) -> tuple[list[Path], list[Path]]:
+    """List the data files that a task reads: those that a run can copy, and all others.
 
     The copy of the task's file finds only files below its own folder.
     """
     sources = source_files(task)
     folder, data = next((file.parent for file in sources), Path()), data_files(sources)
-    large = sum(path.stat().st_size for path in data) > _LARGEST
-    reasons = {}
-    for path, stamp in data.items():
-        if folder not in path.parents:
-            reason = f"move it into {folder}, and read it by a path that starts with Path(__file__).parent"
-        elif stamps([path]) != {path: stamp}:
-            reason = "it has changed since it was read, so make a new environment"
-        else:
-            reason = f"the data files are larger than {_LARGEST // 2**20} MiB" if large else ""
-        reasons[path] = reason
-    return reasons
+    small = sum(path.stat().st_size for path in data) <= _LARGEST
+    copies = [path for path, stamp in data.items() if folder in path.parents and stamps([path]) == {path: stamp}]
+    copies = copies if small else []
+    return copies, [path for path in data if path not in copies]
 
 
 def note_uncopied_data(env: Env) -> None:
     """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
-    reasons = _data_files(env.task.task)
-    for reason in filter(None, dict.fromkeys(reasons.values())):
-        paths = [path for path in reasons if reasons[path] == reason]
-        more = f" and of {len(paths) - 1} more files" if len(paths) > 1 else ""
-        log.warning("the run has no copy of %s%s, which the task %r reads: %s", paths[0], more, env.task.name, reason)
+    for path in _data_files(env.task.task)[1][:1]:
+        log.warning(
+            "the run has no copy of %s, which the task %r reads: it copies files that lie below the folder of the "
+            "task's file, have not changed since they were read, and have less than %d MiB",
+            path, env.task.name, _LARGEST // 2**20,
+        )  # fmt: skip
 
 
 def _names_in_copy(paths: Collection[Path]) -> dict[Path | None, str]:
@@ -298,8 +292,7 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
                 warnings.simplefilter("ignore")  # logged when the environment was made
                 spec.compile()
                 text = spec.to_xml()
-        except (ValueError, mujoco.FatalError) as error:
-            log.info("the model of %s cannot be written as MJCF, so the run has no copy of it: %s", task, error)
+        except (ValueError, mujoco.FatalError):  # the model cannot be written as MJCF
             return None, {}
         folder = Path(spec.modelfiledir or ".").resolve()
         source = folder / "model.xml"
@@ -307,7 +300,6 @@ def _model_files(env: Env) -> tuple[Path | None, Files]:
         for name, content in env.task.spec.assets.items():
             files.setdefault(folder / name, content)
     if sum(path.stat().st_size for path in files.values() if isinstance(path, Path)) > _LARGEST:
-        log.info("the model of %s is larger than %d MiB, so the run has no copy of it", task, _LARGEST // 2**20)
         return None, {}
     return source, files
 
