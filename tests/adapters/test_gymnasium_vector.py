@@ -221,66 +221,46 @@ def test_render_returns_a_picture_of_each_world(vector: Callable[..., GymnasiumV
     envs.close()
 
 
-@pytest.mark.parametrize(
-    "tensors, action, message",
-    [
-        (False, np.zeros((4, 2), dtype=np.float32), r"float32 array of shape \(4, 3\), not a float32 array of shape"),
-        (False, [[0.0] * 3] * 4, r"float32 array of shape \(4, 3\), not list"),
-        (True, np.zeros((4, 3), dtype=np.float32), r"must be a float32 tensor .*, not a ndarray of shape \(4, 3\)"),
-    ],
-)
+@pytest.mark.parametrize("tensors, action, text", [
+    (False, np.zeros((4, 2), dtype=np.float32), r"\(4, 3\), not a float32 array of shape \(4, 2\)"),
+    (False, [[0.0] * 3] * 4, r"\(4, 3\), not list"),
+    (True, np.zeros((4, 3), dtype=np.float32), r"tensor .*, not a ndarray of shape \(4, 3\)"),
+])  # fmt: skip
 def test_actions_of_wrong_shape_or_type_raise_an_error(
-    tensors: bool, action: Any, message: str, vector: Callable[..., GymnasiumVectorEnv]
+    tensors: bool, action: Any, text: str, vector: Callable[..., GymnasiumVectorEnv]
 ) -> None:
     envs = vector(torch=tensors)
     envs.reset(seed=0)
-    with pytest.raises(ValueError, match=message) as error:
+    with pytest.raises(ValueError, match=text):
         envs.step(action)
-    assert "\n" not in str(error.value)
 
 
 def test_step_or_partial_reset_before_the_first_reset_raises_an_error(
     vector: Callable[..., GymnasiumVectorEnv],
 ) -> None:
-    with pytest.raises(ResetNeeded, match="there was no reset before this step: call reset"):
+    with pytest.raises(ResetNeeded):
         vector().step(np.zeros((N, 3), dtype=np.float32))
-    with pytest.raises(ResetNeeded, match="the first reset cannot have a reset_mask: call reset.. first"):
+    with pytest.raises(ResetNeeded):
         vector().reset(options={"reset_mask": np.array([True, False, False, False])})
 
 
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"mask": 1}, r"reset has no option 'mask': it takes options={\"reset_mask\": mask}"),
-        ({"reset_mask": np.ones(3, dtype=bool)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a bool"),
-        ({"reset_mask": np.ones(4)}, r"the reset_mask must be a bool tensor of shape \(4,\), not a ndarray"),
-    ],
-)
-def test_invalid_reset_arguments_raise_an_error(
-    options: dict[str, Any], message: str, hopper: GymnasiumVectorEnv
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        hopper.reset(options=options)
-    with pytest.raises(ValueError, match="seed must be a whole number"):
-        hopper.reset(seed=[1, 2, 3, 4])
-
-
-@pytest.mark.parametrize(
-    "options, value",
-    [({"num_envs": 0}, "0"), ({"nworld": 4}, "nworld"), ({"autoreset_mode": "Never"}, "Never"),
-     ({"render_mode": "human"}, "human")],
-)  # fmt: skip
-def test_invalid_vector_env_arguments_raise_an_error(options: dict[str, Any], value: str) -> None:
-    with pytest.raises((ValueError, TypeError), match=value):
-        GymnasiumVectorEnv("hopper", **options)
+def test_invalid_arguments_raise_an_error(hopper: GymnasiumVectorEnv) -> None:
+    for reset, text in [({"mask": 1}, "mask"), ({"reset_mask": np.ones(3, dtype=bool)}, r"\(3,\)"),
+                        ({"reset_mask": np.ones(4)}, "ndarray")]:  # fmt: skip
+        with pytest.raises(ValueError, match=text):
+            hopper.reset(options=reset)
+    for options, text in [({"num_envs": 0}, "0"), ({"nworld": 4}, "nworld"), ({"autoreset_mode": "Never"}, "Never"),
+                          ({"render_mode": "human"}, "human")]:  # fmt: skip
+        with pytest.raises((ValueError, TypeError), match=text):
+            GymnasiumVectorEnv("hopper", **options)
 
 
 def test_unsuitable_environment_raises_an_error(shared_env: SharedEnv) -> None:
     env, without = (shared_env(Full, nworld=N, autoreset=autoreset) for autoreset in (True, False))
-    with pytest.raises(ValueError, match="the environment already has its options: pass horizon to lw.make"):
+    with pytest.raises(ValueError, match="horizon"):
         GymnasiumVectorEnv(env, horizon=3)
-    with pytest.raises(ValueError, match="the environment has 4 worlds, not num_envs=3"):
+    with pytest.raises(ValueError, match="4 worlds, not num_envs=3"):
         GymnasiumVectorEnv(env, 3)
-    with pytest.raises(ValueError, match="has autoreset=True: make it with autoreset=False"):
+    with pytest.raises(ValueError, match="autoreset=False"):
         GymnasiumVectorEnv(env, autoreset_mode=AutoresetMode.DISABLED)
     assert GymnasiumVectorEnv(without).autoreset_mode is AutoresetMode.DISABLED

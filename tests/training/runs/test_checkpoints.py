@@ -28,32 +28,30 @@ class Mine(torch.nn.Module):
 
 @pytest.mark.parametrize("kind", ["truncated", "foreign", "code", "list", "newer", "partial", "shape"])
 def test_damaged_and_invalid_checkpoints_raise_a_one_line_error(run: Run, kind: str) -> None:
-    path, whole = run.policy, run.policy.read_bytes()
+    path, data = run.policy, run.policy.read_bytes()
     content = read_checkpoint(path, parts=("iteration", "policy"))
-    fix = "restore the file from a copy, or train again into another folder"
+    fix = ""
     match kind:
         case "truncated":
-            path.write_bytes(whole[: len(whole) // 2])
+            path.write_bytes(data[: len(data) // 2])
         case "foreign":
             torch.save({"model": torch.zeros(2)}, path)
-            fix = "it has 'model'.*: pass the policy of a run"
+            fix = "'model'"
         case "code":
             torch.save({"lyceum_warp": FORMAT, "policy": path}, path)
         case "list":
             torch.save([1, 2], path)
-            fix = "was not written by lyceum_warp: pass the policy of a run"
         case "newer":
             torch.save(content | {"lyceum_warp": FORMAT + 1}, path)
-            fix = "pip install --upgrade lyceum-warp"
+            fix = "--upgrade"
         case "partial":
             del content["policy"]
             torch.save(content, path)
         case "shape":
             content["policy"]["shape"]["nobs"] = 4
             torch.save(content, path)
-    with pytest.raises(ValueError, match=fix) as caught:
+    with pytest.raises(ValueError, match=rf"{path}.*{fix}") as caught:
         load(run)
-    assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

@@ -41,18 +41,15 @@ def test_run_has_the_name_of_its_task(tmp_path: Path, config: dict[str, object],
 
 def test_creating_a_run_in_a_folder_with_content_raises_an_error(run: Run, tmp_path: Path) -> None:
     before = {path: path.read_bytes() for path in run.folder.iterdir()}
-    with pytest.raises(ValueError, match=r"contains a run: use another folder, or continue the run"):
+    with pytest.raises(ValueError, match=f"{run.folder} contains a run"):
         Run.create(run.folder, {})
     assert before == {path: path.read_bytes() for path in run.folder.iterdir()}
     for file in ("file", "other/mine.tmp"):  # temporary files may belong to another program
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).write_text("mine")
     for place in (tmp_path, tmp_path / "file", tmp_path / "other"):
-        with pytest.raises(ValueError, match="is not an empty folder: use another folder"):
+        with pytest.raises(ValueError, match=f"{place} exists"):
             Run.create(place, {})
-    (tmp_path / "other" / "config.json").write_text("{}")  # a planner has written this folder
-    with pytest.raises(ValueError, match="contains a run: use another folder$"):
-        Run.create(tmp_path / "other", {})
 
 
 def test_creating_a_run_with_an_invalid_configuration_leaves_no_folder(tmp_path: Path) -> None:
@@ -107,51 +104,35 @@ def test_previous_checkpoint_remains_after_a_save(run: Run, caplog: pytest.LogCa
 # config.json
 
 
-@pytest.mark.parametrize(("config", "message"), [
-    *((config, "is not the configuration of a run") for config in ("{", [], {}, "text")),
-    *(({"format": number}, f"has format {number!r}, and .* reads formats up to 1: pip install --upgrade")
-      for number in (FORMAT + 1, "one")),
-    ({"planner": {}}, "is the configuration of a planner, .* pass the folder of a training run"),
-    ({"task": 3}, "is damaged: task must be"),
-    ({"kept": []}, r"is damaged: kept must be of type dict, not \[\]"),
-    ({"kept": {"file": 3}}, "file must be of type str, not 3"),
-    ({"params": None}, "params must be of type dict"),
-    ({"seed": 2**63}, "seed must be a whole number from 0"),
-    ({"nworld": True}, "nworld must be a whole number"),
-    ({"tensorboard": 1}, "tensorboard must be of type bool"),
-    ({"reached": {"iteration": 1, "return": None}}, "return must be of type"),
-    ({"algorithm": "mine", "mine": 3}, "mine must be of type dict"),
-    ({"algorithm": "npg", "npg_seed": -1}, "npg_seed must be a whole number"),
+@pytest.mark.parametrize(("config", "text"), [
+    *((config, "") for config in ("{", [], {}, "text")),
+    *(({"format": number}, repr(number)) for number in (FORMAT + 1, "one")),
+    ({"planner": {}}, "planner"), ({"task": 3}, "task .*3"), ({"kept": []}, r"kept .*\[\]"),
+    ({"kept": {"file": 3}}, "file .*3"), ({"params": None}, "params .*None"), ({"seed": 2**63}, f"seed .*{2**63}"),
+    ({"nworld": True}, "nworld .*True"), ({"tensorboard": 1}, "tensorboard .*1"),
+    ({"reached": {"iteration": 1, "return": None}}, "return .*None"),
+    ({"algorithm": "mine", "mine": 3}, "mine .*3"), ({"algorithm": "npg", "npg_seed": -1}, "npg_seed .*-1"),
 ])  # fmt: skip
-def test_error_of_an_invalid_configuration_names_the_file(config: Any, message: str, tmp_path: Path) -> None:
+def test_error_of_an_invalid_configuration_names_the_file(config: Any, text: str, tmp_path: Path) -> None:
     if isinstance(config, dict) and config:
         config = {"format": FORMAT} | config
     (tmp_path / "config.json").write_text(config if config == "{" else json.dumps(config))
-    with pytest.raises(ValueError, match=rf"{tmp_path}/config\.json .*{message}"):
+    with pytest.raises(ValueError, match=rf"{tmp_path}/config\.json .*{text}"):
         Run.open(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("path", "hint"),
-    [
-        ("runs/hoper-1", "did you mean {}/runs/hopper-1 or {}/runs/hopper-2?"),
-        ("nothing", "{}/nothing, which does not exist: pass the folder"),
-        ("runs", "{}/runs/hopper-2"),
-        ("runs/hopper-2/policy.pt", "{}/runs/hopper-2/policy.pt, which is a file: pass a run's folder"),
-        ("empty", "{}/empty: it has no config.json"),
-    ],
-)
-@pytest.mark.parametrize("command", ["export", "view", "eval"])
-def test_path_without_a_run_names_what_is_there(
-    command: str, path: str, hint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_path_without_a_run_names_what_is_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("runs/hopper-1", "runs/hopper-2"):
         Run.create(tmp_path / name, {}).policy.touch()
-    (tmp_path / "empty").mkdir()
-    assert cli.main([command, str(tmp_path / path)]) == 2
-    if (command, path) == ("view", "nothing"):
-        hint = "no task '{}/nothing', and no folder"
-    refused(capsys, hint.replace("{}", str(tmp_path)))
+    for path, text in [
+        ("runs/hoper-1", f"{tmp_path}/runs/hopper-1 or {tmp_path}/runs/hopper-2?"),
+        ("nothing", f"{tmp_path}/nothing"),
+        ("runs", f"{tmp_path}/runs/hopper-2"),
+        ("runs/hopper-2/policy.pt", "is a file"),
+    ]:
+        for command in ("export", "view", "eval"):
+            assert cli.main([command, str(tmp_path / path)]) == 2
+            refused(capsys, text)
 
 
 def test_error_of_an_invalid_setting_names_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -211,8 +192,5 @@ def test_metrics_rows_after_the_checkpoint_are_removed(tmp_path: Path) -> None:
 def test_file_that_is_not_a_metrics_table_raises_an_error(tmp_path: Path) -> None:
     run = Run(tmp_path, {})
     run.metrics.write_text("iteration,value\n1,apple\n")
-    with pytest.raises(ValueError, match=r"metrics\.csv is not a table of metrics: line 2"):
-        run.rows()
-    run.metrics.write_text("iteration,value\n1,2,3\n")
-    with pytest.raises(ValueError, match="line 2"):
+    with pytest.raises(ValueError, match=r"metrics\.csv .*line 2: .*apple"):
         run.rows()
