@@ -158,7 +158,7 @@ def tasks(text: str) -> str:
 def task_section(name: str) -> str:
     """Return the section that describes a task."""
     task = BoundTask(find_task(name))
-    cls = task.task
+    cls = task.definition
     text = vars(cls).get("__doc__") or inspect.getdoc(sys.modules[cls.__module__]) or ""
     head, _, body = text.partition("\n\n")
     about = sentence(head.partition(": ")[2] or head)
@@ -187,7 +187,7 @@ def task_section(name: str) -> str:
 
 def facts(task: BoundTask) -> list[str]:
     """Return a table of a task's timing, physics and planner settings."""
-    cls, seconds = task.task, task.timestep
+    cls, seconds = task.definition, task.timestep
     rows = [
         ("step", f"{seconds:g} s, {count(task.frame_skip, 'substep')} of {1000 * task.model.opt.timestep:g} ms"),
         ("episode", f"{cls.horizon} steps, {cls.horizon * seconds:g} s" if cls.horizon else "no limit"),
@@ -211,7 +211,7 @@ def shortened(value: Any) -> str:
 
 def actions(task: BoundTask) -> list[str]:
     """Return a table of actions and bounds. Successive actions with equal bounds share a row."""
-    space = action_space(task.model, task.task.action_range, task.actions)
+    space = action_space(task.model, task.definition.action_range, task.actions)
     assert space.low is not None and space.high is not None
     rows: list[tuple[list[str], int, str]] = []
     for part, columns in space.parts.items():
@@ -227,7 +227,7 @@ def actions(task: BoundTask) -> list[str]:
 
 def metrics(task: BoundTask) -> list[str]:
     """Return a table of the metrics, with the weights of reward terms."""
-    weights, ends = task.task.rewards, task.task.terminations
+    weights, ends = task.definition.rewards, task.definition.terminations
     if not weights and not ends:
         return [f"Metrics: {', '.join(f'`{name}`' for name in task.metrics)}.", ""] if task.metrics else []
     rows = [(f"`{name}`", f"{weights[name]:g}" if name in weights else "ends the episode" if name in ends else "")

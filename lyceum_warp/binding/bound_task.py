@@ -89,7 +89,7 @@ def check_field_name(name: str) -> None:
 
 def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:
     """Compute the layout of each observation group from the task's parameters."""
-    task, name = source.task, source.name
+    task, name = source.definition, source.name
     if not hasattr(task, "obs"):
         return {group: parts.sizes(slices) for group, slices in obs_slices(source, params).items()}
     given = task.obs(SimpleNamespace(**params)) if callable(task.obs) else task.obs
@@ -114,7 +114,7 @@ def obs_layouts(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict
 
 def obs_slices(source: TaskSource, params: Mapping[str, Any]) -> dict[str, parts.Layout]:
     """Compute the layouts of observation groups that are declared as structs."""
-    if hasattr(source.task, "obs"):
+    if hasattr(source.definition, "obs"):
         return {}
     found = {}
     for group, struct in source.group_structs().items():
@@ -165,7 +165,9 @@ class BoundTask:
         params: Mapping[str, Any] | None = None,
     ) -> None:
         physics = physics or PhysicsOptions()
-        self.task, self.nworld = task, nworld
+        self.definition = task
+        """The task's class."""
+        self.nworld = nworld
         self.name = task_name(task)
         self.source = TaskSource(task, self.name)
         self.functions = self.source.functions
@@ -320,7 +322,7 @@ class BoundTask:
             raise ValueError(f"{', '.join(params)} would change the sizes of {changed} parts: make a new environment")
 
     def _check_class(self) -> None:
-        task = self.task
+        task = self.definition
         for name in self.source.memory:
             if is_data_field(name) or is_model_field(name) or name in OWN_PARTS:
                 raise ValueError(
@@ -352,14 +354,14 @@ class BoundTask:
                 )
 
     def _check_int(self, name: str, **bounds: int) -> int:
-        value, what = getattr(self.task, name), f"{name} of the task {self.name!r}"
+        value, what = getattr(self.definition, name), f"{name} of the task {self.name!r}"
         number = whole_number(what, value, **bounds)
         if isinstance(value, float):
             raise ValueError(f"{what} must be an int: write {number}, not {value!r}")
         return number
 
     def _check_success_steps(self) -> None:
-        task, name = self.task, f"success_steps of the task {self.name!r}"
+        task, name = self.definition, f"success_steps of the task {self.name!r}"
         steps = self._check_int("success_steps", low=1, high=_MOST_SUCCESS_STEPS)
         if steps > 1 and self.functions["success"] is None:
             raise ValueError(
@@ -380,14 +382,14 @@ class BoundTask:
             )
         if twice := [name for name in metrics if metrics.count(name) > 1]:
             raise ValueError(f"the task {self.name!r} names the metric {twice[0]!r} twice: give each one name")
-        if self.functions["measure"] is not None and not self.task.metrics:
+        if self.functions["measure"] is not None and not self.definition.metrics:
             raise ValueError(
                 f"the task {self.name!r} has {FUNCTIONS['measure'].signature}, but its class does not name its "
                 "metrics: add metrics = (...)"
             )
 
     def _checked_actions(self) -> dict[str, int] | None:
-        actions = self.task.actions
+        actions = self.definition.actions
         if actions is None:
             if self.model.nu == 0:
                 raise ValueError(

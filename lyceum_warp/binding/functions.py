@@ -22,7 +22,7 @@ class TaskSource:
     """Finds the structs and the functions of a task."""
 
     def __init__(self, task: type[Task], name: str) -> None:
-        self.task, self.name = task, name
+        self.definition, self.name = task, name
         self.path = f"{task.__module__}.{task.__qualname__}"
         self.kernel_name = kernel_name(task)
         self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
@@ -55,7 +55,7 @@ class TaskSource:
                     f"{wanted.signature}"
                 )
             found[group] = function
-        for name in self._observers(self.task):
+        for name in self._observers(self.definition):
             if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
                 raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
         return found
@@ -105,10 +105,10 @@ class TaskSource:
 
     @property
     def _has_structs(self) -> bool:
-        return not hasattr(self.task, "obs")
+        return not hasattr(self.definition, "obs")
 
     def _struct(self, name: str) -> Any:
-        struct = self._declared(name, self.task)
+        struct = self._declared(name, self.definition)
         if isinstance(struct, type):
             raise ValueError(f"{name} of the task {self.name!r} must be a Warp struct: decorate it with @wp.struct")
         if not hasattr(struct, "vars"):
@@ -140,7 +140,7 @@ class TaskSource:
         return own
 
     def _memory(self) -> dict[str, Part]:
-        counted = [name for name in MEMORIES if hasattr(self.task, name)]
+        counted = [name for name in MEMORIES if hasattr(self.definition, name)]
         parts = parts_of(self.world, "World")
         if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
             raise ValueError(
@@ -177,7 +177,7 @@ class TaskSource:
         types = list(function.input_types.values())
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
-        if foreign and function.func.__module__ in {owner.__module__ for owner in self.task.__mro__}:
+        if foreign and function.func.__module__ in {owner.__module__ for owner in self.definition.__mro__}:
             return None  # the function belongs to another task in the module
         annotations = function.func.__annotations__
         if any(isinstance(annotation, str) for annotation in annotations.values()):
@@ -219,12 +219,12 @@ class TaskSource:
     def _check_names(self) -> None:
         """Refuse a name that is similar to one in ``FUNCTIONS``, because it is probably misspelt."""
         attributes = [name for name in vars(Task) if not name.startswith("_")]
-        for name in vars(self.task):
+        for name in vars(self.definition):
             if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
                 continue
             if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
                 raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
-        for name, value in vars(sys.modules[self.task.__module__]).items():
+        for name, value in vars(sys.modules[self.definition.__module__]).items():
             known = (*FUNCTIONS, *self.terms.functions)
             if isinstance(value, wp.Function) and name not in known and not name.startswith(GROUP_PREFIX):
                 own = self._kind(next(iter(value.input_types.values()), None)) == "World"

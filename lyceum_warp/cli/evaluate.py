@@ -206,7 +206,7 @@ def _print_levels(results: list[Episodes]) -> None:
 
 def _print_statistics(env: Env, episodes: Episodes) -> None:
     # terms, ends and what measure writes add up over an episode; other metrics, such as a level, do not
-    averaged = env.task.task.metrics if env.task.functions["measure"] is None else ()
+    averaged = env.task.definition.metrics if env.task.functions["measure"] is None else ()
     numbers = {
         "return": episodes.returns, "evaluation at the end": episodes.evals, "last reward": episodes.rewards,
         "length": episodes.lengths,

@@ -172,7 +172,7 @@ class Plan:
         planner = make_planner(None if choice is None else choice.setting)
         CheckedController(planner, plant).check_horizon(planner.horizon, every)
         config = {
-            "algorithm": planner.settings["update"], "task": spelled_task(plant.task.task), "params": params,
+            "algorithm": planner.settings["update"], "task": spelled_task(plant.task.definition), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
             "planner_model": self.planner_model and str(Path(os.path.expanduser(self.planner_model)).resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
@@ -195,7 +195,7 @@ def _worlds(
     plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
-    task = plant.task.task
+    task = plant.task.definition
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
     planner_options = given(options.planner) | given(options.planner_physics)
@@ -226,7 +226,7 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
     A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
     as one step of the planner's worlds.
     """
-    task, flags = plant.task.task, given(options.mppi)
+    task, flags = plant.task.definition, given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
     samples = [config.samples]
     if not {"samples", "elites"} & flags.keys():

@@ -118,9 +118,9 @@ class View:
         else:
             env = Env(self.what[0], nworld=1 if self.nworld is None else self.nworld, **options, **params)
         if self.mppi:
-            config = self.planner.on_top_of(task_config(env.task.task))
+            config = self.planner.on_top_of(task_config(env.task.definition))
             options |= {} if env.options.model is None else {"model": env.options.model}
-            controllers["mppi"] = MPPI(env.task.task, config, seed=self.seed, params=env.given_params, **options)
+            controllers["mppi"] = MPPI(env.task.definition, config, seed=self.seed, params=env.given_params, **options)
         view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **page)
         return 0
 

@@ -244,7 +244,7 @@ _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "a
 
 def source(env: Env) -> dict[str, Any]:
     """Collect the arguments that recreate an environment; see ``Trajectory.source``."""
-    task = env.task.task
+    task = env.task.definition
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
     model = options.pop("model", None)
     if isinstance(model, str | Path):

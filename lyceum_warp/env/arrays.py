@@ -29,7 +29,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, except for the counters."""
-    form, found = task.task, dict[str, int]()
+    form, found = task.definition, dict[str, int]()
     for layout in task.memory.values():
         found |= sizes(layout)
     own = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
@@ -57,7 +57,7 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
 
     def _allocate_fields(self) -> None:
-        n, model, task, kernels = self.nworld, self.task.model, self.task.task, self.task.kernels
+        n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
@@ -129,7 +129,7 @@ class WorldArrays:
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
 
     def _allocate_actions(self) -> None:
-        n, model, task = self.nworld, self.task.model, self.task.task
+        n, model, task = self.nworld, self.task.model, self.task.definition
         naction = self.action_space.size
         self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
         self.buffers["action"] = torch_view(self.action)

@@ -572,7 +572,7 @@ class Env:
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
         known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
         given = self._params_for(nworld, self._given_params)
-        made = Env(self.task.task, known.changed({"nworld": nworld}), _replica=True, **(given | params))
+        made = Env(self.task.definition, known.changed({"nworld": nworld}), _replica=True, **(given | params))
         made._copy_shared(self)
         return made
 

@@ -48,7 +48,7 @@ class Worlds(WorldArrays):
         super().__init__(task, engine)
         self._workers = self._make_workers()
         self._programs: dict[tuple[int, bool, bool], Programs] = {}
-        horizon = task.task.horizon if options.horizon is None else options.horizon
+        horizon = task.definition.horizon if options.horizon is None else options.horizon
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
@@ -146,7 +146,7 @@ class Worlds(WorldArrays):
             phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
         if randomly and (kernel := self.task.kernels.reject_worlds) is not None:
             phases.append(Phase("redraw", partial(self._redraw, kernel, mask), engine=True))
-        if settle := self.task.task.settle:
+        if settle := self.task.definition.settle:
             phases.append(Phase("settle", partial(self.engine.settle, mask, settle), engine=True))
         return phases
 
@@ -252,12 +252,13 @@ class Worlds(WorldArrays):
 
     def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
         if self.success_counts.size:
-            args = [mask, transition, self.task.task.success_steps, self.success_counts, self.outcome.success]
+            args = [mask, transition, self.task.definition.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         self.engine.reset(mask)
-        self._clear(mask, "memory", *self.task.task.cleared, *([] if again else ["metric_sums", "success_counts"]))
+        counts = [] if again else ["metric_sums", "success_counts"]
+        self._clear(mask, "memory", *self.task.definition.cleared, *counts)
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
             kept, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
@@ -277,7 +278,7 @@ class Worlds(WorldArrays):
 
     def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
         wp.copy(self._rejected, mask)
-        for _ in range(self.task.task.draws - 1):
+        for _ in range(self.task.definition.draws - 1):
             # on a GPU, reading the mask would wait for the device
             if not self.engine.capturable and not self._rejected.numpy().any():
                 return

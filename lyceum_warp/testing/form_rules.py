@@ -67,7 +67,7 @@ def check_success_steps(ctx: Context) -> None:
 
     The number of successes so far is part of the state, and a reset clears it.
     """
-    a, b, needed = ctx.a, ctx.b, int(ctx.a.task.task.success_steps)
+    a, b, needed = ctx.a, ctx.b, int(ctx.a.task.definition.success_steps)
     if needed == 1:
         return
     column = a.state_space.parts["success_steps"]

@@ -179,7 +179,7 @@ def check_dynamics(ctx: Context) -> None:
 
 def check_settle(ctx: Context) -> None:
     """An episode starts at time 0 after the substeps of ``settle``."""
-    nstep = ctx.a.task.task.settle
+    nstep = ctx.a.task.definition.settle
     if nstep == 0:
         return
     ctx = converged(ctx)

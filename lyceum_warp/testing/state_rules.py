@@ -237,7 +237,7 @@ def check_world_count(ctx: Context) -> None:
 def check_keyframe(ctx: Context) -> None:
     """A reset starts from the task's keyframe."""
     env = ctx.a
-    if (name := env.task.task.keyframe) is None:
+    if (name := env.task.definition.keyframe) is None:
         return
     key = env.task.model.key(name)
     env.engine.reset(env.worlds.everyone)
@@ -257,7 +257,7 @@ def check_rejection(ctx: Context) -> None:
     reject = a.task.kernels.reject_worlds
     if reject is None:
         return
-    task, engine = a.task.task, a.engine
+    task, engine = a.task.definition, a.engine
     count, rejected = torch.zeros(a.nworld, dtype=torch.int), wp.zeros(a.nworld, dtype=bool, device=a.device)
     reset = engine.reset
 

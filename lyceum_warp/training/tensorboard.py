@@ -126,7 +126,7 @@ class TensorBoard(Callback):
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:
     """Return mjlab's names for columns, each with a factor that converts to mjlab's unit."""
-    task, seconds = env.task.task, env.horizon * env.timestep
+    task, seconds = env.task.definition, env.horizon * env.timestep
     rewards = task.rewards if seconds else ()  # mjlab divides rewards by the time limit
     return {f"metrics/{name}": (f"Episode_Reward/{name}", 1 / seconds) for name in rewards} | {
         f"step_metrics/{name}": (f"Episode_Termination/{name}", float(env.nworld))

@@ -53,7 +53,7 @@ def test_new_task_passes_check_task(engine: str, folder: Path) -> None:
 
 def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
     env = lw.make(str(new("everything", RICH)), nworld=2, seed=3)
-    task = env.task.task
+    task = env.task.definition
     assert task.obs == {"position": 13, "velocity": 11, "activation": 1, "sensors": 4}
     assert (task.frame_skip, task.horizon, task.keyframe, task.action_range) == (4, 500, "home", (-1.0, 1.0))
     assert env.field("qpos", "hinge")[0] == pytest.approx(0.3)

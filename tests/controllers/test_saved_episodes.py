@@ -59,7 +59,7 @@ def test_episode_env_finds_the_task_file(task_file: TaskFile, tmp_path: Path) ->
     env = lw.make(f"{file}:Tiny", autoreset=False, horizon=3)
     path = lw.control(env, lambda state, obs: torch.zeros(3)).save(tmp_path / "mine.npz")
     made = episode_env(load_episodes(path))
-    assert made.task.name == "tiny" and made.task.task is env.task.task
+    assert made.task.name == "tiny" and made.task.definition is env.task.definition
     gone = dataclasses.replace(lw.Trajectory.load(path), source={"task": "/nowhere/tiny.py:Tiny"})
     with pytest.raises(FileNotFoundError, match=r"/nowhere/tiny.py, does not exist any more: pass a file"):
         episode_env(gone)

@@ -134,7 +134,8 @@ def test_task_has_the_sizes_and_time_steps_of_dm_control(shared_env: SharedEnv, 
     assert env.model.opt.timestep == pytest.approx(theirs["timestep"])
     np.testing.assert_allclose(env.action_space.low, theirs["minimum"])
     np.testing.assert_allclose(env.action_space.high, theirs["maximum"])
-    assert (theirs["step_type"] == [0, *(env.task.task.horizon - 1) * [1], 2]).all() and (theirs["discount"] == 1).all()
+    assert (theirs["step_type"] == [0, *(env.task.definition.horizon - 1) * [1], 2]).all()
+    assert (theirs["discount"] == 1).all()
 
 
 @quick

@@ -38,7 +38,7 @@ def test_gait_clock_reward_is_the_share_of_feet_that_follow_the_clock(g1: lw.Env
         cycles = torch.atan2(*clock(g1).T) / (2.0 * torch.pi)
         contact = g1.obs_spaces["critic"].split(g1.obs_groups["critic"])["foot_contact"] > 0.0
         stands = torch.stack([(cycles + 0.5 * foot) % 1.0 < g1.task.params["stance_share"] for foot in range(2)], 1)
-        share = g1.metrics["gait_clock"] / (g1.timestep * g1.task.task.rewards["gait_clock"])
+        share = g1.metrics["gait_clock"] / (g1.timestep * g1.task.definition.rewards["gait_clock"])
         np.testing.assert_allclose(share, (stands == contact).float().mean(1), atol=1e-5)
         seen |= set(share.mul(2).round().tolist())
     assert seen == {0.0, 1.0, 2.0}

@@ -112,7 +112,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         "observations": parts,
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
         "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
-        **task.task.deployment(model, SimpleNamespace(**task.params), memory),
+        **task.definition.deployment(model, SimpleNamespace(**task.params), memory),
     }
 
 

@@ -171,7 +171,7 @@ class Rollout:
             team: The processes.
         """
         env, team = self.env, team or Team()
-        if env.horizon == 0 or (env.task.task.settle and env.engine.capturable):
+        if env.horizon == 0 or (env.task.definition.settle and env.engine.capturable):
             return
         state = env.get_state()
         steps = torch.randint(env.horizon, (team.size * env.nworld,), generator=generator, device=state.device)

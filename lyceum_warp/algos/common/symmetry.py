@@ -55,7 +55,7 @@ def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:
     Raises:
         ValueError: The task declares no mirror, or a part of the observation or action has no mirror image.
     """
-    task: Any = env.task.task
+    task: Any = env.task.definition
     declared = task.mirror
     if callable(declared):
         declared = declared(env.task.model, SimpleNamespace(**env.task.params))

@@ -208,7 +208,7 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
 
     Options that only the Warp engine has are ignored.
     """
-    named = {EXACT: PhysicsOptions(), **env.task.task.physics}
+    named = {EXACT: PhysicsOptions(), **env.task.definition.physics}
     current = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
     name = next((name for name, options in named.items() if options == current), "own")
     return named | {name: current}, name

@@ -35,7 +35,7 @@ def describe(learner: Learner) -> dict[str, Any]:
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     return {
         "algorithm": learner.algorithm,
-        "task": spelled_task(env.task.task),
+        "task": spelled_task(env.task.definition),
         "params": {name: json_value(name, value) for name, value in env.given_params.items()},
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,

@@ -38,7 +38,7 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     Returns:
         The entry ``kept`` of config.json, and the files of the folder ``task``, by their paths in this folder.
     """
-    task, model_given = env.task.task, env.options.model is not None
+    task, model_given = env.task.definition, env.options.model is not None
     sources, private = source_files(task), not task.__module__.startswith("lyceum_warp.")
     file = next(iter(sources), None)
     manifest: dict[str, Any] = {"name": env.task.name, "model_hash": _model_hash(env), "model_given": model_given}
@@ -82,7 +82,7 @@ def _data_files(task: type[Task]) -> tuple[list[Path], list[Path]]:
 
 def note_uncopied_data(env: Env) -> None:
     """Log a warning if the run's copy of an environment's task lacks data files that the task reads."""
-    for path in _data_files(env.task.task)[1][:1]:
+    for path in _data_files(env.task.definition)[1][:1]:
         log.warning(
             "the run has no copy of %s, which the task %r reads: it copies files that lie below the folder of the "
             "task's file, have not changed since they were read, and have less than %d MiB",
@@ -228,7 +228,7 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
 
     The compiled model depends on the physics. Set ``model`` to False if the physics differ on purpose.
     """
-    manifest, sources = run.manifest, source_files(env.task.task)
+    manifest, sources = run.manifest, source_files(env.task.definition)
     file = next(iter(sources), None)
     if manifest.get("program"):  # a change of the training script may have nothing to do with the task
         manifest = {**manifest, "source_hash": None}
@@ -276,7 +276,7 @@ def _model_hash(env: Env) -> str:
 
 def _model_files(env: Env) -> tuple[Path | None, Files]:
     """Get the main file and all files of a task's model. A model made in Python is written as MJCF."""
-    task, model = env.task.task, env.options.model
+    task, model = env.task.definition, env.options.model
     source = task.model if model is None else model
     if isinstance(source, str | Path):
         source = find_model(source, task if model is None else None)

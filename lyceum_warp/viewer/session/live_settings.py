@@ -32,6 +32,6 @@ def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:
     env = planner.env
     options = {key: value for key, value in env.options.given().items() if key not in _OF_THE_PLANNER}
     return type(planner)(
-        env.task.task, dataclasses.replace(planner.config, **{name: kind(value)}), value=planner.value,
+        env.task.definition, dataclasses.replace(planner.config, **{name: kind(value)}), value=planner.value,
         seed=planner.seeds[0], params=env.given_params, **(options | {"model": env.task.spec}),
     )  # fmt: skip

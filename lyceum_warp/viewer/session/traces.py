@@ -86,7 +86,7 @@ class TraceRollouts:
 
     def __init__(self, controller: Any, plant: Env) -> None:
         env = controller.env if isinstance(controller, Planner) else plant
-        field, self._index = trace_point(env.task.model, env.task.task.trace)
+        field, self._index = trace_point(env.task.model, env.task.definition.trace)
         self._nominal = isinstance(controller, Planner) and controller.config.nominal_model
         fields = tuple(dict.fromkeys((*env.options.fields, field)))
         threads = {"nthread": 1} if env.engine.name == "mujoco" else {}
