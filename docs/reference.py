@@ -20,7 +20,7 @@ from lyceum_warp.binding import file_name, find_task
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.core.spaces import action_space
 from lyceum_warp.core.task import Element, FromModel
-from lyceum_warp.support.docstrings import attribute_docs, field_docs
+from lyceum_warp.support.docstrings import attribute_docs
 
 DOCS = Path(__file__).parent
 
@@ -237,13 +237,13 @@ def metrics(task: BoundTask) -> list[str]:
 
 def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
     """Return the parameters, their defaults, and their comments in the task's files."""
-    meanings = field_docs(task.source.defaults)
+    meanings = attribute_docs(*reversed(task.source.defaults.__mro__[:-1]))
     rows = []
     for name in task.source.params.vars:
         if name in ("dt", "substep_dt"):
             continue
         default = getattr(task.source.defaults, name)
-        meaning = meanings[name].replace("|", "\\|").replace("*", "\\*")
+        meaning = meanings.get(name, "").replace("|", "\\|").replace("*", "\\*")
         rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meaning))
     return rows
 

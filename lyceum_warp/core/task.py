@@ -1,9 +1,7 @@
 """Define the base class of tasks and the table of task functions."""
 
 import dataclasses
-import inspect
 import sys
-import textwrap
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
@@ -34,15 +32,14 @@ else:
 
 @dataclasses.dataclass(frozen=True)
 class TaskFunction:
-    """Signature, purpose and default of a task function."""
+    """Signature and default of a task function."""
 
     name: str
     arguments: str
-    result: type | None
+    result: type | None = None
     """Type of the result: float, bool, or None for a function that writes into its arguments."""
-    about: str
-    """Purpose and default, for the documentation."""
     default: str | None = None
+    """Body of the function that stands in for a task's own."""
     optional: str = ""
     """Last arguments, which a task's function may omit."""
     writes: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -83,59 +80,29 @@ _RNG = "rng: Row[wp.uint32]"
 FUNCTIONS = {
     function.name: function
     for function in (
-        TaskFunction("observe", "s: World, p: Params, obs: Row[float]", None,
-                     "Writes the observation, into a row or into a struct of named parts. Every task needs this "
-                     "function. With ``rng`` as its last argument, the function may draw noise.", optional=_RNG),
-        TaskFunction("control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", None,
-                     "Turns an action into controls, and writes further inputs. Default: copies or scales the action "
-                     "(see ``action_range``).", "pass", writes={"s": "inputs"}),
-        TaskFunction("reward", _TRANSITION, float,
-                     "Reward of one transition. ``advance`` has already written the memory of ``s1``. Default: 0.",
-                     "return 0.0"),
-        TaskFunction("measure", f"{_TRANSITION}, metrics: Row[float]", None,
-                     "Writes the metrics of one transition, in the order of the attribute ``metrics``. Default: none.",
-                     "pass"),
-        TaskFunction("evaluate", "s: World, p: Params", float,
-                     "The evaluation metric, separate from the reward. Default: the reward.", "return 0.0"),
-        TaskFunction("terminated", "s: World, p: Params", bool,
-                     "Whether the state ends the episode. Default: False.", "return False"),
-        TaskFunction("truncated", "s: World, p: Params", bool,
-                     "Whether the episode ends without a failure, such as at the end of a clip. Learners then "
-                     "bootstrap from the last observation. Planners ignore it. Default: False.", "return False"),
-        TaskFunction("success", "s: World, p: Params", bool,
-                     "Whether the state meets the task's goal; ``success_steps`` may require several steps in a row. "
-                     "Default: False.", "return False"),
-        TaskFunction("startup", f"s: World, p: Params, {_RNG}", None,
-                     "Draws model fields and lasting memory once for each world, when its random stream starts. "
-                     "Default: no change.", "pass", writes={"s": "lasting"}),
-        TaskFunction("initialize", "s: World, p: Params", None,
-                     "Changes the fixed initial state, which the model defines. Default: no change.", "pass",
-                     writes={"s": "start"}),
-        TaskFunction("randomize", f"s: World, p: Params, {_RNG}", None,
-                     "Turns the fixed initial state into a random initial state. Default: no change.", "pass",
-                     writes={"s": "start"}),
-        TaskFunction("reject", "s: World, p: Params", bool,
-                     "Whether a random initial state must be drawn again, at most ``draws`` times. Default: False.",
-                     "return False"),
-        TaskFunction("event", f"s: World, p: Params, {_RNG}", None,
-                     "Changes the state between two steps, after the reward and before the next observation. "
-                     "Default: no change.", "pass", writes={"s": "start"}),
-        TaskFunction("substep", "s: World, p: Params", None,
-                     "Writes task memory after each substep. Default: no change.", "pass", writes={"s": "memory"}),
-        TaskFunction("advance", f"{_TRANSITION}, {_RNG}", None,
-                     "Writes task memory of ``s1`` after each step and before ``reward``. Default: no change.", "pass",
-                     writes={"s1": "memory"}),
-        TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", None,
-                     "Writes what one transition adds to sums over all worlds. ``ended`` is True at an episode's end. "
-                     "With ``terminated`` as its last argument, the function can tell failures from truncations. "
-                     "It is called only in environments with automatic resets. Default: none.",
-                     optional="terminated: bool"),
-        TaskFunction("share", "shared: Shared, sums: Sums, p: Params", None,
-                     "Updates the memory that all worlds share, from the sums since the last update. "
-                     "``env.update_shared`` calls this function. Default: no change."),
+        TaskFunction("observe", "s: World, p: Params, obs: Row[float]", optional=_RNG),
+        TaskFunction(
+            "control", "s: World, action: Row[float], p: Params, ctrl: Row[float]", default="pass",
+            writes={"s": "inputs"},
+        ),
+        TaskFunction("reward", _TRANSITION, float, "return 0.0"),
+        TaskFunction("measure", f"{_TRANSITION}, metrics: Row[float]", default="pass"),
+        TaskFunction("evaluate", "s: World, p: Params", float, "return 0.0"),
+        TaskFunction("terminated", "s: World, p: Params", bool, "return False"),
+        TaskFunction("truncated", "s: World, p: Params", bool, "return False"),
+        TaskFunction("success", "s: World, p: Params", bool, "return False"),
+        TaskFunction("startup", f"s: World, p: Params, {_RNG}", default="pass", writes={"s": "lasting"}),
+        TaskFunction("initialize", "s: World, p: Params", default="pass", writes={"s": "start"}),
+        TaskFunction("randomize", f"s: World, p: Params, {_RNG}", default="pass", writes={"s": "start"}),
+        TaskFunction("reject", "s: World, p: Params", bool, "return False"),
+        TaskFunction("event", f"s: World, p: Params, {_RNG}", default="pass", writes={"s": "start"}),
+        TaskFunction("substep", "s: World, p: Params", default="pass", writes={"s": "memory"}),
+        TaskFunction("advance", f"{_TRANSITION}, {_RNG}", default="pass", writes={"s1": "memory"}),
+        TaskFunction("tally", f"{_TRANSITION}, ended: bool, sums: Sums", optional="terminated: bool"),
+        TaskFunction("share", "shared: Shared, sums: Sums, p: Params"),
     )
 }  # fmt: skip
-"""The functions of a task, by name."""
+"""The functions of a task, by name. ``help(lw.Task)`` gives their purposes."""
 
 
 RESULTS = ("obs", "ctrl", "metrics", "rng", "sums", "shared")
@@ -151,15 +118,6 @@ GROUP_PREFIX = "observe_"
 def observer_name(group: str) -> str:
     """Get the name of the function that writes a group of observations."""
     return "observe" if group == "policy" else f"{GROUP_PREFIX}{group}"
-
-
-def _document_functions(cls: type["Task"]) -> type["Task"]:
-    rows = []
-    for function in FUNCTIONS.values():
-        rows += [f"    {function.signature}", *textwrap.wrap(function.about, 108, initial_indent=" " * 8,
-                                                              subsequent_indent=" " * 8)]  # fmt: skip
-    cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{functions}", "\n".join(rows))
-    return cls
 
 
 @dataclasses.dataclass(frozen=True)
@@ -396,7 +354,6 @@ class Training:
             raise ValueError(f"settings of lw.Training must be a dict, not {self.settings!r}")
 
 
-@_document_functions
 @document_attributes
 class Task:
     """Base class of tasks: a model, the fields that functions read, and functions that run in each world.
@@ -420,7 +377,49 @@ class Task:
     ``lw.sensors``. ``lw.from_model`` computes a default from the compiled model.
 
     Functions:
-    {functions}
+        observe(s: World, p: Params, obs: Row[float])
+            Writes the observation, into a row or into a struct of named parts. Every task needs this
+            function. With ``rng`` as its last argument, the function may draw noise.
+        control(s: World, action: Row[float], p: Params, ctrl: Row[float])
+            Turns an action into controls, and writes further inputs. Default: copies or scales the action
+            (see ``action_range``).
+        reward(s0: World, action: Row[float], s1: World, p: Params) -> float
+            Reward of one transition. ``advance`` has already written the memory of ``s1``. Default: 0.
+        measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[float])
+            Writes the metrics of one transition, in the order of the attribute ``metrics``. Default: none.
+        evaluate(s: World, p: Params) -> float
+            The evaluation metric, separate from the reward. Default: the reward.
+        terminated(s: World, p: Params) -> bool
+            Whether the state ends the episode. Default: False.
+        truncated(s: World, p: Params) -> bool
+            Whether the episode ends without a failure, such as at the end of a clip. Learners then
+            bootstrap from the last observation. Planners ignore it. Default: False.
+        success(s: World, p: Params) -> bool
+            Whether the state meets the task's goal; ``success_steps`` may require several steps in a row.
+            Default: False.
+        startup(s: World, p: Params, rng: Row[wp.uint32])
+            Draws model fields and lasting memory once for each world, when its random stream starts.
+            Default: no change.
+        initialize(s: World, p: Params)
+            Changes the fixed initial state, which the model defines. Default: no change.
+        randomize(s: World, p: Params, rng: Row[wp.uint32])
+            Turns the fixed initial state into a random initial state. Default: no change.
+        reject(s: World, p: Params) -> bool
+            Whether a random initial state must be drawn again, at most ``draws`` times. Default: False.
+        event(s: World, p: Params, rng: Row[wp.uint32])
+            Changes the state between two steps, after the reward and before the next observation. Default:
+            no change.
+        substep(s: World, p: Params)
+            Writes task memory after each substep. Default: no change.
+        advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32])
+            Writes task memory of ``s1`` after each step and before ``reward``. Default: no change.
+        tally(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums)
+            Writes what one transition adds to sums over all worlds. ``ended`` is True at an episode's end.
+            With ``terminated`` as its last argument, the function can tell failures from truncations. It is
+            called only in environments with automatic resets. Default: none.
+        share(shared: Shared, sums: Sums, p: Params)
+            Updates the memory that all worlds share, from the sums since the last update.
+            ``env.update_shared`` calls this function. Default: no change.
 
     The argument ``s`` has one world's fields in the current state. ``s0`` has the fields before the step, and ``s1``
     has them after the step. Fields of the position and velocity stages belong to this state. Fields of the acceleration

@@ -5,17 +5,10 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.kernels.rotations import quat_from_axis_angle
-from lyceum_warp.support.docstrings import document_overloads
 
 
 @wp.func
 def put(row: wp.array[float], at: int, value: float) -> int:
-    """Write a value into a row, starting at the index ``at``, and return the next index.
-
-    The value is a number, a bool, a vector, a matrix (row by row), or a row of any of these. If the value is a row,
-    ``first`` and ``last`` select its elements with first <= i < last. Chain calls to write an observation: ``k =
-    lw.put(obs, 0, s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
-    """
     row[at] = value
     return at + 1
 
@@ -66,6 +59,12 @@ def put(row: wp.array[float], at: int, value: wp.array[Any]) -> int:
 # keep this overload last: it fits every type, and Warp uses the first overload that fits
 @wp.func
 def put(row: wp.array[float], at: int, value: Any) -> int:
+    """Write a value into a row, starting at the index ``at``, and return the next index.
+
+    The value is a number, a bool, a vector, a matrix (row by row), or a row of any of these. From a row,
+    ``put(row, at, value, first, last)`` writes the elements with first <= i < last. Chain calls to write an
+    observation: ``k = lw.put(obs, 0, s.qpos)``, then ``k = lw.put(obs, k, s.qvel)``.
+    """
     for i in range(len(value)):
         row[at + i] = value[i]
     return at + len(value)
@@ -83,6 +82,3 @@ def put_upright(qpos: wp.array[float], at: int, position: wp.vec3, yaw: float) -
     """
     k = put(qpos, at, position)
     return put(qpos, k, quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw))
-
-
-document_overloads(put)

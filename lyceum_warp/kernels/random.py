@@ -6,8 +6,6 @@ stream as seed 1 with episode 0.
 
 import warp as wp
 
-from lyceum_warp.support.docstrings import document_overloads
-
 
 @wp.func
 def world_key(seed: int, world: int) -> wp.uint32:
@@ -28,19 +26,6 @@ def substream(base: wp.uint32, number: int) -> wp.uint32:
 
 
 @wp.func
-def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
-    """Draw from U(low, high) and advance the stream. Each element of a vector is drawn from its own range.
-
-    Warp passes numbers by value, so a function cannot change a number of its caller. The stream is therefore a row with
-    one element.
-    """
-    state = rng[0]
-    value = wp.randf(state, low, high)
-    rng[0] = state
-    return value
-
-
-@wp.func
 def uniform(rng: wp.array[wp.uint32], low: wp.vec2, high: wp.vec2) -> wp.vec2:
     value = wp.vec2()
     for i in range(2):
@@ -53,6 +38,19 @@ def uniform(rng: wp.array[wp.uint32], low: wp.vec3, high: wp.vec3) -> wp.vec3:
     value = wp.vec3()
     for i in range(3):
         value[i] = uniform(rng, low[i], high[i])
+    return value
+
+
+@wp.func
+def uniform(rng: wp.array[wp.uint32], low: float, high: float) -> float:
+    """Draw from U(low, high) and advance the stream. Each element of a vector is drawn from its own range.
+
+    Warp passes numbers by value, so a function cannot change a number of its caller. The stream is therefore a row with
+    one element.
+    """
+    state = rng[0]
+    value = wp.randf(state, low, high)
+    rng[0] = state
     return value
 
 
@@ -81,6 +79,3 @@ def seed_worlds(
     if mask_in[w]:
         key_out[w] = world_key(seed_in[0], first + int(w))
         episode_out[w] = -1
-
-
-document_overloads(uniform)

@@ -5,8 +5,6 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.support.docstrings import document_overloads
-
 
 class Sigmoid(enum.IntEnum):
     """The curves along which ``tolerance`` decreases from 1 towards 0, as in dm_control's ``rewards.py``."""
@@ -101,7 +99,6 @@ def grasp_terms(distance: float, finger: float, closed: float) -> tuple[float, f
 
 @wp.func
 def sum_squares(row: wp.array[float], first: int, last: int) -> float:
-    """Sum the squares of a row's elements (numbers or vectors), or only of those with first <= i < last."""
     total = float(0.0)
     for i in range(first, last):
         total += row[i] * row[i]
@@ -123,6 +120,10 @@ def sum_squares(row: wp.array[float]) -> float:
 
 @wp.func
 def sum_squares(row: wp.array[Any]) -> float:
+    """Sum the squares of a row's elements, which are numbers or vectors.
+
+    ``sum_squares(row, first, last)`` sums only those with first <= i < last.
+    """
     return sum_squares(row, 0, row.shape[0])
 
 
@@ -139,6 +140,3 @@ def all_inside(row: wp.array[float], first: int, last: int, bounds: wp.vec2) -> 
     for i in range(first, last):
         ok = ok and inside(row[i], bounds)
     return ok
-
-
-document_overloads(sum_squares)

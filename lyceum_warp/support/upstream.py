@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.support.docstrings import field_docs, listed
+from lyceum_warp.support.docstrings import attribute_docs, listed
 
 
 def builtin_functions() -> Mapping[str, Any]:
@@ -32,7 +32,8 @@ class _StructDoc:
     def __get__(self, struct: Any, owner: type) -> str | None:
         if struct is None:
             return None
-        return f"{inspect.cleandoc(struct.cls.__doc__ or struct.key)}\n\nFields:\n{listed(field_docs(struct.cls))}\n"
+        docs = dict.fromkeys(struct.vars, "") | attribute_docs(*reversed(struct.cls.__mro__[:-1]))
+        return f"{inspect.cleandoc(struct.cls.__doc__ or struct.key)}\n\nFields:\n{listed(docs)}\n"
 
     def __set__(self, struct: Any, doc: str | None) -> None:
         """Ignore the docstring that ``wp.struct`` copies from the class."""

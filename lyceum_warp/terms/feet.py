@@ -8,7 +8,6 @@ plane z = 0. On uneven ground, a task must measure the heights itself and sum ``
 import warp as wp
 
 from lyceum_warp.core.task import Row
-from lyceum_warp.support.docstrings import document_overloads
 
 
 @wp.func
@@ -25,11 +24,6 @@ def ground_speed(velocity: wp.vec3) -> float:
 
 @wp.func
 def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], substep_dt: float):
-    """Advance a foot's contact time or air time by a substep, and set the other to 0.
-
-    When the foot lands, the duration of its swing is stored in ``swing_time``, if this argument is given. Source: mjlab
-    1.6.0, ``ContactSensor``.
-    """
     contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
     air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
 
@@ -38,6 +32,11 @@ def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Ro
 def run_clocks(
     foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], swing_time: Row[float], substep_dt: float
 ):
+    """Advance a foot's contact time or air time by a substep, and set the other to 0.
+
+    When the foot lands, the duration of its swing is stored in ``swing_time``, if this argument is given. Source: mjlab
+    1.6.0, ``ContactSensor``.
+    """
     if touching and air_time[foot] > 0.0:
         swing_time[foot] = air_time[foot] + substep_dt
     run_clocks(foot, touching, contact_time, air_time, substep_dt)
@@ -188,6 +187,3 @@ def long_swings(
         if landed(contact_time[foot], dt):
             total += swing_time[foot] - wanted_air_time
     return active * total
-
-
-document_overloads(run_clocks)

@@ -6,7 +6,7 @@ import pytest
 
 import lyceum_warp as lw
 from lyceum_warp.core import FUNCTIONS, Task
-from lyceum_warp.support.docstrings import attribute_docs, field_docs
+from lyceum_warp.support.docstrings import attribute_docs
 from lyceum_warp.tasks.balance import balancing
 from lyceum_warp.tasks.velocity import gait, rough, walking
 
@@ -36,7 +36,7 @@ def test_help_shows_every_attribute_docstring(kind: type) -> None:
 @pytest.mark.parametrize("struct", [walking.Params, walking.BipedParams, gait.Params, rough.Params, balancing.Params])
 def test_help_of_a_family_shows_the_meaning_of_every_parameter(struct: Any) -> None:
     text = " ".join(page(struct).split())
-    docs = field_docs(struct.cls)
+    docs = attribute_docs(*reversed(struct.cls.__mro__[:-1]))
     assert {*struct.vars} <= {*docs} and all(docs.values())
     for name, doc in docs.items():
         assert f"{name}: {doc}" in text
