@@ -192,7 +192,7 @@ def _worlds(
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
     steps: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
-    plant = Env(options.task, autoreset=False, nthread=1, **steps, **params)
+    plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **steps), params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.definition

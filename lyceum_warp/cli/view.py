@@ -114,9 +114,10 @@ class View:
             if self.follow:
                 watchers.append(Follower(run, policy))
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
-            env = Env(self.what[0], autoreset=False, nthread=1, **params)
+            env = Env(self.what[0], EnvOptions(autoreset=False, nthread=1), params)
         else:
-            env = Env(self.what[0], nworld=1 if self.nworld is None else self.nworld, **options, **params)
+            nworld = 1 if self.nworld is None else self.nworld
+            env = Env(self.what[0], EnvOptions(nworld=nworld).changed(options), params)
         if self.mppi:
             config = self.planner.on_top_of(task_config(env.task.definition))
             options |= {} if env.options.model is None else {"model": env.options.model}

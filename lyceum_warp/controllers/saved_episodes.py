@@ -11,7 +11,7 @@ from typing import Any
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.core.task import Task
-from lyceum_warp.env.env import Env
+from lyceum_warp.env.env import Env, make
 
 
 def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajectory]:
@@ -71,7 +71,7 @@ def episode_env(
     kwargs = {"autoreset": False, "nthread": 1, **first.source.get("options", {})}
     kwargs |= {name: first.params[name] for name in first.source.get("params", ())}
     try:
-        env = Env(definition, **kwargs | changes)
+        env = make(definition, **kwargs | changes)
     except (ValueError, TypeError, FileNotFoundError) as error:
         kind = FileNotFoundError if isinstance(error, FileNotFoundError) else ValueError
         raise kind(f"{path} cannot be shown: {error}") from error

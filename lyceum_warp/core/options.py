@@ -5,7 +5,6 @@ command line. To add an option, add a field to one of these classes.
 """
 
 import dataclasses
-import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -13,7 +12,7 @@ from typing import Any, TypeAlias
 import mujoco
 
 from lyceum_warp.core.model_files import ModelFile
-from lyceum_warp.support.docstrings import attribute_docs, document_attributes, listed
+from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
 from lyceum_warp.support.validate import (
     check_flag,
@@ -239,28 +238,9 @@ def _physics(given: Any) -> PhysicsOptions:
 _PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions) if field.name != "base")
 OPTIONS = (*(field.name for field in dataclasses.fields(EnvOptions)), *_PHYSICS)
 
-_DOCS = {**attribute_docs(EnvOptions), **attribute_docs(PhysicsOptions)}
-
-OPTION_DOCS = listed({name: _DOCS[name] for name in OPTIONS})
-
 
 def suggestion(word: str, others: Iterable[str] = ()) -> str:
     """Return "did you mean ...?" for an unknown name, or "" if no name is similar."""
     if word in SOLVER_LIMITS:
         return f"did you mean solver={{{word!r}: ...}}?"
     return did_you_mean(word, [*others, *OPTIONS])
-
-
-def signature_of_options(function: Callable[..., Any]) -> inspect.Signature:
-    """Replace ``**words`` in a function's signature by a keyword argument for each option."""
-    keyword = inspect.Parameter.KEYWORD_ONLY
-    options = [
-        inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
-        for kind in (EnvOptions, PhysicsOptions)
-        for field in dataclasses.fields(kind)
-        if field.name in OPTIONS
-    ]
-    rest = inspect.Parameter("params", inspect.Parameter.VAR_KEYWORD, annotation=Any)
-    signature = inspect.signature(function)
-    positional = [p for p in signature.parameters.values() if p.kind is inspect.Parameter.POSITIONAL_OR_KEYWORD]
-    return signature.replace(parameters=[*positional, *options, rest])

@@ -1,8 +1,8 @@
 """Make, step, reset and observe an environment, which runs one task in many worlds."""
 
 import functools
-import inspect
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mujoco
@@ -18,7 +18,7 @@ from lyceum_warp.binding.write_probe import Probe
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
-from lyceum_warp.core.options import OPTION_DOCS, EnvOptions, signature_of_options
+from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOptions
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import Engine
@@ -35,36 +35,54 @@ from lyceum_warp.support.validate import check_group, check_kind, check_tensor, 
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
-_ARGUMENTS = """Args:
-    task: Name of a task, a task file (path/to/file.py, or path/to/file.py:Class), or a task class.
-    options: Options as one object; options given by name replace its fields.
-{options}
-    **params: Parameters of the task, fields of its ``Params``. A scalar may also be given as one value per world,
-        (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
 
-Raises:
-    ValueError: An argument is unknown or not valid; the message names the argument and the fix.
-    FileNotFoundError: A model file or a task file is missing.
-"""
-
-
-def _document_arguments(function: Any) -> Any:
-    arguments = _ARGUMENTS.replace("{options}", OPTION_DOCS)
-    function.__doc__ = inspect.cleandoc(function.__doc__).replace("{arguments}", arguments)
-    function.__signature__ = signature_of_options(function)
-    return function
-
-
-@_document_arguments
-def make(task: str | type[Task], options: EnvOptions | None = None, **words: Any) -> "Env":
+def make(  # noqa: D417
+    task: str | Path | type[Task],
+    *,
+    nworld: int = 1,
+    device: str | None = None,
+    engine: str | Callable[..., Engine] = "auto",
+    nthread: int | None = None,
+    seed: int = 0,
+    first_world: int = 0,
+    autoreset: bool = True,
+    horizon: int | None = None,
+    graphs: bool = True,
+    model: ModelSource | None = None,
+    fields: Collection[str] = (),
+    dynamics: Collection[str] = (),
+    physics: str | PhysicsOptions | None = None,
+    frame_skip: int | None = None,
+    timestep: float | None = None,
+    cone: str | None = None,
+    integrator: str | None = None,
+    jacobian: str | None = None,
+    impratio: float | None = None,
+    solver: Mapping[str, int] | None = None,
+    discardvisual: bool | None = None,
+    nconmax: int | None = None,
+    njmax: int | None = None,
+    deterministic: bool | None = None,
+    **params: Any,
+) -> "Env":
     """Make an environment, as in ``make("hopper", nworld=64, ctrl_cost_weight=1e-2)``.
 
-    {arguments}
+    Each option is a field of ``lw.EnvOptions`` or ``lw.PhysicsOptions``; ``help()`` of these classes describes it. For
+    options in one object, call ``lw.Env``.
+
+    Args:
+        task: Name of a task, a task file (path/to/file.py, or path/to/file.py:Class), or a task class.
+        **params: Parameters of the task, fields of its ``Params``. A scalar may also be given as one value per world,
+            (nworld,). A table is an array, a tensor, a nested list, or the path of a ``.npy`` file.
+
+    Raises:
+        ValueError: An argument is unknown or not valid; the message names the argument and the fix.
+        FileNotFoundError: A model file or a task file is missing.
     """
-    return Env(task, options, **words)
+    options = {name: value for name, value in locals().items() if name in OPTIONS and value is not None}
+    return Env(task, EnvOptions().changed(options), params)
 
 
-@_document_arguments
 @document_attributes
 class Env:
     """One task in many worlds. Every array is allocated once and shared with torch.
@@ -80,7 +98,14 @@ class Env:
     On a GPU, use the tensors on torch's default stream, which is synchronised with Warp's stream. Synchronise any other
     stream yourself.
 
-    {arguments}
+    Args:
+        task: Name of a task, a task file (path/to/file.py, or path/to/file.py:Class), or a task class.
+        options: The options.
+        params: Parameters of the task by name, as in ``make``.
+
+    Raises:
+        ValueError: An argument is unknown or not valid; the message names the argument and the fix.
+        FileNotFoundError: A model file or a task file is missing.
     """
 
     obs: torch.Tensor
@@ -149,11 +174,15 @@ class Env:
     """A scalar."""
 
     def __init__(
-        self, task: str | type[Task], options: EnvOptions | None = None, *, _replica: bool = False, **words: Any
+        self,
+        task: str | Path | type[Task],
+        options: EnvOptions | None = None,
+        params: Mapping[str, Any] | None = None,
+        *,
+        _replica: bool = False,
     ) -> None:
         check_kind("options", options, EnvOptions | None, "as lw.EnvOptions(nworld=64)")
-        task = find_task(task)
-        options, params = EnvOptions.split(words, options)
+        task, options, params = find_task(task), options or EnvOptions(), dict(params or {})
         self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
         self.nworld = options.nworld
         self.device = find_device(options.device)
@@ -570,11 +599,12 @@ class Env:
         nworld = self.nworld if nworld is None else nworld
         # use the loaded model, because its file may have changed
         own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
-        known, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
-        given = self._params_for(nworld, self._given_params)
-        made = Env(self.task.definition, known.changed({"nworld": nworld}), _replica=True, **(given | params))
-        made._copy_shared(self)
-        return made
+        options, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
+        options = options.changed({"nworld": nworld})
+        params = self._params_for(nworld, self._given_params) | params
+        replica = Env(self.task.definition, options, params, _replica=True)
+        replica._copy_shared(self)
+        return replica
 
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """Replicate the environment with only a few worlds, with the C engine if ``engine`` is "auto".

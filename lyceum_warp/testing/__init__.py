@@ -11,7 +11,7 @@ from typing import Any
 
 from lyceum_warp.core import Task
 from lyceum_warp.engines import EngineFactory
-from lyceum_warp.env import Env
+from lyceum_warp.env import Env, make
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.testing import (
@@ -93,11 +93,13 @@ def check_task(
     if str(device or "").startswith("cuda"):
         options = {"deterministic": True} | options
 
-    def make(**changes: Any) -> Env:
-        return Env(task, **{"nworld": nworld, "device": device, "engine": engine, "seed": seed, **options, **changes})
+    options = {"nworld": nworld, "device": device, "engine": engine, "seed": seed} | options
 
-    a = make()
-    ctx = Context(a, make(), make, steps, seed)
+    def another(**changes: Any) -> Env:
+        return make(task, **options | changes)
+
+    a = another()
+    ctx = Context(a, another(), another, steps, seed)
     report = Report(a.task.name, a.engine.name, a.device.alias, nworld)
     broken = []
     for check in checks:

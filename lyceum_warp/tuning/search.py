@@ -130,14 +130,14 @@ def tune(
         env_options = env_options.changed({"autoreset": False})
         act = digest = None
         if run is None:
-            env = Env(kind, env_options, **params)
+            env = Env(kind, env_options, params)
         else:
             source = Run.open(run)
             if source.task_name != task_name(kind):
                 raise ValueError(
                     f"{run} is a run of the task {source.task_name!r}, not of the task {task_name(kind)!r}"
                 )
-            env = Env(kind, env_options, **{**Configuration.of(source).params, **params})
+            env = Env(kind, env_options, {**Configuration.of(source).params, **params})
             policy = load(source, which=which, device=env.obs.device)
             check_sizes(policy, env, f"the policy of {run}")
             act, digest = acting(policy), hashlib.sha256(source.policy_file(which).read_bytes()).hexdigest()[:16]

@@ -116,7 +116,7 @@ class Configuration:
                 options = options.changed({"nthread": max(1, cpu_cores() // team.neighbours)})
             if run is None:
                 assert self.task is not None
-                env = Env(self.task, options, **self.params)
+                env = Env(self.task, options, self.params)
             else:
                 # only rank 0 checks trust, because other machines may have no record of the run
                 env = run_env(run, options, self.params, task=task, trust=not team.leads)

@@ -164,20 +164,20 @@ def run_env(
     elif Path(task.partition(":")[0]).resolve() == file:
         remember(run.folder, run.config)
     else:
-        return Env(task, options, **params)
+        return Env(task, options, params)
     copy = run.task_folder / manifest.get("model", "")
     if not copy.is_file():
-        return Env(task, options, **params)
+        return Env(task, options, params)
     if not manifest.get("model_given") or isinstance(options.model, str):
         reason = "has changed since the run began"
         try:
-            env = Env(task, options, **params)
+            env = Env(task, options, params)
             if not _model_changed(run, env):
                 return env
         except FileNotFoundError:
             reason = "is no longer where it was"
         log.warning("the model of the task %r %s: the run's own copy is used, %s", run.task_name, reason, copy)
-    return Env(task, options.changed({"model": read_spec(copy)}), **params)
+    return Env(task, options.changed({"model": read_spec(copy)}), params)
 
 
 def _run_task(run: Run, *, trust: bool) -> str:
