@@ -8,4 +8,5 @@ from lyceum_warp.env.env import (
     make as make,
 )
 from lyceum_warp.env.openloop import OpenLoop as OpenLoop
+from lyceum_warp.env.probe import Probe as Probe
 from lyceum_warp.env.worlds import Worlds as Worlds

@@ -114,7 +114,8 @@ class WorldArrays:
         """Sums of the metrics over the episode up to the last step."""
         self.outcome.metrics = self.metrics  # type: ignore[assignment]
         self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
-        parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
+        self.judged_parts = parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
+        """Number of parts of the kernel ``judge``."""
         self._judging = parts if self.device.is_cuda else 1  # threads per transition
         self._found = step_types.Findings()
         self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)

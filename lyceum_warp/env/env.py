@@ -14,7 +14,6 @@ from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.binding.write_probe import Probe
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
@@ -24,6 +23,7 @@ from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
 from lyceum_warp.env.arrays import own_bytes_per_world
+from lyceum_warp.env.probe import Probe
 from lyceum_warp.env.worlds import Worlds
 from lyceum_warp.graphs.compilation import compile_ahead
 from lyceum_warp.kernels import step_types, steps
@@ -223,13 +223,11 @@ class Env:
             if self.engine.capturable and options.graphs:
                 self.engine.prepare_capture()
             self.engine.reset(worlds.everyone)
-            probe = Probe(self.task, worlds.after, worlds.params, self.device)
-            # a write out of bounds would damage the environment's own arrays
-            probe.check_bounds()
+            Probe(worlds).check_bounds()  # a write out of range would damage the environment's own arrays
             self.rand_reset(options.seed)
             if self.task.dynamics and not _replica:  # after construction, invalid values are faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
-            probe.check_observations()
+            Probe(worlds).check_observations()
             if not _replica:
                 self.engine.check_room()
         except Exception as error:

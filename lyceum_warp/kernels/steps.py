@@ -83,14 +83,6 @@ def act_kernels(task: TaskCode) -> None:
         if not valid_model(view(batch, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | MODEL
 
-    @task.kernel_for("control")
-    def control_worlds(
-        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], ctrl_out: wp.array2d[float], first: int
-    ):
-        """Call only the task's ``control``; launched over (nworld,)."""
-        w = first + wp.tid()
-        control(view(batch, w), action_in[w], params[w % params.shape[0]], ctrl_out[w])
-
     @task.kernel_for("substep")
     def substep_memory(batch: Batch, params: wp.array[Params], first: int):
         """Advance the task's memory by one substep; launched over (nworld,)."""

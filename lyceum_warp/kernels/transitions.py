@@ -252,15 +252,6 @@ def judge_kernels(task: TaskCode) -> None:
             if not valid:
                 copy_observations(good_in, obs_inout, w, lane, lanes)
 
-    @task.kernel_for("measure")
-    def measure_worlds(
-        batch: Batch, params: wp.array[Params], action_in: wp.array2d[float], metrics_out: wp.array2d[float], first: int
-    ):
-        """Compute the metrics of states without transitions: each state is its own next state. Over (nworld,)."""
-        w = first + wp.tid()
-        s = view(batch, w)
-        measure(s, action_in[w], s, params[w % params.shape[0]], metrics_out[w])
-
 
 def rollout_kernels(task: TaskCode) -> None:
     """Make the kernels for open-loop rollouts, which store the fields of all steps.

@@ -8,6 +8,7 @@ from lyceum_warp import Row
 @wp.struct
 class World:
     qpos: Row[float]
+    xpos: Row[wp.vec3]
     qfrc_applied: Row[float]
     body_mass: Row[float]
     counts: Row[float] = lw.memory(2)
@@ -26,14 +27,32 @@ def observe(s: World, p: Params, obs: Row[float]):
     obs[0] = s.qpos[0]
     if p.function == 1:
         obs[p.index] = 1.0
+    if p.function == 20:
+        obs[0] = s.qpos[p.index]
+
+
+@wp.func
+def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
+    result = float(0.0)
+    if p.function == 22:
+        result = action[p.index]
+    return result
+
+
+@wp.func
+def terminated(s: World, p: Params) -> bool:
+    return p.function == 23 and s.xpos[p.index][0] > 0.0
 
 
 @wp.func
 def observe_critic(s: World, p: Params, obs: Row[float]):
-    obs[0] = s.qpos[0]
+    if p.function == 21:
+        obs[0] += 1.0
+    else:
+        obs[0] = s.qpos[0]
     obs[1] = s.qpos[1]
     if p.function == 2:
-        obs[p.index] += 0.0
+        obs[p.index] += 1.0
 
 
 @wp.func
@@ -47,6 +66,8 @@ def measure(s0: World, action: Row[float], s1: World, p: Params, metrics: Row[fl
 def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
     for i in range(3):
         ctrl[i] = action[i]
+    if p.function == 24:
+        ctrl[0] = action[p.index]
     if p.function == 4:
         ctrl[p.index] = 1.0
     if p.function == 5:
@@ -61,6 +82,8 @@ def substep(s: World, p: Params):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 25:
+        s1.counts[0] = s0.level[p.index]
     if p.function == 7:
         s1.counts[p.index] = 1.0
 
@@ -85,6 +108,8 @@ def initialize(s: World, p: Params):
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
+    if p.function == 26:
+        s.qpos[0] = s.body_mass[p.index]
     if p.function == 11:
         s.qpos[p.index] = 1.0
     if p.function == 12:
@@ -125,6 +150,16 @@ def test_write_out_of_range_raises_an_error_before_it_damages_the_heap(name: str
         with pytest.raises(ValueError, match="out_of_range") as caught:
             lw.make(OutOfRange, nworld=2, function=number, index=index)
         assert str(caught.value) == f"{name.split()[0]} of the task 'out_of_range' writes {text}, but {declared}"
+
+
+@pytest.mark.parametrize(
+    ("function", "number", "size"),
+    [("observe", 20, 6), ("observe_critic", 21, 0), ("reward", 22, 3), ("terminated", 23, 5), ("control", 24, 3),
+     ("advance", 25, 3), ("randomize", 26, 5)],
+)  # fmt: skip
+def test_read_out_of_range_or_of_unwritten_memory_raises_an_error(function: str, number: int, size: int) -> None:
+    with pytest.raises(ValueError, match=f"^{function} of the task 'out_of_range' reads out of range"):
+        lw.make(OutOfRange, nworld=2, function=number, index=size)
 
 
 @pytest.mark.parametrize("index", [0, 5, -1, -6])
