@@ -19,8 +19,8 @@ from lyceum_warp.binding.writes import written_fields
 from lyceum_warp.core.fields import is_data_field
 from lyceum_warp.core.model_fields import NOT_NEGATIVE
 from lyceum_warp.core.task import FUNCTIONS, Row, TaskFunction
-from lyceum_warp.kernels import random, rows as kernel_rows, steps
-from lyceum_warp.kernels.step_types import TaskCode
+from lyceum_warp.kernels import random, rows as kernel_rows, task_kernels
+from lyceum_warp.kernels.step_types import Counters, TaskCode
 
 _BATCH = """
 @wp.struct
@@ -46,7 +46,7 @@ class Observations:
 
 
 @wp.func
-def observe_group(group: int, s: World, p: Params, out: Observations, w: int, base: wp.uint32, rng: Row[wp.uint32]):
+def observe_group(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
 {observe}
 
 
@@ -94,7 +94,10 @@ _MEMORY_CHECKS = {
 """Warp source that checks each kind of memory for non-finite numbers. In ``lasting_memory``, it also replaces these
 numbers by the numbers before the step."""
 
-_kernels: dict[Any, steps.Kernels] = {}
+_OBSERVE = wp.constant(-1)
+"""Number of the substream from which observation noise is drawn."""
+
+_kernels: dict[Any, task_kernels.Kernels] = {}
 _MAKING = threading.RLock()
 
 
@@ -103,7 +106,7 @@ def kernels_of(
     groups: Mapping[str, wp.Function],
     memory: Mapping[str, Layout],
     structs: Mapping[str, Layout],
-) -> steps.Kernels:
+) -> task_kernels.Kernels:
     """Return a task's kernels. Tasks with the same functions, structs and sizes share their kernels."""
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     called = tuple(source.terms.functions.items())
@@ -122,7 +125,7 @@ def kernels_of(
             module = free_module_name(f"lyceum_warp.generated.{source.kernel_name}")
             given: dict[str, Any] = {"module": module, "functions": functions, "written": written}
             names = [field.name for field in dataclasses.fields(TaskCode) if field.init and field.name not in given]
-            _kernels[key] = steps.make_kernels(TaskCode(**given, **{name: scope[name] for name in names}))
+            _kernels[key] = task_kernels.make_kernels(TaskCode(**given, **{name: scope[name] for name in names}))
         return _kernels[key]
 
 
@@ -161,9 +164,13 @@ def _generated(
             rows.append(f"s.{name} = batch.{name}[w]")
         if name in memory or is_data_field(name):  # model fields are not copied, because a step does not change them
             state += _copy(name, ndim)
-    scope |= {"substream": random.substream, "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
+    scope |= {"stream": random.stream, "substream": random.substream, "OBSERVE": _OBSERVE, "Counters": Counters}
+    scope |= {"finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row}
     scope |= {"restored_row": kernel_rows.restored_row, "row_in_range": kernel_rows.row_in_range}
     observe = []
+    if any(map(draws_noise, groups.values())):  # the noise of a group depends only on the counters
+        observe.append("base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)")
+        observe.append("rng = counters.rng[group * counters.step.shape[0] + w]")
     for number, (group, function) in enumerate(groups.items()):
         scope[f"observe_{number}"] = function
         noisy = draws_noise(function)

@@ -26,7 +26,7 @@ from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.probe import Probe
 from lyceum_warp.env.worlds import Worlds
 from lyceum_warp.graphs.compilation import compile_ahead
-from lyceum_warp.kernels import step_types, steps
+from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
@@ -287,6 +287,8 @@ class Env:
     def step(self, action: torch.Tensor | None = None) -> None:
         """Advance every world by one step, and start new episodes in worlds whose episode ended.
 
+        The phases are act, physics, judge, restart, refresh and observe; ``Worlds.step_phases`` lists them.
+
         Args:
             action: Actions to copy into ``env.action`` before the step, (nworld, nact).
 
@@ -538,7 +540,7 @@ class Env:
         Returns:
             One vector, float64; empty if the task has no shared memory.
         """
-        parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / steps.UNIT)
+        parts = (torch_view(self.worlds.shared)[0], torch_view(self.worlds.sums) / shared_memory.UNIT)
         return torch.cat([part.double() for part in parts])
 
     def set_shared(self, state: torch.Tensor) -> None:
@@ -553,7 +555,7 @@ class Env:
         check_tensor(state, "the state of shared memory", self.get_shared())
         size = self.worlds.shared.shape[1]
         torch_view(self.worlds.shared)[0].copy_(state[:size])
-        torch_view(self.worlds.sums).copy_((state[size:] * steps.UNIT).round())
+        torch_view(self.worlds.sums).copy_((state[size:] * shared_memory.UNIT).round())
 
     def _copy_shared(self, other: "Env") -> None:
         for name, memory in other.shared.items():

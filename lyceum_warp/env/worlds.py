@@ -1,7 +1,6 @@
 """Run the phases of a step, of a reset, and of reading and restoring states."""
 
 import dataclasses
-from collections.abc import Iterable
 from functools import partial
 
 import torch
@@ -12,15 +11,14 @@ from lyceum_warp.core.fields import Stage
 from lyceum_warp.core.options import EnvOptions
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.env.arrays import WorldArrays
+from lyceum_warp.env.resets import Resets
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
-from lyceum_warp.kernels import random, rows, state, steps
+from lyceum_warp.kernels import rows, steps
 from lyceum_warp.support.arrays import (
     flat,
     launch_lanes,
     launch_parts,
-    launch_rows,
     launch_worlds,
     torch_view,
 )
@@ -38,7 +36,7 @@ class Programs:
     restore_state: Calls
 
 
-class Worlds(WorldArrays):
+class Worlds(Resets):
     """Many worlds of one task on one engine, with the phases that update their arrays.
 
     A captured graph repeats launches, so a phase must always launch the same kernels on the same arrays.
@@ -92,7 +90,7 @@ class Worlds(WorldArrays):
             return [self._merged(mask, phases)] if skip and phases else phases
 
         restarting = self.restarting
-        restart, refresh = self._restart_phases(restarting, randomly=True), self._refresh_phases(restarting)
+        restart, refresh = self.restart_phases(restarting, randomly=True), self.refresh_phases(restarting)
         if not (events := self._event_phases()):
             return [*self.transition_phases(substeps), *only(restarting, restart, refresh, self._observe_phases())]
         return [
@@ -135,20 +133,10 @@ class Worlds(WorldArrays):
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
         """List the phases that start episodes in the worlds of ``mask``."""
         return [
-            *self._restart_phases(self.mask, randomly=randomly),
-            *self._refresh_phases(self.mask),
+            *self.restart_phases(self.mask, randomly=randomly),
+            *self.refresh_phases(self.mask),
             Phase("judge", self._judge_state, by_world=True),
         ]
-
-    def _restart_phases(self, mask: wp.array, *, randomly: bool) -> list[Phase]:
-        phases = [Phase("restart", partial(self._restart, mask, randomly=randomly), by_world=True)]
-        if self.task.reset_dynamics:
-            phases.append(Phase("dynamics", partial(self.engine.apply_model, mask), engine=True))
-        if randomly and (kernel := self.task.kernels.reject_worlds) is not None:
-            phases.append(Phase("redraw", partial(self._redraw, kernel, mask), engine=True))
-        if settle := self.task.definition.settle:
-            phases.append(Phase("settle", partial(self.engine.settle, mask, settle), engine=True))
-        return phases
 
     def _event_phases(self) -> list[Phase]:
         kernel = self.task.kernels.run_events
@@ -166,11 +154,6 @@ class Worlds(WorldArrays):
         """List the phases that write new observations after a restart or an event."""
         changed = self.restarting if self.task.kernels.run_events is None else self._outdated
         return [Phase("observe", partial(self._observe, changed), by_world=True)]
-
-    def _refresh_phases(self, mask: wp.array) -> list[Phase]:
-        if self.engine.reset_stage == Stage.NONE:
-            return []
-        return [Phase("refresh", partial(self.engine.refresh, mask), engine=True)]
 
     def read_phases(self) -> list[Phase]:
         """List the phases that write all states into ``state``."""
@@ -255,40 +238,6 @@ class Worlds(WorldArrays):
             args = [mask, transition, self.task.definition.success_steps, self.success_counts, self.outcome.success]
             launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
-    def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
-        self.engine.reset(mask)
-        counts = [] if again else ["metric_sums", "success_counts"]
-        self._clear(mask, "memory", *self.task.definition.cleared, *counts)
-        if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
-            kept, live = self._lasting_before, self.lasting_memory
-            launch_rows(state.copy_rows, mask, *((kept, live) if again else (live, kept)))
-        self._make_nominal(mask, self.task.reset_dynamics)
-        args = [mask, randomly, again, self.after, self.params, self.counters]
-        launch_worlds(self.task.kernels.restart, self.nworld, args, self.device)
-        self.engine.commit(mask)
-
-    def _clear(self, mask: wp.array, *names: str) -> None:
-        for name in names:
-            if (array := self._clearable[name]).size:
-                launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
-
-    def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
-        for name in names:
-            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
-
-    def _redraw(self, kernel: wp.Kernel, mask: wp.array) -> None:
-        wp.copy(self._rejected, mask)
-        for _ in range(self.task.definition.draws - 1):
-            # on a GPU, reading the mask would wait for the device
-            if not self.engine.capturable and not self._rejected.numpy().any():
-                return
-            self.engine.refresh(self._rejected)
-            args = [self._rejected, self.after, self.params, self._rejected]
-            launch_worlds(kernel, self.nworld, args, self.device)
-            self._restart(self._rejected, randomly=True, again=True)
-            if self.task.reset_dynamics:
-                self.engine.apply_model(self._rejected)
-
     def _event(self, kernel: wp.Kernel) -> None:
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
         live = {name: getattr(self.after, name) for name in before}
@@ -333,19 +282,6 @@ class Worlds(WorldArrays):
         torch_view(self.safe_action).copy_(action)
         self._judged.zero_()
         self._judge(self.everyone, self._judged, self._no_fault, transition=True)
-
-    def seed_streams(self, seed: int, first_world: int = 0) -> None:
-        """Restart the random streams of the selected worlds, and call the task's ``startup``."""
-        self._seed.fill_(seed)
-        args = [self.mask, self._seed, first_world, self.counters.key, self.counters.episode]
-        wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
-        self._clear(self.mask, "lasting_memory")
-        self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
-        if self.task.kernels.start_worlds is not None:
-            args = [self.mask, self.after, self.params, self.counters]
-            launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
-        if self.task.dynamics:
-            self.engine.apply_model(self.mask)
 
     def update_shared(self) -> None:
         """Update the shared memory from the sums, clear the sums, and observe all worlds again."""

@@ -1,8 +1,15 @@
-"""Start and end open-loop rollouts: copy states to worlds, map actions to controls, count steps and merge faults."""
+"""Open-loop rollouts: copy states to worlds, map actions to controls, judge all steps at once, merge faults.
+
+Row t * nworld + w of a judged rollout is world w after t steps. ``before`` and ``after`` are views of the same arrays,
+but ``after`` starts at row nworld, and thus holds the next states.
+"""
 
 import warp as wp
 
 from lyceum_warp.core.done import Done
+from lyceum_warp.kernels.random import stream
+from lyceum_warp.kernels.rows import copy_row
+from lyceum_warp.kernels.step_types import Counters, TaskCode
 
 ACTION = wp.constant(int(Done.ACTION))
 
@@ -90,3 +97,59 @@ def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
     """Add the bits of one array of faults to another; launched over (nworld,)."""
     w = wp.tid()
     fault_inout[w] = fault_inout[w] | fault_in[w]
+
+
+def make_judge_rows(task: TaskCode) -> None:
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view, terminated = task.view, task.functions["terminated"]
+    reward, sum_of_terms = task.functions["reward"], task.terms.get("reward")
+    has_terms = "reward" in task.terms
+
+    @task.kernel()
+    def judge_rows(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        weights_in: wp.array2d[float],
+        action_in: wp.array2d[float],
+        reward_out: wp.array[float],
+        terminated_out: wp.array[bool],
+        first: int,
+    ):
+        """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
+        row = first + wp.tid()
+        p = params[row % params.shape[0]]
+        s1 = view(after, row)
+        if wp.static(has_terms):
+            weights = weights_in[row % weights_in.shape[0]]
+            reward_out[row] = sum_of_terms(view(before, row), action_in[row], s1, p, weights)
+        else:
+            reward_out[row] = reward(view(before, row), action_in[row], s1, p)
+        terminated_out[row] = terminated(s1, p)
+
+
+def make_advance_rows(task: TaskCode) -> None:
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view, advance = task.view, task.functions["advance"]
+
+    @task.kernel_for("advance")
+    def advance_rows(
+        before: Batch,
+        after: Batch,
+        params: wp.array[Params],
+        action_in: wp.array2d[float],
+        counters: Counters,
+        memory_inout: wp.array2d[float],
+        lasting_memory_inout: wp.array2d[float],
+        first: int,
+    ):
+        """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
+        w = first + wp.tid()
+        n = counters.step.shape[0]
+        p = params[w % params.shape[0]]
+        for t in range(action_in.shape[0] // n):
+            row = t * n + w
+            copy_row(memory_inout[row], memory_inout[row + n], 0, 1)
+            copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
+            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
+            advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])

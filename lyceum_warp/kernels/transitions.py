@@ -4,8 +4,6 @@ import warp as wp
 
 from lyceum_warp.core.done import Done
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.random import stream, substream
-from lyceum_warp.kernels.rows import copy_row
 from lyceum_warp.kernels.step_types import Counters, Findings, Outcome, TaskCode
 
 TERMINATED = wp.constant(int(Done.TERMINATED))
@@ -14,9 +12,6 @@ REWARD = wp.constant(int(Done.REWARD))
 OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
 
-OBSERVE = wp.constant(-1)
-"""Number of the substream from which observation noise is drawn."""
-
 # the parts of ``judge``; from OBSERVE_FIRST on, each observation group is a part
 ENDS = wp.constant(0)
 GAIN = wp.constant(1)
@@ -24,24 +19,8 @@ METRICS = wp.constant(2)
 OBSERVE_FIRST = wp.constant(3)
 
 
-def judge_kernels(task: TaskCode) -> None:
-    """Make the kernels that compute rewards, ends of episodes, metrics and observations."""
-    Batch, Params, Observations, World = task.Batch, task.Params, task.Observations, task.World  # noqa: N806
-    view, finite_memory = task.view, task.finite_memory
-    valid_group, copy_observations = task.valid_group, task.copy_observations
-    reward, measure, evaluate, terminated, truncated, success = (
-        task.functions[name] for name in ("reward", "measure", "evaluate", "terminated", "truncated", "success")
-    )
-    score, has_score = task.terms.get("score"), "score" in task.terms
-    has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
-    has_metrics = has_measure or has_score
-    observe_group = task.observe_group
-
-    @wp.func
-    def observe(group: int, s: World, p: Params, out: Observations, w: int, counters: Counters):
-        """Write an observation group; its noise depends only on the counters."""
-        base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)
-        observe_group(group, s, p, out, w, base, counters.rng[group * counters.step.shape[0] + w])
+def make_check_memory(task: TaskCode) -> None:
+    Batch, finite_memory = task.Batch, task.finite_memory  # noqa: N806
 
     @task.kernel(task.has_memory)
     def check_memory(
@@ -52,6 +31,16 @@ def judge_kernels(task: TaskCode) -> None:
         w = first + k
         if mask_in[w] and not finite_memory(before, after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
+
+
+def make_judge(task: TaskCode) -> None:
+    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
+    view, observe_group, valid_group = task.view, task.observe_group, task.valid_group
+    terminated, truncated = task.functions["terminated"], task.functions["truncated"]
+    success, evaluate = task.functions["success"], task.functions["evaluate"]
+    reward, measure = task.functions["reward"], task.functions["measure"]
+    has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
+    score, has_score = task.terms.get("score"), "score" in task.terms
 
     @task.kernel()
     def judge(
@@ -111,10 +100,17 @@ def judge_kernels(task: TaskCode) -> None:
                             measure(view(before, w), action_in[w], s1, p, metrics_out[w])
                 else:
                     group = part - OBSERVE_FIRST
-                    observe(group, s1, p, obs_out, w, counters)
+                    observe_group(group, s1, p, obs_out, w, counters)
                     if not valid_group(group, obs_out, w):
                         found = OBSERVATION
             found_out.fault[part, w] = found
+
+
+def make_conclude(task: TaskCode) -> None:
+    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
+    view, copy_observations = task.view, task.copy_observations
+    evaluate, has_evaluate = task.functions["evaluate"], "evaluate" in task.written
+    has_metrics = "measure" in task.written or "score" in task.terms
 
     @task.kernel()
     def conclude(
@@ -202,6 +198,12 @@ def judge_kernels(task: TaskCode) -> None:
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
 
+
+def make_observe_worlds(task: TaskCode) -> None:
+    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
+    view, observe_group, valid_group = task.view, task.observe_group, task.valid_group
+    copy_observations = task.copy_observations
+
     @task.kernel()
     def observe_worlds(
         mask_in: wp.array[bool],
@@ -224,11 +226,15 @@ def judge_kernels(task: TaskCode) -> None:
         if mask_in[w]:
             valid = bool(True)
             for group in range(start, valid_out.shape[0], parts):
-                observe(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
+                observe_group(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
                 valid_out[group, w] = valid_group(group, obs_out, w)
                 valid = valid and valid_out[group, w]
             if parts == 1 and not valid:
                 copy_observations(good_in, obs_out, w, 0, 1)
+
+
+def make_replace_observations(task: TaskCode) -> None:
+    Observations, copy_observations = task.Observations, task.copy_observations  # noqa: N806
 
     @task.kernel()
     def replace_observations(
@@ -251,59 +257,3 @@ def judge_kernels(task: TaskCode) -> None:
                 valid = valid and valid_in[group, w]
             if not valid:
                 copy_observations(good_in, obs_inout, w, lane, lanes)
-
-
-def rollout_kernels(task: TaskCode) -> None:
-    """Make the kernels for open-loop rollouts, which store the fields of all steps.
-
-    Row t * nworld + w is world w after t steps. ``before`` and ``after`` are views of the same arrays, but ``after``
-    starts at row nworld, and thus holds the next states.
-    """
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view = task.view
-    reward, terminated, advance = (task.functions[name] for name in ("reward", "terminated", "advance"))
-    sum_of_terms, has_terms = task.terms.get("reward"), "reward" in task.terms
-
-    @task.kernel()
-    def judge_rows(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
-        weights_in: wp.array2d[float],
-        action_in: wp.array2d[float],
-        reward_out: wp.array[float],
-        terminated_out: wp.array[bool],
-        first: int,
-    ):
-        """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
-        row = first + wp.tid()
-        p = params[row % params.shape[0]]
-        s1 = view(after, row)
-        if wp.static(has_terms):
-            weights = weights_in[row % weights_in.shape[0]]
-            reward_out[row] = sum_of_terms(view(before, row), action_in[row], s1, p, weights)
-        else:
-            reward_out[row] = reward(view(before, row), action_in[row], s1, p)
-        terminated_out[row] = terminated(s1, p)
-
-    @task.kernel_for("advance")
-    def advance_rows(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
-        action_in: wp.array2d[float],
-        counters: Counters,
-        memory_inout: wp.array2d[float],
-        lasting_memory_inout: wp.array2d[float],
-        first: int,
-    ):
-        """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
-        w = first + wp.tid()
-        n = counters.step.shape[0]
-        p = params[w % params.shape[0]]
-        for t in range(action_in.shape[0] // n):
-            row = t * n + w
-            copy_row(memory_inout[row], memory_inout[row + n], 0, 1)
-            copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
-            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
-            advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])

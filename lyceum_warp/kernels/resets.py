@@ -1,0 +1,69 @@
+"""Make the kernels of a reset, which begin episodes and start random streams."""
+
+import warp as wp
+
+from lyceum_warp.kernels.random import stream
+from lyceum_warp.kernels.step_types import Counters, TaskCode
+
+STARTUP = wp.constant(-1)
+"""Replaces the episode number in the random stream of ``startup``."""
+
+
+def make_start_worlds(task: TaskCode) -> None:
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view, startup = task.view, task.functions["startup"]
+
+    @task.kernel_for("startup")
+    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
+        """Call ``startup`` in the masked worlds; launched over (nworld,)."""
+        w = first + wp.tid()
+        if mask_in[w]:
+            counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
+            startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
+
+
+def make_restart(task: TaskCode) -> None:
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view = task.view
+    initialize, randomize = task.functions["initialize"], task.functions["randomize"]
+
+    @task.kernel()
+    def restart(
+        mask_in: wp.array[bool],
+        random: bool,
+        again: bool,
+        batch: Batch,
+        params: wp.array[Params],
+        counters: Counters,
+        first: int,
+    ):
+        """Begin an episode in the masked worlds, or draw another initial state; launched over (nworld,).
+
+        The engine has already reset these worlds to the fixed initial state. Another initial state is drawn with the
+        next numbers of the world's random stream.
+        """
+        w = first + wp.tid()
+        if not mask_in[w]:
+            return
+        if not again:
+            counters.step[w] = 0
+            counters.episode[w] = counters.episode[w] + 1
+            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
+        p = params[w % params.shape[0]]
+        s = view(batch, w)
+        initialize(s, p)
+        if random:
+            randomize(s, p, counters.rng[w])
+
+
+def make_reject_worlds(task: TaskCode) -> None:
+    Batch, Params = task.Batch, task.Params  # noqa: N806
+    view, reject = task.view, task.functions["reject"]
+
+    @task.kernel_for("reject")
+    def reject_worlds(
+        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
+    ):
+        """Find the masked worlds whose initial states are rejected; launched over (nworld,)."""
+        w = first + wp.tid()
+        again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
