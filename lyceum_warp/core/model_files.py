@@ -1,7 +1,6 @@
 """Refer to model files in other packages or in a local folder, and find them on demand."""
 
 import dataclasses
-import difflib
 import importlib
 import importlib.util
 import logging
@@ -13,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import mujoco
+
+from lyceum_warp.support.suggestions import closest
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class ModelFile:
         folder, file = self.place()
         if not (folder / file).is_file():
             files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
-            close = difflib.get_close_matches(file, files, 3) or files[:10]
+            close = closest(file, files) or files[:10]
             raise FileNotFoundError(
                 f"there is no model file {file!r} in {folder}; the folder has {', '.join(close) or 'no XML files'}"
             )

@@ -1,9 +1,10 @@
 """Make, step, reset and observe an environment, which runs one task in many worlds."""
 
+import copy
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,10 +13,9 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask, check_field_name
 from lyceum_warp.binding.compile_errors import explained
-from lyceum_warp.binding.read_only_model import read_only
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
+from lyceum_warp.core.fields import describe, elements, has_several_rows
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
 from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOptions
 from lyceum_warp.core.spaces import Space
@@ -30,7 +30,6 @@ from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
-from lyceum_warp.support.suggestions import Named, did_you_mean
 from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
@@ -206,7 +205,7 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
+                dict(zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.episode_metric_sums = torch_view(worlds.episode_metrics)
@@ -243,29 +242,19 @@ class Env:
             )
         super().__setattr__(name, value)
 
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            hint = did_you_mean(name, [*Env.__annotations__, *vars(Env)], "help(lw.Env) lists the attributes")
-            if is_data_field(name) or is_model_field(name):
-                hint = f"use env.field({name!r})"
-            raise AttributeError(f"an environment has no {name!r}: {hint}")
-
-    def __reduce__(self) -> Any:
-        raise TypeError(
-            "an environment cannot be pickled or copied: use env.replicate(); for another process, send "
-            "env.get_state() to a new environment there"
-        )
-
     @functools.cached_property
     def model(self) -> mujoco.MjModel:
-        """The compiled model. It is read-only, because the engine has its own copy.
+        """A copy of the compiled model, whose arrays are read-only, because the engine has a copy of its own.
 
         To change the physics, pass an edited MjSpec as ``model=``. To change model fields per world, list them in the
-        task's ``World`` and write them in ``startup`` or ``randomize``. ``copy.copy(env.model)`` is an ordinary MjModel
-        that can be edited.
+        task's ``World`` and write them in ``startup`` or ``randomize``. ``copy.copy(env.model)`` can be edited.
         """
-        return read_only(self.task.model)
+        model = copy.copy(self.task.model)
+        for part in (model, model.opt):
+            for name in dir(part):
+                if isinstance(array := getattr(part, name), np.ndarray):
+                    array.flags.writeable = False
+        return model
 
     @property
     def horizon(self) -> int:
