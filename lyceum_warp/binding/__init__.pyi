@@ -1,12 +1,10 @@
-from lyceum_warp.binding.bound_task import (
-    obs_layouts as obs_layouts,
-    task_spec as task_spec,
-)
 from lyceum_warp.binding.functions import TaskSource as TaskSource
 from lyceum_warp.binding.models import (
     compile_model as compile_model,
     find_model as find_model,
+    task_spec as task_spec,
 )
+from lyceum_warp.binding.observations import obs_layouts as obs_layouts
 from lyceum_warp.binding.opened_files import (
     data_files as data_files,
     stamps as stamps,

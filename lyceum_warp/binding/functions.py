@@ -1,8 +1,7 @@
-"""Find a task's structs and functions in its class or module, and check them against ``task.FUNCTIONS``."""
+"""Read a task's class and modules: its structs, functions, terms and memory."""
 
 import ast
 import dataclasses
-import difflib
 import functools
 import sys
 from collections.abc import Callable, Collection, Mapping
@@ -10,151 +9,174 @@ from typing import Any
 
 import warp as wp
 
+from lyceum_warp.binding.divisions import check_divisions
 from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.registry import kernel_name
-from lyceum_warp.binding.sources import is_struct, source_of
+from lyceum_warp.binding.sources import is_struct, overloads, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
-from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Part, Task, TaskFunction, observer_name
+from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
+from lyceum_warp.core.fields import DATA_FIELDS, INITIAL, INPUTS, is_data_field
+from lyceum_warp.core.model_fields import VARYING_FIELDS, is_model_field
+from lyceum_warp.core.spaces import OWN_PARTS
+from lyceum_warp.core.task import (
+    FUNCTIONS,
+    GROUP_PREFIX,
+    MEMORIES,
+    RESULTS,
+    Part,
+    Row,
+    Task,
+    TaskFunction,
+    observer_name,
+)
+from lyceum_warp.support.suggestions import closest, did_you_mean
+
+_BEFORE_FORWARD = {"startup", "initialize", "randomize"}
+"""Functions that run before the engine computes the fields of the initial state."""
+
+
+def check_field_name(name: str) -> None:
+    """Raise ValueError unless MjData or MjModel has a field of this name."""
+    if not (is_data_field(name) or is_model_field(name)):
+        hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
+        raise ValueError(f"there is no field {name!r}: {hint}")
 
 
 class TaskSource:
-    """Finds the structs and the functions of a task."""
+    """What a task's class and modules define. The signatures fit those of ``core.task.FUNCTIONS``."""
 
-    def __init__(self, task: type[Task], name: str) -> None:
-        self.definition, self.name = task, name
-        self.path = f"{task.__module__}.{task.__qualname__}"
-        self.kernel_name = kernel_name(task)
-        self._owners: Any = task.__mro__[: task.__mro__.index(Task)]
+    def __init__(self, definition: type[Task], name: str) -> None:
+        self.definition, self.name = definition, name
+        self.path = f"{definition.__module__}.{definition.__qualname__}"
+        self.kernel_name = kernel_name(definition)
+        self._owners: Any = definition.__mro__[: definition.__mro__.index(Task)]
         self._variant: Variant | None = None
         self.world: Any = self._struct("World")
-        own: Any = self._struct("Params")
-        self.defaults: type = own.cls
-        self.params: Any = self._with_functions(own)
-        self._variant = variant_of(name, self._owners, self.world, self.params, own)
-        self.memory: dict[str, Part] = self._memory()
+        declared: Any = self._struct("Params")
+        self.defaults: type = declared.cls
+        """The class whose attributes are the defaults of Params."""
+        self.params: Any = self._with_functions(declared)
+        self._variant = variant_of(name, self._owners, self.world, self.params, declared)
+        self.memory: dict[str, Part] = parts_of(self.world, "World")
         self.shared, self.sums = self._shared_structs()
-        self.functions: dict[str, wp.Function | None] = {
-            name: self._function(wanted) for name, wanted in FUNCTIONS.items()
-        }
-        term = functools.partial(self._written, accepts=lambda f: isinstance(f, wp.Function) and f.func is not None)
-        self.terms = Terms(task, name, term, self.functions, self.world, self.params)
+        self.types = self._field_types()
+        """The types of World's fields and of each kind of memory, by name."""
+        self.functions = {name: self._function(form) for name, form in FUNCTIONS.items()}
+        """The functions of ``FUNCTIONS`` that the task defines. Others are None."""
         if self.functions["observe"] is None:
-            raise ValueError(f"the task {self.name!r} has no observe(s, p, obs), which every task needs")
+            raise ValueError(f"the task {name!r} has no observe(s, p, obs), which every task needs")
+        self.terms = Terms(definition, name, self._term, self.functions, self.world, self.params)
         self._check_names()
 
-    def group_functions(self, groups: Collection[str]) -> dict[str, wp.Function]:
+    @functools.cached_property
+    def written(self) -> dict[str, frozenset[str]]:
+        """The fields and the parts of memory that each function writes."""
+        return {name: written_fields(function) for name, function in self.functions.items() if function is not None}
+
+    @property
+    def curriculum(self) -> tuple[str, ...]:
+        """Names of the lasting memory that functions other than ``startup`` write."""
+        trained = frozenset[str]().union(*(fields for name, fields in self.written.items() if name != "startup"))
+        return tuple(name for name in self._lasting() if name in trained)
+
+    def check_bodies(self, observers: Mapping[str, wp.Function]) -> None:
+        """Raise a ValueError if a function reads or writes what it must not, or divides integers.
+
+        ``observers`` are the functions of the observation groups, by group name.
+        """
+        rights = {name: self._rights_of(form) for name, form in FUNCTIONS.items()}
+        rights |= {observer_name(group): rights["observe"] for group in observers}
+        functions = {name: function for name, function in self.functions.items() if function is not None}
+        functions |= {observer_name(group): function for group, function in observers.items()}
+        for name, function in functions.items():
+            check_writes(self.name, name, function, rights)
+            check_divisions(self.name, name, function)
+        for name in _BEFORE_FORWARD & functions.keys():
+            check_reads(self.name, name, functions[name])
+        for name, term in self.terms.functions.items():
+            for overload in overloads(term):
+                none = {name: dict.fromkeys(overload.input_types, ())}
+                check_writes(self.name, name, overload, rights | none)
+                check_divisions(self.name, name, overload)
+
+    def observers(self, groups: Collection[str]) -> dict[str, wp.Function]:
         """Return the functions that write observation groups, by group name."""
-        found = {}
+        observers = {}
         for group in groups:
-            wanted = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
-            function = self._function(wanted)
-            if function is None:
+            form = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
+            observer = self._function(form)
+            if observer is None:
                 raise ValueError(
                     f"no function of the task {self.name!r} writes the group {group!r} of its observations: add "
-                    f"{wanted.signature}"
+                    f"{form.signature}"
                 )
-            found[group] = function
-        for name in self._observers(self.definition):
-            if (group := name.removeprefix(GROUP_PREFIX)) not in groups:
-                raise ValueError(f"obs of the task {self.name!r} has no group {group!r}, which {name} writes")
-        return found
+            observers[group] = observer
+        return observers
 
     def group_structs(self) -> dict[str, Any]:
         """Return the structs into which functions write observation groups, by group name."""
-        names = [name for owner in reversed(self._owners) for name in self._observers(owner)]
-        groups = dict.fromkeys(["policy", *(name.removeprefix(GROUP_PREFIX) for name in names)])
-        functions = self.group_functions(groups)
-        return {group: list(function.input_types.values())[2] for group, function in functions.items()}
+        scopes = [scope for owner in reversed(self._owners) for scope in (owner.scope, vars(owner))]
+        names = dict.fromkeys(name for scope in scopes for name in scope if name.startswith(GROUP_PREFIX))
+        observers = self.observers(["policy", *(n.removeprefix(GROUP_PREFIX) for n in names if self._observes(n))])
+        return {group: list(observer.input_types.values())[2] for group, observer in observers.items()}
 
-    def _observers(self, owner: type[Task]) -> list[str]:
-        """Find the functions that write observation groups, in the class and in its module.
+    def _observes(self, name: str) -> bool:
+        """Whether a function has the arguments of ``observe``. Others are helpers, or belong to another task."""
+        function, form = self._look_up(name), FUNCTIONS["observe"]
+        kinds = tuple(map(self._kind, getattr(function, "input_types", {}).values()))
+        return kinds in (form.kinds, form.all_kinds)
 
-        Functions of the module are left out if another function calls them.
-        """
-        module = vars(sys.modules[owner.__module__])
-        written = {name: value for name, value in module.items() if isinstance(value, wp.Function)}
-        functions = {name: self._seen(value) for name, value in written.items()}
-        tasks = [kind for kind in (owner, *module.values()) if isinstance(kind, type) and issubclass(kind, Task)]
-        used = {id(self._seen(value)) for task in tasks for value in vars(task).values()}
-        called = {name for f in written.values() if f.func is not None for name in f.func.__code__.co_names}
-        forms = (FUNCTIONS["observe"].kinds, FUNCTIONS["observe"].all_kinds)
-        own = [name for name, value in vars(owner).items() if isinstance(value, wp.Function | staticmethod)]
-        unused = [
-            name
-            for name, function in functions.items()
-            if name not in called and id(function) not in used
-            and tuple(map(self._kind, function.input_types.values())) in forms  # ignore other tasks' functions
-            and (self._has_structs or not any(_may_list(task, name.removeprefix(GROUP_PREFIX)) for task in tasks))
-        ]  # fmt: skip
-        return [name for name in (*own, *unused) if name.startswith(GROUP_PREFIX)]
-
-    def _written(self, name: str, accepts: Callable[[Any], bool] = lambda found: found is not None) -> Any:
+    def _look_up(self, name: str, accepts: Callable[[Any], bool] = lambda value: value is not None) -> Any:
         """Look up a name in the class, in its module, and in the base classes and their modules."""
         for owner in self._owners:
-            for names in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
-                found = names.get(name)
-                found = found.__func__ if isinstance(found, staticmethod) else found
-                if accepts(found):
-                    return self._seen(found)
+            for scope in (vars(owner), owner.scope, vars(sys.modules[owner.__module__])):
+                value = scope.get(name)
+                value = value.__func__ if isinstance(value, staticmethod) else value
+                if accepts(value):
+                    return value if self._variant is None else self._variant.seen(value)
         return None
 
-    def _seen(self, value: Any) -> Any:
-        """Return the task's copy of a struct or function; see ``variants``."""
-        return value if self._variant is None else self._variant.seen(value)
+    def _term(self, name: str) -> wp.Function | None:
+        function: wp.Function | None = self._look_up(name, lambda f: isinstance(f, wp.Function) and f.func is not None)
+        return function
 
-    @property
-    def _has_structs(self) -> bool:
-        return not hasattr(self.definition, "obs")
+    # structs
 
     def _struct(self, name: str) -> Any:
         struct = self._declared(name, self.definition)
         if isinstance(struct, type):
             raise ValueError(f"{name} of the task {self.name!r} must be a Warp struct: decorate it with @wp.struct")
-        if not hasattr(struct, "vars"):
+        if not is_struct(struct):
             raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
         return struct
 
     def _declared(self, name: str, owner: type[Task]) -> Any:
         """Return the struct that a class declares, merged with those of the parents if it extends one of them."""
         scopes = (vars(owner), owner.scope, vars(sys.modules[owner.__module__]))
-        own = next((scope[name] for scope in scopes if name in scope), None)
+        struct = next((scope[name] for scope in scopes if name in scope), None)
         parents = [self._declared(name, base) for base in owner.__bases__ if base in self._owners]
         structs = list(filter(is_struct, parents))
-        if own is None:
+        if struct is None:
             return merged(structs) if structs else None
-        extends = is_struct(own) and any(issubclass(own.cls, struct.cls) for struct in structs)
-        return merged([own, *structs]) if extends else own
+        extends = is_struct(struct) and any(issubclass(struct.cls, parent.cls) for parent in structs)
+        return merged([struct, *structs]) if extends else struct
 
-    def _with_functions(self, own: Any) -> Any:
+    def _with_functions(self, declared: Any) -> Any:
         """Return the parameter struct that functions take.
 
         A task that changes only defaults uses the struct of its base task, to share functions and kernels with it.
         """
-        fields = {name: wp.types.type_repr(field.type) for name, field in own.vars.items()}
+        fields = {name: wp.types.type_repr(field.type) for name, field in declared.vars.items()}
         for owner in reversed(self._owners):
             struct = vars(owner).get("Params", owner.scope.get("Params"))
-            known = struct.vars.items() if is_struct(struct) and issubclass(own.cls, struct.cls) else ()
+            known = struct.vars.items() if is_struct(struct) and issubclass(declared.cls, struct.cls) else ()
             if {name: wp.types.type_repr(field.type) for name, field in known} == fields:
                 return struct
-        return own
-
-    def _memory(self) -> dict[str, Part]:
-        counted = [name for name in MEMORIES if hasattr(self.definition, name)]
-        parts = parts_of(self.world, "World")
-        if old := [*counted, *(name for name in MEMORIES if name in self.world.vars and name not in parts)]:
-            raise ValueError(
-                f"{old[0]} of the task {self.name!r} is a row without named parts: declare each part in World, for "
-                f"example air_time: Row[float] = lw.{old[0]}(4)"
-            )
-        if wrong := [name for name, part in parts.items() if part.kind not in MEMORIES]:
-            raise ValueError(
-                f"World.{wrong[0]} of the task {self.name!r} is declared by lw.part(...): use lw.memory(...)"
-            )
-        return parts
+        return declared
 
     def _shared_structs(self) -> tuple[Any, Any]:
-        field, tally, share = self.world.vars.get("shared"), self._written("tally"), self._written("share")
+        field, tally, share = self.world.vars.get("shared"), self._look_up("tally"), self._look_up("share")
         if field is None and tally is None and share is None:
             return None, None
         structs = [list(function.input_types.values())[i] for function, i in ((tally, 5), (share, 1))
@@ -167,9 +189,43 @@ class TaskSource:
             )
         return field.type, structs[0]
 
-    def _function(self, wanted: TaskFunction) -> wp.Function | None:
-        name = wanted.name
-        function = self._written(name)
+    def _field_types(self) -> dict[str, Any]:
+        for name, part in self.memory.items():
+            if part.kind not in MEMORIES:
+                raise ValueError(f"World.{name} of the task {self.name!r} is declared by lw.part: use lw.memory(...)")
+            if is_data_field(name) or is_model_field(name) or name in OWN_PARTS:
+                raise ValueError(
+                    f"the memory World.{name} of the task {self.name!r} has the name of an existing field or part of "
+                    "the state: rename it"
+                )
+        shared = ["shared"] if self.shared is not None else []
+        types = {name: v.type for name, v in self.world.vars.items() if name not in (*self.memory, *shared)}
+        for name in types:
+            check_field_name(name)
+        kinds = {part.kind for part in self.memory.values()}
+        return types | {name: Row[float] for name in MEMORIES if name in kinds}
+
+    # functions
+
+    def _rights_of(self, form: TaskFunction) -> Rights:
+        """Return which fields of each argument a function may write."""
+        model = [name for name in self.types if is_model_field(name)]
+        groups = {
+            "inputs": INPUTS,
+            "memory": tuple(self.memory),
+            "lasting": (*self._lasting(), *model),
+            "start": (*INITIAL, *self.memory, *model),
+        }
+        return {
+            name: None if name in RESULTS else groups.get(form.writes.get(name, ""), ()) for name in form.argument_names
+        }
+
+    def _lasting(self) -> list[str]:
+        return [name for name, part in self.memory.items() if part.kind == "lasting_memory"]
+
+    def _function(self, form: TaskFunction) -> wp.Function | None:
+        """Look up a function and check it, or return None if the task does not define it."""
+        function, name = self._look_up(form.name), form.name
         if function is None:
             return None
         if not isinstance(function, wp.Function):
@@ -177,73 +233,46 @@ class TaskSource:
         types = list(function.input_types.values())
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
-        if foreign and function.func.__module__ in {owner.__module__ for owner in self.definition.__mro__}:
+        if foreign and function.func.__module__ in {owner.__module__ for owner in self._owners}:
             return None  # the function belongs to another task in the module
-        annotations = function.func.__annotations__
-        if any(isinstance(annotation, str) for annotation in annotations.values()):
-            raise ValueError(
-                f"{name} of the task {self.name!r} has annotations that are text, not types: remove "
-                "'from __future__ import annotations' and quotes around types"
-            )
-        returned = annotations.get("return")
-        values = _return_values(function)
-        if wanted.result is not None and not values:
-            raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {wanted.signature}")
-        if wanted.result is not None and any(isinstance(value, ast.Tuple) for value in values):
-            raise ValueError(
-                f"{name} of the task {self.name!r} returns a tuple, but must return a single {wanted.result.__name__}"
-            )
+        returns = any(isinstance(node, ast.Return) for node in ast.walk(source_of(function).tree))
+        if form.result is not None and not returns:
+            raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {form.signature}")
         check_structs(self.name, function, {self.world: self.world.cls, self.params: self.defaults})
         kinds = tuple(map(self._kind, types))
-        if kinds not in (wanted.kinds, wanted.all_kinds) or (returned is not None and returned is not wanted.result):
-            more = f", with or without a last argument {wanted.optional}" if wanted.optional else ""
-            if wanted.name.startswith("observe") and len(structs) == 3:
+        returned = function.adj.arg_types.get("return")
+        if kinds not in (form.kinds, form.all_kinds) or returned not in (None, form.result):
+            more = f", with or without a last argument {form.optional}" if form.optional else ""
+            if form.name.startswith("observe") and len(structs) == 3:
                 more = f"{more}; to write the struct {structs[2].key}, remove obs from the class"
-            raise ValueError(f"{name} of the task {self.name!r} must be written as {wanted.signature}{more}")
+            raise ValueError(f"{name} of the task {self.name!r} must be written as {form.signature}{more}")
         return function
 
     def _kind(self, argument: Any) -> str:
         """Return an argument's type as ``FUNCTIONS`` writes it, such as "World" or "Row[float]"."""
-        if argument is self.world:
-            return "World"
-        if argument is self.params:
-            return "Params"
-        if argument is not None and argument in (self.shared, self.sums):
-            return "Shared" if argument is self.shared else "Sums"
-        if self._has_structs and is_struct(argument):
+        structs = {"World": self.world, "Params": self.params, "Shared": self.shared, "Sums": self.sums}
+        if names := [name for name, struct in structs.items() if struct is not None and argument is struct]:
+            return names[0]
+        if is_struct(argument) and not hasattr(self.definition, "obs"):
             return "Row[float]"
         element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
         kinds = {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
 
     def _check_names(self) -> None:
-        """Refuse a name that is similar to one in ``FUNCTIONS``, because it is probably misspelt."""
-        attributes = [name for name in vars(Task) if not name.startswith("_")]
-        for name in vars(self.definition):
-            if name.startswith(("_", GROUP_PREFIX)) or name in (*attributes, "World", "Params", *FUNCTIONS):
-                continue
-            if close := difflib.get_close_matches(name, (*attributes, *FUNCTIONS), 1, 0.75):
-                raise ValueError(f"the task {self.name!r} has {name!r} in its class: did you mean {close[0]}?")
+        """Refuse an attribute or a function whose name is similar to a known one, because it would be ignored."""
+        known = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
+        names = [name for name in vars(self.definition) if not name.startswith(("_", GROUP_PREFIX))]
+        guesses = {name: closest(name, known, 1, 0.75) for name in names if name not in known}
+        missing = [name for name, function in self.functions.items() if function is None]
         for name, value in vars(sys.modules[self.definition.__module__]).items():
-            known = (*FUNCTIONS, *self.terms.functions)
-            if isinstance(value, wp.Function) and name not in known and not name.startswith(GROUP_PREFIX):
-                own = self._kind(next(iter(value.input_types.values()), None)) == "World"
-                close = difflib.get_close_matches(name, [f for f in FUNCTIONS if self.functions[f] is None], 1, 0.85)
-                if own and close:
-                    raise ValueError(f"the task {self.name!r} has a function {name!r}: did you mean {close[0]}?")
+            if isinstance(value, wp.Function) and name not in (*FUNCTIONS, *self.terms.functions):
+                guesses[name] = closest(name, missing, 1, 0.85) if self.world in value.input_types.values() else []
+        for name, guess in guesses.items():
+            if guess:
+                raise ValueError(f"the task {self.name!r} has {name!r}: did you mean {guess[0]}?")
 
 
 def draws_noise(observer: wp.Function) -> bool:
     """Whether the function of an observation group takes a random stream."""
     return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
-
-
-def _may_list(task: type[Task], group: str) -> bool:
-    """Whether the ``obs`` of a task may have the given group."""
-    obs = getattr(task, "obs", None)
-    return callable(obs) or (isinstance(obs, Mapping) and isinstance(obs.get(group), Mapping))
-
-
-def _return_values(function: wp.Function) -> list[ast.expr]:
-    nodes = ast.walk(source_of(function).tree)
-    return [node.value for node in nodes if isinstance(node, ast.Return) and node.value is not None]

@@ -12,14 +12,70 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.fields import ON_DEMAND, SENSED
 from lyceum_warp.core.model_fields import MOVED_INERTIA
 from lyceum_warp.core.model_files import ModelFile, gymnasium_model, read_spec
 from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
+from lyceum_warp.core.task import Task
 from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.suggestions import did_you_mean
 
 log = logging.getLogger(__name__)
+
+
+def read_task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
+    """Load a task's model, or the given model, as an MjSpec without ``edit_model``."""
+    if model is not None:
+        return load_spec(model)
+    if not hasattr(task, "model"):
+        name = task_name(task)
+        raise ValueError(f'the task {name!r} has no model: add one to its class, such as model = "robot.xml"')
+    return load_spec(task.model() if callable(task.model) else task.model, task)
+
+
+def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
+    """Load a task's model, or the given model, as an MjSpec, and apply ``edit_model`` of the task and its parents."""
+    return _edited(task, read_task_spec(task, model))
+
+
+def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    copy, name = spec.copy(), task_name(task)
+    edits = [vars(owner)["edit_model"] for owner in reversed(task.__mro__) if "edit_model" in vars(owner)]
+    for edit in (edit.__get__(None, task) for edit in edits):
+        if "edit_model" in getattr(getattr(edit, "__code__", None), "co_names", ()):
+            raise ValueError(
+                f"edit_model of the task {name!r} calls edit_model of another class, which would then run twice: "
+                "remove the call, because the edits of all parents run first"
+            )
+        try:
+            result: Any = edit(copy)
+        except Exception as error:
+            raise ValueError(
+                f"edit_model of the task {name!r} fails on the model {spec.modelname!r}: {type(error).__name__}: "
+                f"{error}"
+            ) from error
+        if result is not None:
+            raise ValueError(
+                f"edit_model of the task {name!r} returns {type(result).__name__}: it must change the spec in place "
+                "and return None"
+            )
+    return copy
+
+
+def compile_task_model(
+    task: type[Task],
+    spec: mujoco.MjSpec,
+    fields: Collection[str],
+    physics: PhysicsOptions,
+    varied: Collection[str],
+) -> mujoco.MjModel:
+    """Apply ``edit_model`` of a task and its parents to a copy of a spec, and compile it; see ``compile_model``."""
+    edited = _edited(task, spec)
+    try:
+        return compile_model(edited, fields, physics, varied=varied)
+    except ValueError as error:
+        raise ValueError(f"the model {spec.modelname!r} of the task {task_name(task)!r}: {error}") from error
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:

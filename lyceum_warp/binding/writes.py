@@ -82,23 +82,24 @@ Rights = Mapping[str, Collection[str] | None]
 """Maps each argument of a function to the fields that the function may write. For an output row, the value is None."""
 
 
-def check_writes(task: str, functions: Mapping[str, wp.Function], rights: Mapping[str, Rights]) -> None:
-    """Raise a ValueError if a function of a task writes a field or a row that it must not write."""
-    for name, function in functions.items():
-        allowed = list(rights[name].values())
-        for write in trace(function).writes:
-            fields = allowed[write.position]
-            if (fields is None or write.field in fields) and not write.replaced:
-                continue
-            within = "" if write.function == name_of(function) else f" in {write.function}"
-            place = f"{within} ({write.place})"
-            if write.use is not None:
-                raise ValueError(
-                    f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, and may "
-                    "write it there: read and write its elements directly"
-                )
-            advice = _advice(write, name, rights)
-            raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {advice}")
+def check_writes(task: str, name: str, function: wp.Function, rights: Mapping[str, Rights]) -> None:
+    """Raise a ValueError if a function of a task writes a field or a row that it must not write.
+
+    ``rights`` has the rights of all functions by name.
+    """
+    allowed = list(rights[name].values())
+    for write in trace(function).writes:
+        fields = allowed[write.position]
+        if (fields is None or write.field in fields) and not write.replaced:
+            continue
+        within = "" if write.function == name_of(function) else f" in {write.function}"
+        place = f"{within} ({write.place})"
+        if write.use is not None:
+            raise ValueError(
+                f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, and may write "
+                "it there: read and write its elements directly"
+            )
+        raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {_advice(write, name, rights)}")
 
 
 def check_reads(task: str, name: str, function: wp.Function) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.binding.bound_task import BoundTask, check_field_name
+from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
+from lyceum_warp.binding.functions import check_field_name
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows

@@ -18,22 +18,17 @@ def bound(file: Path, **options: Any) -> BoundTask:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("obs = 10", "obs of the task 'tiny' is 10: add the parts of its observation"),
-        ("memory = 1", r"memory of the task 'tiny' is a row without .* air_time: Row\[float\] = lw\.memory\(4\)"),
-        ("del model", "the task 'tiny' has no model: add one to its class, such as model = \"robot.xml\""),
-        ("lagged = ('qvel',)", "lagged of the task 'tiny' has 'qvel': make it a field of World, too"),
-        ("cleared = ('qacc',)", "cleared of the task 'tiny' has 'qacc': make it a field of World, too"),
-        ("frame_skip = 0", "frame_skip of the task 'tiny' must be a whole number from 1 to .*, not 0"),
-        ("success_steps = 2.5", r"^success_steps of the task 'tiny' must be a whole number from 1 to \d+, not 2\.5$"),
-        (
-            "success_steps = 2",
-            r"^success_steps of the task 'tiny' is 2, but the task has no success\(s: World, p: Params\)",
-        ),
-        ("horizon = 100.0", r"horizon of the task 'tiny' must be an int: write 100, not 100\.0"),
-        ("settle = 2.0", "settle of the task 'tiny' must be an int: write 2"),
-        ("horizon = -1", "horizon of the task 'tiny' must be a whole number from 0 to .*, not -1"),
-        ("action_range = (1.0, -1.0)", r"action_range of the task 'tiny' must be .* not \(1.0, -1.0\)"),
-        ("action_range = (0.0, float('inf'))", r"must be two finite numbers, lowest first"),
+        ("obs = 10", "obs of the task 'tiny' is 10"),
+        ("del model", "'tiny' has no model"),
+        ("lagged = ('qvel',)", "'qvel' in lagged"),
+        ("cleared = ('qacc',)", "'qacc' in cleared"),
+        ("frame_skip = 0", "frame_skip = 0"),
+        ("success_steps = 2.5", r"success_steps = 2\.5"),
+        ("success_steps = 2", r"success_steps = 2, but no success\(s: World, p: Params\)"),
+        ("horizon = 100.0", r"horizon = 100\.0"),
+        ("horizon = -1", "horizon = -1"),
+        ("action_range = (1.0, -1.0)", r"action_range = \(1.0, -1.0\)"),
+        ("action_range = (0.0, float('inf'))", r"action_range = \(0.0, inf\)"),
     ],
 )
 def test_invalid_task_attribute_raises_an_error(line: str, message: str, tmp_path: Path) -> None:
@@ -154,7 +149,7 @@ def test_success_steps_longer_than_an_episode_raise_an_error(tmp_path: Path) -> 
     source = tiny_task.with_function("def success(s: World, p: Params) -> bool:\n    return True")
     for horizon, steps in ((0, 6), (6, 6), (6, 1)):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = {horizon}, {steps}\n"))
-    with pytest.raises(ValueError, match="success_steps of the task 'tiny' is 7, but an episode has only 6 steps"):
+    with pytest.raises(ValueError, match="success_steps = 7, but an episode has 6 steps"):
         bound(tiny_task.write(tmp_path, f"{source}    horizon, success_steps = 6, 7\n"))
 
 
@@ -167,7 +162,7 @@ def test_observation_size_that_differs_between_worlds_raises_an_error() -> None:
 def test_parameters_that_change_the_observation_size_raise_an_error_and_are_not_set() -> None:
     env = lw.make("hopper", nworld=2)
     for value in (False, [True, False]):
-        with pytest.raises(ValueError, match="would change the sizes of the observation's parts: make a new"):
+        with pytest.raises(ValueError, match="exclude_current_positions_from_observation would change"):
             env.set_params(exclude_current_positions_from_observation=value)
     assert env.task.params["exclude_current_positions_from_observation"] is True
     env.step(torch.zeros(2, 3))

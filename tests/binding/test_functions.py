@@ -37,14 +37,11 @@ MISTAKES = {
         r"terminated of the task 'tiny' must be written as terminated\(s: World, p: Params\) -> bool",
     ),
     "no observe": ("def observe", "def look", r"the task 'tiny' has no observe\(s, p, obs\)"),
-    "annotations as text": (
-        "obs: Row[float]):", "obs: 'Row[float]'):", "observe of the task 'tiny' has annotations that are text"
-    ),
     "an ordinary class World": (
         CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
         "World of the task 'tiny' must be a Warp struct: decorate it with @wp.struct",
     ),
-    "a misspelt attribute": (CLASS, f"{CLASS}\n    horzon = 10", "'horzon' in its class: did you mean horizon"),
+    "a misspelt attribute": (CLASS, f"{CLASS}\n    horzon = 10", "'horzon': did you mean horizon"),
 }  # fmt: skip
 
 
@@ -54,25 +51,6 @@ def test_invalid_struct_function_or_attribute_raises_an_error(old: str, new: str
         source_of(tmp_path, tiny_task.changed((old, new)))
 
 
-CRITIC = "@wp.func\ndef observe_critic(s: World, p: Params, obs: Row[float]):\n    obs[0] = s.qpos[0]\n\n"
-OBSERVE = "def observe(s: World, p: Params, obs: Row[float]):\n"
-USERS = {
-    "a class that lists the group": "\nclass Other(lw.Task):\n    obs = {'policy': {'x': 1}, 'critic': {'x': 1}}\n",
-    "a class that may list it": "\nclass Other(lw.Task):\n    obs = staticmethod(lambda p: {'x': 1})\n",
-    "a class that has it as observe": "\nclass Other(lw.Task):\n    observe = observe_critic\n",
-    "a function that calls it": f"\n@wp.func\n{OBSERVE.replace('observe', 'all')}    observe_critic(s, p, obs)\n",
-    "none": "",
-}
-
-
-@pytest.mark.parametrize("user", USERS)
-def test_unused_observe_function_without_a_group_raises_an_error(user: str, tmp_path: Path) -> None:
-    file = tiny_task.write(tmp_path, tiny_task.changed(("class Tiny", f"{CRITIC}class Tiny")) + USERS[user])
-    task = find_task(f"{file}:Tiny")
-    source = TaskSource(task, task_name(task))
-    if user == "none":
-        with pytest.raises(ValueError, match="no group 'critic', which observe_critic writes"):
-            source.group_functions(["policy"])
-    else:
-        assert list(source.group_functions(["policy"])) == ["policy"]
-    assert list(source.group_functions(["policy", "critic"])) == ["policy", "critic"]
+def test_annotations_may_be_text(tmp_path: Path) -> None:
+    text = f"from __future__ import annotations\n{tiny_task.TINY}"
+    assert source_of(tmp_path, text).functions["observe"] is not None

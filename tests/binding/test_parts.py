@@ -143,7 +143,7 @@ MISTAKES = {
     ),
     "a part in World": (
         [("    qpos: Row[float]", "    qpos: Row[float]\n    x: Row[float] = lw.part()")],
-        r"World\.x of the task 'tiny' is declared by lw\.part\(\.\.\.\): use lw\.memory\(\.\.\.\)",
+        r"World\.x of the task 'tiny' is declared by lw\.part: use lw\.memory",
     ),
     "a part that is not written": (
         [STRUCT, (f"@wp.func\n{OBSERVE}", struct_of("x: Row[float] = lw.part(2)"))],

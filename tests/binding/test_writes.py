@@ -293,5 +293,5 @@ REFUSED = {
 @pytest.mark.parametrize(("name", "function", "message"), REFUSED.values(), ids=REFUSED)
 def test_forbidden_write_in_a_task_raises_a_one_line_error(name: str, function: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
-        check_writes("mine", {name: function}, RIGHTS)
+        check_writes("mine", name, function, RIGHTS)
     assert "\n" not in str(caught.value)

@@ -115,9 +115,6 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
     ),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
-    "a keyframe by its number": (
-        [line("keyframe = 0")], "keyframe of the task 'tiny' must be the name of a keyframe .*, such as 'home', not 0",
-    ),
     "actions without control": ([line('actions = {"speed": 1}')], "defines its own actions, so it needs control"),
     "actions without sizes": (
         [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
