@@ -5,15 +5,15 @@ the result of another function, a parameter, or a field. The generated text call
 the results.
 """
 
-import difflib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import warp as wp
 
 from lyceum_warp.binding.sources import is_struct, overloads, run_source, source_of
 from lyceum_warp.core.task import Row, Task
+from lyceum_warp.support.suggestions import did_you_mean
 
 _STEP = {"s0": "s0", "action": "action", "s1": "s1", "s": "s1", "p": "p"}
 """Maps each possible argument of a reward term or metric to a variable of the generated text."""
@@ -42,7 +42,8 @@ class Terms:
         world: Any,
         params: Any,
     ) -> None:
-        self._name, self.lookup, self._world, self._params = name, lookup, world, params
+        self._name, self.lookup = name, lookup
+        self._world, self._params = world, params
         self.weights = self._checked_weights(task.rewards)
         self.ends = {name: self._names(name, getattr(task, name)) for name in _ENDS}
         self._reward, self._measure = written["reward"], written["measure"]
@@ -121,18 +122,17 @@ class Terms:
         parts = []
         if self.weights:
             body = _Body(self, _STEP)
-            total = self._total(body, {term: f"weights[{i}] * {body.value(term, float)}" for i, term in
-                                       enumerate(self.weights)})  # fmt: skip
+            total = _total(f"weights[{i}] * {body.value(term, float)}" for i, term in enumerate(self.weights))
             parts.append(body.function(f"reward({_HEAD}) -> float", [*total, "return p.dt * total"]))
         body = _Body(self, _STEP)
         lines = ["measure(s0, action, s1, p, metrics)"] if self._measure else []
-        found = {f"metrics[{i}]": f"weights[{i}] * {body.value(term, float)}" for i, term in enumerate(self.weights)}
-        lines += [f"{place} = p.dt * {value}" for place, value in found.items()]
+        summands = {f"metrics[{i}]": f"weights[{i}] * {body.value(term, float)}" for i, term in enumerate(self.weights)}
+        lines += [f"{place} = p.dt * {value}" for place, value in summands.items()]
         start = len(self.weights) + first
         for i, metric in enumerate(metrics, start):
             lines.append(f"metrics[{i}] = {body.number(metric)}")
         if self.weights:
-            lines += [*self._total(body, found), "return p.dt * total"]
+            lines += [*_total(summands.values()), "return p.dt * total"]
         else:
             lines.append("return reward(s0, action, s1, p)" if self._reward else "return 0.0")
         parts.append(body.function(f"score({_HEAD}, metrics: Row[float]) -> float", lines))
@@ -143,18 +143,14 @@ class Terms:
                 parts.append(body.function(f"{_ENDS[attribute]}(s: World, p: Params) -> bool", [f"return {any_end}"]))
         return "\n\n".join(parts)
 
-    def _total(self, body: "_Body", values: Mapping[str, str]) -> list[str]:
-        first, *others = values.values()
-        return [f"total = {first}", *(f"total += {value}" for value in others)]
-
     # names
 
-    def choose(self, name: str, given: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
+    def choose(self, name: str, variables: Mapping[str, str], within: tuple[str, ...] = ()) -> tuple[wp.Function, Any]:
         """Return a function's first overload whose arguments can all be found, and its result type.
 
         Args:
             name: The function's name.
-            given: The text for each name that refers to a state, the action or Params.
+            variables: The text for each name that refers to a state, the action or Params.
             within: The chain of functions that need this function's result, for the detection of cycles.
         """
         if name in within:
@@ -163,52 +159,53 @@ class Terms:
             )
         function = self.lookup(name)
         assert function is not None
-        refused = None
+        errors = []
         for overload in overloads(function):
             try:
                 for argument in overload.input_types:
-                    self.source_of(overload, argument, given, (*within, name))
+                    self.source_of(overload, argument, variables, (*within, name))
             except ValueError as error:
-                refused = refused or error
+                errors.append(error)
             else:
                 return overload, self._result(overload)
-        assert refused is not None
-        raise refused
+        raise errors[0]
 
     def source_of(
-        self, function: wp.Function, name: str, given: Mapping[str, str], within: tuple[str, ...]
+        self, function: wp.Function, name: str, variables: Mapping[str, str], within: tuple[str, ...]
     ) -> tuple[Literal["expression", "function", "default"], str]:
         """Find where an argument's value comes from: an expression, a function of the same name, or the default."""
         source: Literal["expression", "function"] = "expression"
-        if name in given:
-            text = given[name]
+        if name in variables:
+            text = variables[name]
             kind: Any = {"p": self._params, "action": Row[float]}.get(name, self._world)
         elif name not in _OWN and self.lookup(name) is not None:
-            source, text, kind = "function", name, self.choose(name, given, within)[1]
+            source, text, kind = "function", name, self.choose(name, variables, within)[1]
         elif name in self._params.vars:
             text, kind = f"p.{name}", self._params.vars[name].type
         elif name in self._world.vars:
-            text, kind = f"{given['s']}.{name}", self._world.vars[name].type
+            text, kind = f"{variables['s']}.{name}", self._world.vars[name].type
         elif name in function.defaults:
             return "default", name
         else:
-            raise ValueError(self._unknown(function, name, given))
+            raise ValueError(self._unknown(function, name, variables))
         if not _fits(expected := function.input_types[name], kind):
             raise ValueError(
                 f"{self.place(function)} takes {name} as {_spelled(expected)}, but {text} is {_spelled(kind)}"
             )
         return source, text
 
-    def _unknown(self, function: wp.Function, name: str, given: Mapping[str, str]) -> str:
+    def _unknown(self, function: wp.Function, name: str, variables: Mapping[str, str]) -> str:
         place = self.place(function)
         if name in _STEP:
             return f"{place} takes {name}, but the end of an episode depends only on the state: it may take s and p"
         if name in _OWN:
             return f"{place} takes {name}, which is a name of the generated text: rename it"
-        known = [*given, *self._params.vars, *self._world.vars, *source_of(function).scope]
-        close = [other for other in difflib.get_close_matches(name, known, 1) if other != name]
-        hint = f": did you mean {close[0]}?" if close else ""
-        return f"{place} takes {name}, which is not a function of the task, a parameter or a field of World{hint}"
+        known = {*variables, *self._params.vars, *self._world.vars, *source_of(function).scope} - {name}
+        hint = did_you_mean(name, known)
+        return (
+            f"{place} takes {name}, which is not a function of the task, a parameter or a field of World"
+            f"{hint and f': {hint}'}"
+        )
 
     def _result(self, function: wp.Function) -> Any:
         kind = function.adj.arg_types.get("return")
@@ -225,18 +222,18 @@ class Terms:
 class _Body:
     """The body of a generated function, which calls each function once."""
 
-    def __init__(self, terms: Terms, given: Mapping[str, str]) -> None:
-        self._terms, self._given = terms, given
+    def __init__(self, terms: Terms, variables: Mapping[str, str]) -> None:
+        self._terms, self._variables = terms, variables
         self._lines: list[str] = []
         self._values: dict[str, tuple[wp.Function, Any]] = {}
 
-    def value(self, name: str, *wanted: type) -> str:
+    def value(self, name: str, *types: type) -> str:
         """Return the variable that holds a function's result."""
         if name not in self._values:
-            function, kind = self._terms.choose(name, self._given)
+            function, kind = self._terms.choose(name, self._variables)
             arguments, named = [], False
             for argument in function.input_types:
-                source, text = self._terms.source_of(function, argument, self._given, (name,))
+                source, text = self._terms.source_of(function, argument, self._variables, (name,))
                 text = self.value(text) if source == "function" else text
                 if source == "default":
                     named = True  # after an omitted argument, Warp requires keyword arguments
@@ -244,14 +241,14 @@ class _Body:
                     arguments.append(f"{argument}={text}" if named else text)
             self._lines.append(f"{name}_ = {name}({', '.join(arguments)})")
             self._values[name] = function, kind
-            found = self._terms.lookup(name)
-            assert found is not None
-            self._terms.functions[name] = found
+            term = self._terms.lookup(name)
+            assert term is not None
+            self._terms.functions[name] = term
         function, kind = self._values[name]
-        if wanted and not any(_fits(one, kind) for one in wanted):
+        if types and not any(_fits(one, kind) for one in types):
             raise ValueError(
                 f"{self._terms.place(function)} returns {_spelled(kind)}, but must return "
-                f"{' or '.join(one.__name__ for one in wanted)}"
+                f"{' or '.join(one.__name__ for one in types)}"
             )
         return f"{name}_"
 
@@ -263,10 +260,15 @@ class _Body:
         return f"@wp.func\ndef {signature}:\n" + "\n".join(f"    {line}" for line in (*self._lines, *lines)) + "\n"
 
 
-def _fits(expected: Any, given: Any) -> bool:
-    if is_struct(expected) or is_struct(given):
-        return expected is given or expected is Any
-    return "Any" in wp.types.type_repr(expected) or bool(wp.types.types_equal(expected, given))
+def _total(values: Iterable[str]) -> list[str]:
+    first, *others = values
+    return [f"total = {first}", *(f"total += {value}" for value in others)]
+
+
+def _fits(expected: Any, kind: Any) -> bool:
+    if is_struct(expected) or is_struct(kind):
+        return expected is kind or expected is Any
+    return "Any" in wp.types.type_repr(expected) or bool(wp.types.types_equal(expected, kind))
 
 
 def _spelled(kind: Any) -> str:

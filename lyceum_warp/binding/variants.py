@@ -29,7 +29,7 @@ class Variant:
         modules: The modules of the task and its parents. The task's module comes first.
         functions: The functions with Python source in these modules.
         structs: The replacements of structs.
-        replaced: The replacements of functions.
+        replacements: The replacements of functions.
     """
 
     def __init__(
@@ -37,9 +37,10 @@ class Variant:
         modules: Sequence[types.ModuleType],
         functions: Sequence[wp.Function],
         structs: Mapping[Any, Any],
-        replaced: Mapping[wp.Function, wp.Function],
+        replacements: Mapping[wp.Function, wp.Function],
     ) -> None:
-        self._modules, self._structs, self._replaced = {m.__name__: m for m in modules}, structs, replaced
+        self._modules = {module.__name__: module for module in modules}
+        self._structs, self._replacements = structs, replacements
         self._copies: dict[wp.Function, wp.Function] = {}
         # Warp evaluates wp.static(...) when it defines a function, so the structs must be in the scope
         scopes = {module.__name__: self._with_structs(vars(module)) for module in modules}
@@ -57,15 +58,16 @@ class Variant:
         gets the original, so that the replacement can call it.
         """
         if isinstance(value, wp.Function):
-            while (other := self._replaced.get(value)) is not None and _home(other) != viewer:
-                value = other
+            while (replacement := self._replacements.get(value)) is not None and _home(replacement) != viewer:
+                value = replacement
             return self._copies.get(value, value)
         if is_struct(value):
             return self._structs.get(value, value)
         if isinstance(value, types.ModuleType) and viewer and self._modules.get(value.__name__) is value:
             proxy = types.ModuleType(value.__name__)
-            vars(proxy).update({name: self.seen(v, viewer) for name, v in vars(value).items()
-                                if not isinstance(v, types.ModuleType)})  # fmt: skip
+            for name, attribute in vars(value).items():
+                if not isinstance(attribute, types.ModuleType):
+                    setattr(proxy, name, self.seen(attribute, viewer))
             return proxy
         return value
 
@@ -73,60 +75,66 @@ class Variant:
         return {name: self._structs.get(value, value) if is_struct(value) else value for name, value in values.items()}
 
     def _copy(self, function: wp.Function, scope: dict[str, Any], home: wp.Module) -> wp.Function:
-        first: wp.Function | None = None
+        copies: list[Any] = []
         for overload in overloads(function):
-            own: Any = overload.func
-            copy = types.FunctionType(own.__code__, scope, own.__name__, own.__defaults__, own.__closure__)
-            copy.__annotations__ = self._with_structs(own.__annotations__)
-            copy.__module__, copy.__qualname__, copy.__doc__ = own.__module__, own.__qualname__, own.__doc__
-            made: Any = wp.func(module=home)(copy)
-            if first is None:
-                first = made
-            else:
-                first.add_overload(made)
-        assert first is not None
+            body: Any = overload.func
+            copy = types.FunctionType(body.__code__, scope, body.__name__, body.__defaults__, body.__closure__)
+            copy.__annotations__ = self._with_structs(body.__annotations__)
+            copy.__module__, copy.__qualname__, copy.__doc__ = body.__module__, body.__qualname__, body.__doc__
+            copies.append(wp.func(module=home)(copy))
+        first, *others = copies
+        for other in others:
+            first.add_overload(other)
         return first
 
 
-_made: dict[Any, Variant] = {}
+_variants: dict[Any, Variant] = {}
 
 
-def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, own: Any) -> Variant | None:
+def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, declared: Any) -> Variant | None:
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
-    Tasks with the same structs and replacements share a variant and its compiled kernels. ``own`` is the Params struct
-    that the task declares, and ``params`` is the Params struct that its functions take. If the task changes only
+    Tasks with the same structs and replacements share a variant and its compiled kernels. ``declared`` is the Params
+    struct that the task declares, and ``params`` is the Params struct that its functions take. If the task changes only
     defaults, ``params`` is the struct of the base task. Otherwise, the two are identical.
     """
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [value for module in modules for value in _values(module, owners)]
-    structs = _new_structs(filter(is_struct, values), {own: params, world: world, params: params})
-    replaced = _next_functions(owners) | {
-        value.replaces: value
-        for value in reversed(values)
-        if isinstance(value, wp.Function) and hasattr(value, "replaces")
-    }
+    structs = _new_structs(filter(is_struct, values), {declared: params, world: world, params: params})
+    replacements = _next_functions(owners) | _declared_replacements(values)
     modules = _with_helpers(modules, owners, {*structs, *structs.values(), world, params})
-    found = dict.fromkeys(v for module in modules for v in _values(module, owners) if isinstance(v, wp.Function))
-    functions = [f for f in found if has_source(f) and sys.modules.get(_home(f)) in modules]
-    taken = {kind for f in functions for overload in overloads(f) for kind in overload.input_types.values()
-             if is_struct(kind)}  # fmt: skip
-    structs = {struct: new for struct, new in structs.items() if struct in taken}
-    if not structs and not replaced:  # the task needs no copies, for example because it changes only defaults
+    functions = _functions(modules, owners)
+    arguments = {kind for function in functions for overload in overloads(function)
+                 for kind in overload.input_types.values() if is_struct(kind)}  # fmt: skip
+    structs = {struct: new for struct, new in structs.items() if struct in arguments}
+    if not structs and not replacements:  # the task needs no copies, for example because it changes only defaults
         return None
-    key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replaced.items()))
-    if key not in _made:
-        made = _made[key] = Variant(modules, functions, structs, replaced)
-        for before, after in replaced.items():
-            check_structs(task, made.seen(after, _home(after)), {world: world.cls, params: own.cls})
-            _check_replacement(task, made, before, after)
-    return _made[key]
+    key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replacements.items()))
+    if key not in _variants:
+        variant = _variants[key] = Variant(modules, functions, structs, replacements)
+        for original, replacement in replacements.items():
+            copy = variant.seen(replacement, _home(replacement))
+            check_structs(task, copy, {world: world.cls, params: declared.cls})
+            _check_replacement(task, variant, original, replacement)
+    return _variants[key]
+
+
+def _declared_replacements(values: Sequence[Any]) -> dict[wp.Function, wp.Function]:
+    """Map each function to the one whose attribute ``replaces`` names it. The first of the values wins."""
+    functions = [value for value in values if isinstance(value, wp.Function) and hasattr(value, "replaces")]
+    return {function.replaces: function for function in reversed(functions)}
+
+
+def _functions(modules: Sequence[types.ModuleType], owners: Sequence[type[Task]]) -> list[wp.Function]:
+    """List the functions with Python source that modules define."""
+    values = dict.fromkeys(v for module in modules for v in _values(module, owners) if isinstance(v, wp.Function))
+    return [function for function in values if has_source(function) and sys.modules.get(_home(function)) in modules]
 
 
 def merged(structs: Iterable[Any]) -> Any:
     """Return the struct that extends all others. If none does, make one."""
-    known = dict.fromkeys(structs)
-    last = [s for s in known if not any(s is not other and issubclass(other.cls, s.cls) for other in known)]
+    unique = dict.fromkeys(structs)
+    last = [s for s in unique if not any(s is not other and issubclass(other.cls, s.cls) for other in unique)]
     return last[0] if len(last) == 1 else _merge(*last)
 
 
@@ -136,18 +144,18 @@ def _merge(*structs: Any) -> Any:
     return wp.struct(types.new_class(structs[0].cls.__name__, structs, exec_body=lambda body: body.update(names)))
 
 
-def _new_structs(family: Iterable[Any], known: Mapping[Any, Any]) -> dict[Any, Any]:
+def _new_structs(family: Iterable[Any], main: Mapping[Any, Any]) -> dict[Any, Any]:
     """Map each struct of a family to the struct that the task's functions take.
 
-    ``known`` maps the task's World and Params. A struct that one of these extends maps to this one. Any other struct,
+    ``main`` maps the task's World and Params. A struct that one of these extends maps to this one. Any other struct,
     such as an observation's, maps to the struct of the same name that extends it.
     """
-    structs, family = dict(known), list(family)
+    structs, family = dict(main), list(family)
     for parent in family:
         if parent not in structs:
-            others = [s for s in known.values() if issubclass(s.cls, parent.cls)]
-            named = [s for s in family if s.key == parent.key and issubclass(s.cls, parent.cls)]
-            structs |= {parent: others[0]} if others else dict.fromkeys(named, merged(named))
+            children = [struct for struct in main.values() if issubclass(struct.cls, parent.cls)]
+            namesakes = [struct for struct in family if struct.key == parent.key and issubclass(struct.cls, parent.cls)]
+            structs |= {parent: children[0]} if children else dict.fromkeys(namesakes, merged(namesakes))
     return {struct: new for struct, new in structs.items() if struct is not new}
 
 
@@ -159,7 +167,7 @@ def _next_functions(owners: Sequence[type[Task]]) -> dict[wp.Function, wp.Functi
     """
     scopes = {owner: {**vars(sys.modules[owner.__module__]), **owner.scope, **vars(owner)} for owner in owners}
     names = dict.fromkeys(name for scope in scopes.values() for name in scope)
-    replaced: dict[wp.Function, wp.Function] = {}
+    replacements: dict[wp.Function, wp.Function] = {}
     for name in (name for name in names if name in FUNCTIONS or name.startswith(GROUP_PREFIX)):
         functions: dict[wp.Function, type[Task]] = {}
         for owner, scope in scopes.items():
@@ -172,23 +180,24 @@ def _next_functions(owners: Sequence[type[Task]]) -> dict[wp.Function, wp.Functi
         first, *others = functions
         common = next((f for f in others if issubclass(functions[first], functions[f])), None)
         if common is not None:
-            beside = [f for f, owner in functions.items()
-                      if not issubclass(functions[first], owner) and issubclass(owner, functions[common])]  # fmt: skip
-            replaced |= itertools.pairwise([common, *reversed(beside)])
-    return replaced
+            head, base = functions[first], functions[common]
+            siblings = [f for f, owner in functions.items() if issubclass(owner, base) and not issubclass(head, owner)]
+            replacements |= itertools.pairwise([common, *reversed(siblings)])
+    return replacements
 
 
 def _with_helpers(
     modules: Sequence[types.ModuleType], owners: Sequence[type[Task]], structs: set[Any]
 ) -> list[types.ModuleType]:
     """Add the modules from which the family imports functions that take one of the given structs."""
-    found = list(modules)
-    for module in found:  # the list grows during the loop
-        for value in _values(module, owners):
+    family, pending = list(modules), list(modules)
+    while pending:
+        for value in _values(pending.pop(0), owners):
             home = sys.modules.get(_home(value)) if isinstance(value, wp.Function) else value
-            if isinstance(home, types.ModuleType) and home not in found and _names(home, structs):
-                found.append(home)
-    return found
+            if isinstance(home, types.ModuleType) and home not in family and _names(home, structs):
+                family.append(home)
+                pending.append(home)
+    return family
 
 
 def _home(function: wp.Function) -> str:
@@ -202,8 +211,8 @@ def _values(module: types.ModuleType, owners: Sequence[type[Task]]) -> Iterator[
     """
     for owner in owners:
         if owner.__module__ == module.__name__:
-            own = (value.__func__ if isinstance(value, staticmethod) else value for value in vars(owner).values())
-            yield from own
+            for value in vars(owner).values():
+                yield value.__func__ if isinstance(value, staticmethod) else value
             yield from owner.scope.values()
     yield from list(vars(module).values())
 
@@ -237,12 +246,13 @@ def _file(cls: type) -> str:
     return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)
 
 
-def _check_replacement(task: str, made: Variant, old: wp.Function, new: wp.Function) -> None:
+def _check_replacement(task: str, variant: Variant, old: wp.Function, new: wp.Function) -> None:
     """Check that a replacement takes the same arguments as the function that it replaces."""
-    wanted, given = (list(made.seen(f, _home(new)).input_types.values()) for f in (old, new))
-    same = len(wanted) == len(given) and all(
+    old_types = list(variant.seen(old, _home(new)).input_types.values())
+    new_types = list(variant.seen(new, _home(new)).input_types.values())
+    same = len(old_types) == len(new_types) and all(
         a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)
-        for a, b in zip(wanted, given, strict=True)
+        for a, b in zip(old_types, new_types, strict=True)
     )
     if not same:
         raise ValueError(
