@@ -79,7 +79,7 @@ class BoundTask:
 
         self.parameters = Parameters(
             source.params, source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
-            given=params or {}, weights=source.terms.weights,
+            values=params or {}, weights=source.terms.weights,
         )  # fmt: skip
         self.actions = self._actions()
         """The size of each part of an action, or None if the actions are MuJoCo's controls."""

@@ -46,7 +46,7 @@ class Parameters:
         *,
         nworld: int,
         timestep: float,
-        given: Mapping[str, Any],
+        values: Mapping[str, Any],
         weights: Mapping[str, float] | None = None,
     ) -> None:
         self._struct, self._owner, self._weights = struct, owner, dict(weights or {})
@@ -60,23 +60,24 @@ class Parameters:
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so "
                 f"make() would set the option: rename it in Params"
             )
-        found = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
-        self._computed = {name for name, value in found.items() if isinstance(value, FromModel)}
-        self.values: dict[str, Any] = {name: found[name] for name in (*struct.vars, *self._weights) if name in found}
-        self.values = self.changed(given).values
-        self._computed -= set(given)
+        initial = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        self._computed = {name for name, value in initial.items() if isinstance(value, FromModel)}
+        names = (*struct.vars, *self._weights)
+        self.values: dict[str, Any] = {name: initial[name] for name in names if name in initial}
+        self.values = self.changed(values).values
+        self._computed -= set(values)
 
     @property
     def per_world(self) -> dict[str, np.ndarray]:
         """The values of the parameters that differ between worlds, (nworld, ...)."""
         return {name: v for name, v in self.values.items() if isinstance(v, np.ndarray) and name not in self.tables}
 
-    def changed(self, given: Mapping[str, Any]) -> "Parameters":
+    def changed(self, values: Mapping[str, Any]) -> "Parameters":
         """Return a copy with some values replaced. The copy and the original share arrays."""
         known = (*self._struct.vars, *self._weights)
-        for name in given:
-            if name not in known or name in _FILLED_IN:
-                names = sorted(set(known) - set(_FILLED_IN))
+        names = sorted(set(known) - set(_FILLED_IN))
+        for name in values:
+            if name not in names:
                 if name in OPTIONS:
                     raise ValueError(
                         f"{name!r} is an option, not a parameter of the task {self._task_name!r}: make another "
@@ -84,13 +85,13 @@ class Parameters:
                     )
                 hint = suggestion(name, names) or f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
-        if missing := [name for name in known if name not in self.values and name not in given]:
+        if missing := [name for name in known if name not in self.values and name not in values]:
             raise ValueError(f"the task {self._task_name!r} needs values for {', '.join(missing)}")
         other = copy.copy(self)
-        other._computed = self._computed - set(given)
+        other._computed = self._computed - set(values)
         other.values = {
             name: self._converted(name, value)
-            for name, value in {**self.values, **given}.items()
+            for name, value in {**self.values, **values}.items()
             if name not in other._computed
         }
         for name in known:
@@ -101,13 +102,13 @@ class Parameters:
     def _compute(self, name: str, values: Mapping[str, Any]) -> Any:
         """Compute a default from the model. Return the previous table if its contents did not change."""
         try:
-            found = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
+            result = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
         except Exception as error:  # the task's function may raise any error
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             raise ValueError(
                 f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
             ) from error
-        value, before = self._converted(name, found), self.values[name]
+        value, before = self._converted(name, result), self.values[name]
         return before if name in self.tables and np.array_equal(before, value) else value
 
     def array(self, device: wp.Device) -> wp.array:
@@ -131,12 +132,12 @@ class Parameters:
 
     def _upload(self, name: str, dtype: type, device: wp.Device) -> None:
         value = self.values[name]
-        kept = self._arrays.get(name)
-        if kept is None or kept[1].device != device or kept[0].shape != value.shape:
+        previous, array = self._arrays.get(name, (None, None))
+        if previous is None or array is None or array.device != device or previous.shape != value.shape:
             self._arrays[name] = value, wp.array(value, dtype=dtype, device=device)
-        elif kept[0] is not value:
-            kept[1].assign(value)
-            self._arrays[name] = value, kept[1]
+        elif previous is not value:
+            array.assign(value)
+            self._arrays[name] = value, array
 
     def _check_tables(self) -> None:
         for name, kind in self.tables.items():
@@ -149,92 +150,82 @@ class Parameters:
 
     def _converted(self, name: str, value: Any) -> Any:
         """Convert a value to its field's type: a scalar, a vector, a table, or an array with one value per world."""
-        kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
         if name in self.tables:
             return self._table(name, value)
-        default = getattr(self._owner, name, None)
-        what = f"the parameter {name} of {self._task_name!r}"
-        given = f"the parameter {name}={value!r} of {self._task_name!r}"
-        if isinstance(value, Element):
-            if not isinstance(default, Element) or default.field != value.field:
-                is_what = f"one of {default.field!r}" if isinstance(default, Element) else "a number"
-                raise ValueError(f"{what} can't be an element of {value.field!r}: its default is {is_what}")
-            if kind is not wp.int32:
-                raise ValueError(f"{what} must be declared as int, because it holds an index")
-            return elements(self._model, value.field, value.name).start
-        if isinstance(default, Element) and isinstance(value, str):
-            return elements(self._model, default.field, value).start
-        shape = tuple(getattr(kind, "_shape_", ()))
+        kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
+        text = f"the parameter {name}={value!r} of {self._task_name!r}"
+        field = _element_field(getattr(self._owner, name, None))
+        value = self._indices(text, value, field, whole=kind is wp.int32)
         try:
             array = np.asarray(value, dtype=np.float64)  # np.asarray also converts Warp's vectors, lists and tensors
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{given} is not a number: {error}") from error
+            raise ValueError(f"{text} is not a number: {error}") from error
         if np.isnan(array).any():
-            raise ValueError(f"{given} is not a number")
-        if isinstance(default, Element):
-            self._check_index(given, array, default.field)
-        if array.shape == shape:
-            if shape:
-                return kind(*array.ravel())
-            if kind in (wp.bool, wp.int32) and not (array == np.round(array)).all():
-                raise ValueError(f"{given} must be a whole number")
-            return {wp.bool: bool, wp.int32: int}.get(kind, float)(array.item())
+            raise ValueError(f"{text} is not a number")
+        if field:
+            self._check_index(text, array, field)
+        shape = tuple(getattr(kind, "_shape_", ()))
         per_world = (self._nworld, *shape)
-        if array.shape == per_world:
+        if array.shape not in (shape, per_world):
+            takes = f"{shape or 'one number'}, or one per world, {per_world}"
+            raise ValueError(f"{text} has shape {array.shape}: it takes {takes}")
+        if array.shape != shape:
             return array
-        raise ValueError(
-            f"{what} has shape {array.shape}; it takes {shape or 'one number'}, or one per world, {per_world}"
-        )
+        if shape:
+            return kind(*array.ravel())
+        if kind in (wp.bool, wp.int32) and not (array == np.round(array)).all():
+            raise ValueError(f"{text} must be a whole number")
+        return {wp.bool: bool, wp.int32: int}.get(kind, float)(array.item())
 
     def _table(self, name: str, value: Any) -> np.ndarray:
         """Convert a table to a read-only array of float32 or int32. The last axes are those of a vector or matrix."""
         if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
             return value
-        kind, what = self.tables[name], f"the parameter {name} of {self._task_name!r}"
+        kind, text = self.tables[name], f"the parameter {name} of {self._task_name!r}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
         field = _element_field(getattr(self._owner, name, None))
-        value = self._indices(what, value, field)
+        value = self._indices(text, value, field, whole=whole)
         if isinstance(value, (str, Path)):
-            what += f" from {str(value)!r}"
-            value = _loaded(what, value)
+            text += f" from {str(value)!r}"
+            value = _loaded(text, value)
         try:
-            given = value.detach().cpu() if hasattr(value, "detach") else value
-            given = np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)
+            value = value.detach().cpu() if hasattr(value, "detach") else value
+            array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise ValueError(f"{what} must be a table of numbers: {error}") from error
+            raise ValueError(f"{text} must be a table of numbers: {error}") from error
         with np.errstate(over="ignore", invalid="ignore"):
-            table: np.ndarray = given.astype(np.int32 if whole else np.float32)
+            table: np.ndarray = array.astype(np.int32 if whole else np.float32)
         axes = kind.ndim + len(element)
         if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
             last = f", the last {element}" if element else ""
-            raise ValueError(f"{what} has shape {table.shape}: it takes {axes} axes{last}, with no axis of length 0")
+            raise ValueError(f"{text} has shape {table.shape}: it takes {axes} axes{last}, with no axis of length 0")
         if field:
-            self._check_index(what, given, field)
-        bad = table != given if whole else ~np.isfinite(table)
+            self._check_index(text, array, field)
+        bad = table != array if whole else ~np.isfinite(table)
         if bad.any():
             place = np.argwhere(bad)[0].tolist()
-            wanted = "a whole number of 32 bits" if whole else "a finite number of 32 bits"
-            raise ValueError(f"{what} has {given[tuple(place)]} at {place}: it must be {wanted}")
+            number = "a whole number of 32 bits" if whole else "a finite number of 32 bits"
+            raise ValueError(f"{text} has {array[tuple(place)]} at {place}: it must be {number}")
         table.flags.writeable = False
         return table
 
-    def _indices(self, what: str, value: Any, field: str | None) -> Any:
-        """Replace the model elements in a table by their indices. With ``field``, also replace names."""
+    def _indices(self, text: str, value: Any, field: str | None, *, whole: bool) -> Any:
+        """Replace model elements by their indices. With ``field``, also replace the elements' names."""
         if isinstance(value, list | tuple):
-            return [self._indices(what, entry, field) for entry in value]
+            return [self._indices(text, entry, field, whole=whole) for entry in value]
         if isinstance(value, Element):
-            if field and value.field != field:
-                raise ValueError(f"{what} can't have an element of {value.field!r}: its elements belong to {field!r}")
+            if not whole or field not in (None, value.field):
+                raise ValueError(f"{text} can't be an element of {value.field!r}: it takes {field or 'numbers'}")
             return elements(self._model, value.field, value.name).start
         return elements(self._model, field, value).start if field and isinstance(value, str) else value
 
-    def _check_index(self, given: str, array: np.ndarray, field: str) -> None:
+    def _check_index(self, text: str, array: np.ndarray, field: str) -> None:
         if field not in self._sizes:
             self._sizes[field] = rows(self._model, field)
         count = self._sizes[field]
         if ((array < 0) | (array >= count)).any():
-            raise ValueError(f"{given} is not an index of {field!r}: give an index from 0 to {count - 1}, or a name")
+            raise ValueError(f"{text} is not an index of {field!r}: give an index from 0 to {count - 1}, or a name")
 
     def _instance(self, world: int) -> Any:
         instance = self._struct()
@@ -255,14 +246,11 @@ def _element_field(default: Any) -> str | None:
     return default.field if isinstance(default, Element) else None
 
 
-def _loaded(what: str, path: str | Path) -> np.ndarray:
+def _loaded(text: str, path: str | Path) -> np.ndarray:
     try:
         # map the file instead of reading it: a broken header could make NumPy allocate any amount of memory
-        loaded: np.ndarray = np.load(path, allow_pickle=False, mmap_mode="r")
+        return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
     except FileNotFoundError:
-        raise FileNotFoundError(f"{what} cannot be read, because there is no such file") from None
+        raise FileNotFoundError(f"{text} cannot be read, because there is no such file") from None
     except Exception as error:  # NumPy raises many types of errors
-        raise ValueError(f"{what} cannot be read: {error}") from error
-    if not isinstance(loaded, np.ndarray):
-        raise ValueError(f"{what} must be a single array, in a .npy file written by numpy.save")
-    return np.array(loaded)
+        raise ValueError(f"{text} cannot be read: {error}") from error
