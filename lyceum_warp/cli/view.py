@@ -14,6 +14,7 @@ from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers import episode_env, load_episodes
+from lyceum_warp.core import EnvOptions
 from lyceum_warp.env import Env, start_episodes
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.training import AUTO, Run, load, load_curriculum, pretrained_run, pretrained_text, runs_in
