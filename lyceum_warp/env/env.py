@@ -4,7 +4,7 @@ import copy
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.functions import check_field_name
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.fields import describe, elements, has_several_rows
+from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
 from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOptions
 from lyceum_warp.core.spaces import Space
@@ -31,6 +31,7 @@ from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
+from lyceum_warp.support.suggestions import Named, did_you_mean
 from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
@@ -206,7 +207,7 @@ class Env:
             self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
             self.action_space, self.state_space = worlds.action_space, worlds.state_space
             self.metrics, self.episode_metrics = (
-                dict(zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
+                Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
                 for array in (worlds.metrics, worlds.episode_metrics)
             )
             self.episode_metric_sums = torch_view(worlds.episode_metrics)
@@ -242,6 +243,14 @@ class Env:
                 f"env.{name} is a buffer at a fixed address: write into the buffer, as env.{name}.copy_(...)"
             )
         super().__setattr__(name, value)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            hint = did_you_mean(name, [*Env.__annotations__, *vars(self)], "help(lw.Env) lists the attributes")
+            if is_data_field(name) or is_model_field(name):
+                hint = f"use env.field({name!r})"
+            raise AttributeError(f"an environment has no {name!r}: {hint}")
 
     @functools.cached_property
     def model(self) -> mujoco.MjModel:

@@ -6,10 +6,13 @@ from collections.abc import Iterable
 from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type)
+Value = TypeVar("Value")
 
 _OTHER_WORDS = {
     # environments
     "num_envs": "nworld", "n_envs": "nworld", "max_episode_steps": "horizon", "xml_file": "model", "record": "graphs",
+    "observation_space": "obs_space", "single_observation_space": "obs_space", "single_action_space": "action_space",
+    "rewards": "reward", "dones": "done", "obs_buf": "obs",
     # learning
     "lr": "learning_rate", "gae_lambda": "lam", "clip_range": "clip", "clip_param": "clip", "ent_coef": "entropy_coef",
     "vf_coef": "value_coef", "value_loss_coef": "value_coef", "n_steps": "num_steps", "num_steps_per_env": "num_steps",
@@ -51,3 +54,15 @@ def suggest_arguments(cls: Class) -> Class:
 
     cls.__init__ = checked  # type: ignore[misc]
     return cls
+
+
+class Named(dict[str, Value]):
+    """A dict whose KeyError suggests a known name. ``kind`` is the noun for a name, such as "metric"."""
+
+    def __init__(self, kind: str, values: Any = ()) -> None:
+        super().__init__(values)
+        self._kind = kind
+
+    def __missing__(self, name: str) -> Value:
+        hint = did_you_mean(name, self, f"there are {', '.join(self) or 'none'}")
+        raise KeyError(f"there is no {self._kind} {name!r}: {hint}")
