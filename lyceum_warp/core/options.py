@@ -32,6 +32,7 @@ INTEGRATORS = {
     "rk4": mujoco.mjtIntegrator.mjINT_RK4,
     "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
 JACOBIANS = {
     "dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
@@ -85,7 +86,8 @@ class PhysicsOptions:
     cone: str | None = None
     """Friction cone: pyramidal or elliptic."""
     integrator: str | None = None
-    """Integrator: euler, rk4, implicit or implicitfast."""
+    """Integrator: euler, rk4, implicit, implicitfast or discrete. With discrete, servos, springs and contacts stay stable in
+    long substeps, and ``qacc`` and accelerometers hold the mean over the substep."""
     jacobian: str | None = None
     """Constraint Jacobian: dense, sparse or auto. The choice affects speed and memory. Results differ only by
     rounding."""

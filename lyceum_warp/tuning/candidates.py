@@ -9,6 +9,8 @@ from lyceum_warp.env import Env
 
 _ITERATIONS = (4, 2, 1)
 _LS_ITERATIONS = (10, 5)
+_COARSE = ("implicitfast", "discrete")
+"""Integrators that stay stable in long substeps."""
 
 _AUTO_SPARSE = {"mujoco": 60, "warp": 33}
 """Smallest number of degrees of freedom for which each engine uses a sparse Jacobian."""
@@ -41,15 +43,16 @@ def candidates(env: Env) -> list[Setting]:
     if option.noslip_iterations:
         settings.append(Setting("noslip_iterations=0", "noslip", {"solver": {**limits, "noslip_iterations": 0}}))
     settings += [Setting(f"cone {name}", "cone", {"cone": name}) for name in CONES if name != cone]
-    integrators = [name for name in ("euler", "implicitfast") if name != integrator]
+    integrators = [name for name in ("euler", *_COARSE) if name != integrator]
     settings += [Setting(name, "integrator", {"integrator": name}) for name in integrators]
     for substeps in _fewer(env.task.frame_skip):
         timestep = float(f"{env.timestep / substeps:.10g}")
         physics = {"frame_skip": substeps, "timestep": timestep}
         name = f"{substeps} x {1e3 * timestep:.4g} ms"
         settings.append(Setting(name, "substeps", physics))
-        if integrator != "implicitfast":  # implicitfast stays stable with long time steps
-            settings.append(Setting(f"{name}, implicitfast", "substeps", {**physics, "integrator": "implicitfast"}))
+        for coarse in _COARSE:
+            if integrator != coarse:
+                settings.append(Setting(f"{name}, {coarse}", "substeps", {**physics, "integrator": coarse}))
     settings += [Setting(f"jacobian {name}", "jacobian", {"jacobian": name}) for name in _other_jacobian(env)]
     if cone == "elliptic" and option.impratio != 1.0:
         settings.append(Setting("impratio=1", "impratio", {"impratio": 1.0}))

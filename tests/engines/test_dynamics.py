@@ -130,8 +130,11 @@ def test_restored_nominal_values_give_the_steps_of_the_shared_model(engine: type
     "MujocoEngine-RK4-current1",
     "ToyEngine-implicitfast-current0",
     "WarpEngine-implicitfast-current0",
+    "MujocoEngine-discrete-current2",
 )
-@pytest.mark.parametrize(("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",))])
+@pytest.mark.parametrize(
+    ("integrator", "current"), [("implicitfast", ()), ("RK4", ("xpos",)), ("discrete", ("xpos", "actuator_force"))]
+)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_rollout_uses_the_model_fields_of_each_state(
     engine: type[Engine], integrator: str, current: tuple[str]

@@ -13,9 +13,10 @@ def test_settings_for_hopper_lower_the_solver_limits_and_keep_the_time_step(shar
     settings = candidates(env)
     names = [setting.name for setting in settings]
     assert [name for name in names if name.startswith("iterations")] == ["iterations=2", "iterations=1"]
-    assert {"cone elliptic", "euler", "implicitfast", "jacobian sparse"} <= set(names)
+    assert {"cone elliptic", "euler", "implicitfast", "discrete", "jacobian sparse"} <= set(names)
     assert [name for name in names if " x " in name] == [
-        "2 x 4 ms", "2 x 4 ms, implicitfast", "1 x 8 ms", "1 x 8 ms, implicitfast",
+        "2 x 4 ms", "2 x 4 ms, implicitfast", "2 x 4 ms, discrete", "1 x 8 ms", "1 x 8 ms, implicitfast",
+        "1 x 8 ms, discrete",
     ]  # fmt: skip
     assert all(
         setting.physics["frame_skip"] * setting.physics["timestep"] == pytest.approx(env.timestep, rel=1e-9)
