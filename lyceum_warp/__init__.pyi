@@ -1,6 +1,7 @@
 """Public names of the package; type checkers read this file, and __init__.py loads a name at its first use."""
 
 from lyceum_warp.algos.common.evaluation import Episodes as Episodes, evaluate as evaluate
+from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import Iteration as Iteration, Learner as Learner
 from lyceum_warp.algos.common.policy import GaussianPolicy as GaussianPolicy
 from lyceum_warp.algos.common.policy_export import export_policy as export_policy
@@ -30,6 +31,7 @@ from lyceum_warp.controllers.report import ControlReport as ControlReport, contr
 from lyceum_warp.controllers.trajectory import Trajectory as Trajectory
 from lyceum_warp.core.done import Done as Done
 from lyceum_warp.core.fields import quat as quat, vec10 as vec10
+from lyceum_warp.core.gate import Gate as Gate, Limit as Limit, Verdict as Verdict
 from lyceum_warp.core.mirror import Mirror as Mirror
 from lyceum_warp.core.model_files import (
     ModelFile as ModelFile,

@@ -9,6 +9,7 @@ from lyceum_warp.algos.common.evaluation import (
     evaluation_seed as evaluation_seed,
     evaluation_worlds as evaluation_worlds,
 )
+from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (
     METRIC_COLUMN as METRIC_COLUMN,
     Iteration as Iteration,

@@ -23,7 +23,7 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
-from lyceum_warp.core import EnvOptions, Training
+from lyceum_warp.core import EnvOptions, PhysicsOptions, Training
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import (
@@ -298,7 +298,7 @@ class Train:
         nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
         return Configuration(
             task=self.task,
-            options=EnvOptions(nworld=nworld, device="cpu"),
+            options=EnvOptions(nworld=nworld, device="cpu", physics=PhysicsOptions(base=training.physics)),
             algorithm=training.algorithm,
             hyperparameters=hyperparameters,
             iterations=training.iterations,

@@ -7,6 +7,11 @@ from lyceum_warp.core.fields import (
     quat as quat,
     vec10 as vec10,
 )
+from lyceum_warp.core.gate import (
+    Gate as Gate,
+    Limit as Limit,
+    Verdict as Verdict,
+)
 from lyceum_warp.core.mirror import Mirror as Mirror
 from lyceum_warp.core.model_files import (
     ModelFile as ModelFile,

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.core.gate import Gate
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.upstream import extend_structs
@@ -348,6 +349,8 @@ class Training:
     are ignored if a flag chooses another algorithm."""
     iterations: int = 100
     """Number of iterations."""
+    physics: str | None = None
+    """Name of a set of options in the task's ``physics``, for learning. Policies are judged in "exact" physics."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings, Mapping):
@@ -519,6 +522,8 @@ class Task:
     ``lw.make(task, physics="fast")``. The default, "exact", means the options of the model and ``frame_skip``."""
     planning: ClassVar[Planning] = Planning()
     """The task's settings for MPPI, such as ``lw.Planning(settings={"horizon": 16}, options={...}, params={...})``."""
+    gate: ClassVar[Gate | None] = None
+    """A test that a policy of the task must pass, for ``lw.gate`` and ``lyceum-warp gate``."""
     training: ClassVar[Training] = Training()
     """The task's settings for ``lyceum-warp train``, such as ``lw.Training(algorithm="ppo", settings={...})``."""
 

@@ -9,7 +9,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import walkers
-from lyceum_warp.tasks.velocity import gait, walking
+from lyceum_warp.tasks.velocity import gait, gates, walking
 
 SIDES, FEET = ("left", "right"), ("left_foot", "right_foot")
 LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
@@ -48,6 +48,8 @@ class G1(walking.Biped):
     """The model of all G1 tasks."""
 
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
+    gate = gates.NanoG1(legs=len(LEGS))
+    physics = {"coarse": lw.PhysicsOptions(integrator="discrete", frame_skip=2, timestep=0.01)}
 
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:

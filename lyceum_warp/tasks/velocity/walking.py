@@ -18,6 +18,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row, terms, walkers
+from lyceum_warp.tasks.velocity import gates
 
 # terms and arguments
 from lyceum_warp.terms import (  # noqa: F401
@@ -396,7 +397,9 @@ class Velocity(lw.Task):
     """A legged robot that follows velocity commands."""
 
     frame_skip, horizon = 4, 1000
-    training = lw.Training(algorithm="ppo", iterations=400)
+    gate = gates.Walks()
+    physics = {"coarse": lw.PhysicsOptions(integrator="discrete", frame_skip=1, timestep=0.02)}
+    training = lw.Training(algorithm="ppo", iterations=400, physics="coarse")
     actions = {"joint_position": "joints"}
     rewards = {
         "track_linear_velocity": 2.0,
@@ -431,5 +434,5 @@ class Biped(Velocity):
     """
 
     frame_skip, keyframe = 5, "home"
-    training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800)
+    training = lw.Training(algorithm="ppo", settings={"log_std": -0.7}, iterations=800, physics="coarse")
     rewards = Velocity.rewards | {"action_rate_l2": -0.05, "single_stance": 2.0, "roll_pitch_rate_l2": -0.05}

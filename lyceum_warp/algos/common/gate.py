@@ -1,0 +1,60 @@
+"""Test whether a policy passes its task's gate, on the C engine under exact physics."""
+
+from typing import Any
+
+import torch
+
+from lyceum_warp.algos.common.evaluation import acting
+from lyceum_warp.algos.common.networks import moved
+from lyceum_warp.algos.common.policy import Policy
+from lyceum_warp.core.gate import Verdict
+from lyceum_warp.engines.placement import options_on_cores
+from lyceum_warp.env.curriculum import Curriculum, start_episodes
+from lyceum_warp.env.env import Env
+from lyceum_warp.support.validate import check_kind, whole_number
+
+
+@torch.no_grad()
+def gate(
+    env: Env,
+    policy: Policy,
+    *,
+    seed: int = 0,
+    curriculum: Curriculum | None = None,
+    nthread: int | None = None,
+    quick: bool = False,
+) -> Verdict:
+    """Test whether a policy passes the gate of its task, such as whether a robot walks.
+
+    The worlds have the environment's parameters, but run on the C engine under the task's exact physics.
+
+    Args:
+        env: An environment of the task; its worlds do not change.
+        policy: A function that maps observations to actions without noise, or a module whose method ``act`` does this.
+        seed: Seed of the worlds.
+        curriculum: How far curricula have come, such as ``lw.load_curriculum(run)``; by default as far as in ``env``.
+        nthread: Threads of the C engine; by default all cores.
+        quick: Whether to leave out all parts of the gate after one that fails.
+
+    Raises:
+        ValueError: The task has no gate, or the policy does not fit the task.
+    """
+    check_kind("env of gate", env, Env, "as lw.make(...) makes it")
+    seed, test = whole_number("seed", seed, low=0), env.task.definition.gate
+    if test is None:
+        raise ValueError(f"the task {env.task.name!r} has no gate: set its attribute gate to a lw.Gate")
+    curriculum = curriculum or Curriculum.of(env)
+    options = {**options_on_cores(), "physics": "exact", "horizon": 0, "seed": seed, "nthread": nthread}
+
+    def worlds(nworld: int, **params: Any) -> Env:
+        replica = env.replicate(nworld=nworld, **options, **params)
+        start_episodes(replica, None, curriculum)
+        return replica
+
+    local = moved(policy, worlds(1)) if isinstance(policy, torch.nn.Module) else policy
+    numbers: dict[str, float] = {}
+    for part in test.measure(worlds, acting(local)):
+        numbers |= part
+        if quick and any(name in test.limits and not test.limits[name].allows(x) for name, x in part.items()):
+            break
+    return Verdict(task=env.task.name, seed=seed, memory=curriculum.text, numbers=numbers, limits=test.limits)
