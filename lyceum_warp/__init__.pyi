@@ -124,6 +124,7 @@ from lyceum_warp.training.callbacks import (
     TransferTest as TransferTest,
     Videos as Videos,
 )
+from lyceum_warp.training.gating import PassGate as PassGate
 from lyceum_warp.training.loop import train as train
 from lyceum_warp.training.runs.folder import (
     Run as Run,

@@ -32,6 +32,7 @@ from lyceum_warp.training import (
     Callback,
     Configuration,
     Minutes,
+    PassGate,
     Run,
     TargetReturn,
     TensorBoard,
@@ -47,7 +48,8 @@ from lyceum_warp.training import (
 )
 from lyceum_warp.viz import find_camera, parsed_camera, policy_video
 
-_SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0}
+_SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
+             "gate_every": 0}  # fmt: skip
 """Settings that --resume may change, with their default values."""
 
 _RUN_FLAGS = {
@@ -145,6 +147,9 @@ class Train:
     minutes: float | None = None
     """Time limit in minutes. Training ends before an iteration that would probably exceed the limit, judged by the
     longest iteration so far. The first iteration always runs. --resume continues the run."""
+    gate_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
+    """Test the policy about every INT iterations, and end the run once it passes the gate of the task (lyceum-warp gate)
+    with two seeds. The tests run beside training on CPU cores, under exact physics. 0 makes no tests."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -234,7 +239,10 @@ class Train:
                 return 128 + signalled.number
             if not leads:
                 return 0
-            reached = run.config.get("reached", {})
+            reached, passed = run.config.get("reached", {}), run.config.get("passed")
+            if passed is not None:
+                say(f"the policy of iteration {passed['iteration']} passes the gate (tries: {passed['tries']}): "
+                    f"lyceum-warp gate {folder} --which {passed['iteration']}")  # fmt: skip
             if reached.get("iteration") == learner.iteration < total:
                 say(f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}")
             elif learner.iteration < total and self.minutes is not None:
@@ -251,6 +259,8 @@ class Train:
             callbacks.append(TensorBoard())
         if every := settings["video_every"]:
             callbacks.append(Videos(every, camera=parsed_camera(self.camera), progress=display.work))
+        if every := settings["gate_every"]:
+            callbacks.append(PassGate(every))
         if self.transfer is not False:
             callbacks.append(TransferTest(slow=self.transfer is True, progress=display.work))
         if self.minutes is not None:

@@ -28,7 +28,9 @@ class Limit:
     @property
     def range(self) -> str:
         """Format the range, for example "at most 0.2"; empty if every number passes."""
-        parts = [f"at least {self.low:g}"] * (self.low > -math.inf) + [f"at most {self.high:g}"] * (self.high < math.inf)
+        parts = [f"at least {self.low:g}"] * (self.low > -math.inf) + [f"at most {self.high:g}"] * (
+            self.high < math.inf
+        )
         return " and ".join(parts)
 
 

@@ -6,6 +6,7 @@ from lyceum_warp.training.callbacks import (
     Videos as Videos,
 )
 from lyceum_warp.training.curve import learning_curve as learning_curve
+from lyceum_warp.training.gating import PassGate as PassGate
 from lyceum_warp.training.loop import train as train
 from lyceum_warp.training.runs.checkpoints import (
     network_of as network_of,
