@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
+from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
@@ -248,12 +249,10 @@ class PPO(OnPolicyLearner):
         self._parameters = [p for group in self._learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
-        self.optimizer = torch.optim.Adam(self._parameters, lr=self.rate, fused=True, capturable=self._cuda)
-        # with one tensor, one all-reduce suffices
-        sizes = [p.numel() for p in self._parameters]
-        self._sums = self._parameters[0].new_zeros(sum(sizes) + 4)
-        for parameter, part in zip(self._parameters, self._sums[:-4].split(sizes), strict=True):
-            parameter.grad = part.view_as(parameter)
+        self.optimizer = Adam(self._parameters, self.rate, numbers=4)
+        self._sums = self.optimizer.sums
+        for parameter, part in zip(self._parameters, self.optimizer.shaped(self.optimizer.gradient), strict=True):
+            parameter.grad = part  # for clip_grad_norm_
         self._losses = torch.zeros(3, device=device)
         self._entropy_coef = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
@@ -462,11 +461,7 @@ class PPO(OnPolicyLearner):
         """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
-        for group in self.optimizer.param_groups:
-            self.rate.copy_(group["lr"])
-            group["lr"], group["capturable"] = self.rate, self._cuda
         with torch.no_grad():
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
-        self.minibatches.epoch.forget()  # the graph contains the addresses of Adam's old moments

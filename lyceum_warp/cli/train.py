@@ -148,8 +148,8 @@ class Train:
     """Time limit in minutes. Training ends before an iteration that would probably exceed the limit, judged by the
     longest iteration so far. The first iteration always runs. --resume continues the run."""
     gate_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Test the policy about every INT iterations, and end the run once it passes the gate of the task (lyceum-warp gate)
-    with two seeds. The tests run beside training on CPU cores, under exact physics. 0 makes no tests."""
+    """Test the policy about every INT iterations, and end the run once it passes the gate of the task with two seeds
+    (lyceum-warp gate). The tests run beside training on CPU cores, under exact physics. 0 makes no tests."""
     keep_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Save the policy in a numbered file every INT iterations. 0 saves only the last and the best policy."""
     save_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None

@@ -28,10 +28,8 @@ class Limit:
     @property
     def range(self) -> str:
         """Format the range, for example "at most 0.2"; empty if every number passes."""
-        parts = [f"at least {self.low:g}"] * (self.low > -math.inf) + [f"at most {self.high:g}"] * (
-            self.high < math.inf
-        )
-        return " and ".join(parts)
+        ends = {f"at least {self.low:g}": self.low, f"at most {self.high:g}": self.high}
+        return " and ".join(text for text, end in ends.items() if math.isfinite(end))
 
 
 class Gate(abc.ABC):

@@ -86,8 +86,8 @@ class PhysicsOptions:
     cone: str | None = None
     """Friction cone: pyramidal or elliptic."""
     integrator: str | None = None
-    """Integrator: euler, rk4, implicit, implicitfast or discrete. With discrete, servos, springs and contacts stay stable in
-    long substeps, and ``qacc`` and accelerometers hold the mean over the substep."""
+    """Integrator: euler, rk4, implicit, implicitfast or discrete. With discrete, servos, springs and contacts stay
+    stable in long substeps, and ``qacc`` and accelerometers hold the mean over the substep."""
     jacobian: str | None = None
     """Constraint Jacobian: dense, sparse or auto. The choice affects speed and memory. Results differ only by
     rounding."""

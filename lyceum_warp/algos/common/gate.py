@@ -4,9 +4,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.evaluation import acting
 from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy
+from lyceum_warp.algos.common.policy import Policy, acting
 from lyceum_warp.core.gate import Verdict
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env.curriculum import Curriculum, start_episodes
