@@ -12,7 +12,7 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check -c constrain
 .PHONY: demo docs test test-all test-room lint clean
 
 demo: $(VENV)/installed-viz
-	$(BIN)/lyceum-warp train hopper --iterations 80 --target-return 3000 \
+	$(BIN)/lyceum-warp train hopper --iterations 80 --target-return 3000 --video \
 		--out runs/demo-$$(date +%Y%m%d-%H%M%S) --require-return 1000
 
 # Several processes, each with whole files, whose tests share environments. The folders with the longest files begin.

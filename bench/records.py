@@ -99,7 +99,7 @@ RECORDS: dict[str, dict[str, tuple[float, tuple[str, ...]]]] = {
 }
 """Maps each task and device to its threshold, and to the flags for `lyceum-warp train`."""
 
-COMMON = ("--iterations", "1000000", "--no-video", "--no-plot", "--no-transfer")
+COMMON = ("--iterations", "1000000", "--no-video", "--no-plot")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from lyceum_warp.algos import Iteration, Learner
+from lyceum_warp.algos import Iteration, Learner, simulation
 from lyceum_warp.controllers import ControlProgress, Trajectory
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Callback, Run
@@ -54,10 +54,10 @@ class Display(Callback):
         processes = f" each in {size} processes" if size > 1 else ""
         self.console.print(
             f"[bold]{env.task.name}[/]: {env.obs_space.size} observations, {env.action_space.size} actions; "
-            f"{env.nworld} worlds{processes}, {env.engine.name} engine on {env.options.device or 'cpu'}, "
-            f"{learner.title}; run in {escape(str(run.folder))}", soft_wrap=True,
+            f"{env.nworld} worlds{processes}, {simulation(env)}, {learner.title}; run in {escape(str(run.folder))}",
+            soft_wrap=True,
         )  # fmt: skip
-        self.total = iterations
+        self.total, self.learner, self.simulation = iterations, learner, simulation(env)
         self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
         self.progress.start()
 
@@ -73,6 +73,9 @@ class Display(Callback):
 
     def __call__(self, it: Iteration) -> None:
         """Show an iteration."""
+        if (text := simulation(self.learner.env)) != self.simulation:
+            self.console.print(f"from iteration {it.iteration} on: {text}", soft_wrap=True)
+            self.simulation = text
         if it.mean_return is not None:
             self.mean = it.mean_return
         mean_return = self.mean if self.console.is_terminal or it.mean_return is not None else math.nan

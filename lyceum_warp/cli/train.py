@@ -2,6 +2,7 @@
 
 import dataclasses
 import datetime
+import functools
 import json
 import logging
 import signal
@@ -11,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.algos import Learner, SquashedPolicy, Team, evaluation_seed, evaluation_worlds, join
+from lyceum_warp.algos import EXACT, Learner, SquashedPolicy, Team, evaluation_seed, evaluation_worlds, join
 from lyceum_warp.binding import file_name, find_task, task_name, task_names
 from lyceum_warp.cli.arguments import (
     CameraWords,
@@ -24,6 +25,7 @@ from lyceum_warp.cli.arguments import (
 )
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
 from lyceum_warp.core import EnvOptions, PhysicsOptions, Training
+from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import (
@@ -49,7 +51,7 @@ from lyceum_warp.training import (
 from lyceum_warp.viz import find_camera, parsed_camera, policy_video
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
-             "gate_every": 0}  # fmt: skip
+             "gate_every": 0, "exact_from": None}  # fmt: skip
 """Settings that --resume may change, with their default values."""
 
 _RUN_FLAGS = {
@@ -93,8 +95,8 @@ class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.v
 class Train:
     """Train a policy on a task, with the natural policy gradient, PPO or SAC.
 
-    The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt, checkpoint.pt, curve.png
-    and video.mp4 into the run's folder. Ctrl-C saves and ends the run after the current iteration. A second Ctrl-C ends
+    The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt, checkpoint.pt and curve.png
+    into the run's folder. Ctrl-C saves and ends the run after the current iteration. A second Ctrl-C ends
     it immediately.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
@@ -147,6 +149,9 @@ class Train:
     minutes: float | None = None
     """Time limit in minutes. Training ends before an iteration that would probably exceed the limit, judged by the
     longest iteration so far. The first iteration always runs. --resume continues the run."""
+    exact_from: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="")] = None
+    """Number of iterations after which learning goes on in the task's exact physics. The default is the number that the
+    task suggests."""
     gate_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Test the policy about every INT iterations, and end the run once it passes the gate of the task with two seeds
     (lyceum-warp gate). The tests run beside training on CPU cores, under exact physics. 0 makes no tests."""
@@ -168,18 +173,15 @@ class Train:
     engine.
     """
     param: ParamWords = ()
-    video: bool = True
+    video: bool = False
     """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Number of iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0
     writes no videos."""
     camera: CameraWords = ()
-    transfer: Annotated[bool | None, tyro.conf.arg(help_behavior_hint="")] = None
-    """Whether to compare the policy's returns between engines at the end, and write transfer.json. By default, only
-    cheap comparisons are made. A policy that was trained on a GPU is tested on the C engine. A policy that was trained
-    under other physics is tested under the task's default physics. --transfer adds a test under each set of physics
-    options that the task defines. After training on CPU cores, --transfer also adds a test on the Warp engine.
-    Compiling the kernels of this engine may take minutes.
+    transfer: bool = False
+    """Whether to compare the policy's returns between the engines, and between the task's sets of physics options, at
+    the end, and write transfer.json. Compiling the kernels of the Warp engine for a CPU may take minutes.
     """
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
@@ -206,11 +208,13 @@ class Train:
         settings: dict[str, Any] = {}
         for name, default in _SETTINGS.items():
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
+        if source is None and self.exact_from is None:
+            settings["exact_from"] = self._training().exact_from
         if self.resume is None:
             settings["target_return"] = self.target_return
         camera = parsed_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
-            raise ValueError("--camera has no effect with --no-video: omit one of them")
+            raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         with join(self.env.device or saved.get("device", "cpu")) as team:
             if not team.leads:  # only one process prints messages
                 logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
@@ -224,7 +228,8 @@ class Train:
             try:
                 run = train(
                     learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
-                    keep_every=settings["keep_every"], save_every=settings["save_every"], take_over=self.take_over,
+                    keep_every=settings["keep_every"], save_every=settings["save_every"],
+                    exact_from=settings["exact_from"], take_over=self.take_over,
                     entries=settings | entries,
                 )  # fmt: skip
             except Interrupted as signalled:
@@ -261,8 +266,8 @@ class Train:
             callbacks.append(Videos(every, camera=parsed_camera(self.camera), progress=display.work))
         if every := settings["gate_every"]:
             callbacks.append(PassGate(every))
-        if self.transfer is not False:
-            callbacks.append(TransferTest(slow=self.transfer is True, progress=display.work))
+        if self.transfer:
+            callbacks.append(TransferTest(progress=display.work))
         if self.minutes is not None:
             callbacks.append(Minutes(self.minutes))
         return callbacks
@@ -296,10 +301,7 @@ class Train:
 
     def _suggestion(self, team: Team) -> Configuration:
         """Return the configuration that the task suggests."""
-        assert self.task is not None
-        training = find_task(self.task).training
-        if self.algorithm not in (None, training.algorithm):
-            training = Training(algorithm=self.algorithm)
+        training = self._training()
         try:
             hyperparameters = ALGORITHMS[training.algorithm][1](**training.settings) if training.settings else None
         except (KeyError, TypeError, ValueError) as error:
@@ -313,6 +315,12 @@ class Train:
             hyperparameters=hyperparameters,
             iterations=training.iterations,
         )
+
+    def _training(self) -> Training:
+        """Return the task's suggestions, or the defaults if a flag chooses another algorithm."""
+        assert self.task is not None
+        training = find_task(self.task).training
+        return training if self.algorithm in (None, training.algorithm) else Training(algorithm=self.algorithm)
 
     def _given(self, *names: str) -> dict[str, Any]:
         return {name: value for name in names if (value := getattr(self, name)) is not None}
@@ -352,11 +360,12 @@ class Train:
     def _report(self, run: Run, learner: Learner) -> int:
         env = learner.env
         console.print(curve_table(run.rows()))
+        judge = functools.partial(evaluation_worlds, env, EPISODES, **options_on_cores(), physics=EXACT)
         with LongWork("evaluating the mean policy", "steps", console) as work:
-            choice = choose_policy(run, lambda: evaluation_worlds(env, EPISODES), progress=work)
+            choice = choose_policy(run, judge, progress=work)
         score = choice.score
-        say(f"mean policy, {EPISODES} new episodes: return {score.mean:.1f} ± {score.std:.1f} "
-            f"({score.low:.1f} to {score.high:.1f})")  # fmt: skip
+        say(f"mean policy, {EPISODES} new episodes on the C engine, exact physics: "
+            f"return {score.mean:.1f} ± {score.std:.1f} ({score.low:.1f} to {score.high:.1f})")  # fmt: skip
         if len(choice.scores) > 1:
             say(choice.text)
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}

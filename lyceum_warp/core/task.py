@@ -351,6 +351,8 @@ class Training:
     """Number of iterations."""
     physics: str | None = None
     """Name of a set of options in the task's ``physics``, for learning. Policies are judged in "exact" physics."""
+    exact_from: int | None = None
+    """Number of iterations after which learning goes on in "exact" physics."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.settings, Mapping):

@@ -8,10 +8,10 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from lyceum_warp.algos import EXACT, Iteration, Learner, evaluation_seed, task_physics, transfer
+from lyceum_warp.algos import Iteration, Learner, evaluation_seed, transfer
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import check_flag, positive_number, whole_number
+from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz import CameraChoice, NamedProgress, check_video, find_camera, one_line, policy_video
 
@@ -162,31 +162,22 @@ class Videos(Callback):
 class TransferTest(Callback):
     """Runs ``lw.transfer`` on 64 pairs of episodes at the end of training, and writes the run's ``transfer.json``.
 
-    By default, only quick comparisons are made. After training on a GPU, the policy's results on the Warp engine are
-    compared with those on the C engine. After training with physics other than "exact", they are compared with those
-    in "exact" physics. If the test fails, a warning is logged.
+    If the test fails, a warning is logged.
 
     Args:
-        slow: Whether to compare the two engines and all physics options of the task in any case.
+        warp: As in ``lw.transfer``.
         progress: As in ``Videos``.
     """
 
-    def __init__(self, *, slow: bool = False, progress: NamedProgress | None = None) -> None:
-        check_flag("slow", slow)
-        self.slow, self.progress = slow, progress
+    def __init__(self, *, warp: bool = True, progress: NamedProgress | None = None) -> None:
+        self.warp, self.progress = warp, progress
 
     def end(self, run: Run, learner: Learner) -> None:
-        """Run the test, unless there is nothing to compare."""
+        """Run the test."""
         env = learner.env
-        on_gpu = env.device.is_cuda and env.engine.name == "warp"
-        if not (self.slow or on_gpu or task_physics(env)[1] != EXACT):
-            return
         progress = self.progress and functools.partial(self.progress, "judging the policy's transfer", "steps")
         try:
-            verdict = transfer(
-                env, learner.policy, 64, seed=env.options.seed + 1, warp=on_gpu or self.slow, physics=self.slow,
-                progress=progress,
-            )  # fmt: skip
+            verdict = transfer(env, learner.policy, 64, seed=env.options.seed + 1, warp=self.warp, progress=progress)
         except Exception as error:  # an error must not discard the training
             log.warning("no verdict on transfer (%s)", one_line(error))
             return

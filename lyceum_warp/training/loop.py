@@ -3,12 +3,13 @@
 import contextlib
 import json
 import logging
+import math
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos import Learner
+from lyceum_warp.algos import EXACT, Learner, task_physics
 from lyceum_warp.engines import engine_name
 from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
@@ -32,6 +33,7 @@ def train(
     callbacks: Sequence[Callable[[Any], object]] = (),
     keep_every: int = 0,
     save_every: int = 0,
+    exact_from: int | None = None,
     take_over: bool = False,
     entries: Mapping[str, Any] | None = None,
 ) -> Run:
@@ -60,6 +62,8 @@ def train(
             the error is raised again.
         keep_every: Iterations between policies that are saved in numbered files, or 0 for none.
         save_every: Iterations between saves, or 0 to save by time.
+        exact_from: Number of iterations after which learning goes on in the task's "exact" physics, with the worlds,
+            networks, optimisers and random streams as they are. By default, a run that is continued keeps its number.
         take_over: Whether to continue a run that another process has locked, on this or another host. That process then
             ends at its next write.
         entries: More JSON entries for config.json.
@@ -81,10 +85,13 @@ def train(
         check_kind("each of callbacks", callback, Callable, "a function or a lw.Callback")
     check_kind("entries", entries, Mapping | None, "as {'note': 'first try'}")
     check_flag("take_over", take_over)
+    if exact_from is None and isinstance(run, Run):
+        exact_from = run.config.get("exact_from")
     settings: dict[str, Any] = {
         "iterations": whole_number("iterations", iterations, low=1),
         "keep_every": whole_number("keep_every", keep_every, low=0),
         "save_every": whole_number("save_every", save_every, low=0),
+        "exact_from": None if exact_from is None else whole_number("exact_from", exact_from, low=1),
         **(entries or {}),
     }
     team, leads = learner.team, learner.team.leads
@@ -120,7 +127,7 @@ def train(
             undo.pop_all()
         saver = Saver(run if leads else None, learner, keep_every=keep_every, save_every=save_every, saved=saved)
         try:
-            _learn(learner, saver, iterations, callbacks)
+            _learn(learner, saver, iterations, math.inf if exact_from is None else exact_from, callbacks)
             for observer in observers:
                 observer.end(run, learner)
         except Exception as error:
@@ -130,7 +137,9 @@ def train(
     return run
 
 
-def _learn(learner: Learner, saver: Saver, iterations: int, callbacks: Sequence[Callable[[Any], object]]) -> None:
+def _learn(
+    learner: Learner, saver: Saver, iterations: int, exact_from: float, callbacks: Sequence[Callable[[Any], object]]
+) -> None:
     """Iterate until the last iteration, or until a callback ends the training. All ranks stop together."""
     team = learner.team
     ended = False
@@ -138,6 +147,10 @@ def _learn(learner: Learner, saver: Saver, iterations: int, callbacks: Sequence[
         if saver.saved != learner.iteration:
             saver.save()
         while learner.iteration < iterations and not ended:
+            env = learner.env
+            if learner.iteration >= exact_from and task_physics(env)[1] != EXACT:
+                place = {"seed": env.options.seed, "first_world": env.first_world}
+                learner.enter(env.replicate(physics=EXACT, **place))
             iteration, error = next(learner), None
             with team.together():
                 saver.write(iteration)

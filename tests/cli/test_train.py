@@ -114,8 +114,8 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     out = tmp_path / "run"
     options = ["--integrator", "euler", "--solver", "iterations=7", "--solver", "ls_iterations=9", "--deterministic"]
     options += ["--horizon", "32", "--nthread", "2"]
-    assert train(out, "--iterations", "1", "--no-transfer", *options, task="hopper") == 0
-    resume = ["train", "--resume", str(out), *QUIET, "--no-transfer", "--iterations"]
+    assert train(out, "--iterations", "1", *options, task="hopper") == 0
+    resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
     assert cli.main([*resume, "2", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
     assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
@@ -138,7 +138,7 @@ def test_named_physics_are_saved_as_options_and_eval_can_replace_them(
 ) -> None:
     line = "    physics = {'fast': lw.PhysicsOptions(integrator='euler', timestep=0.004, frame_skip=2)}\n"
     task = task_file("fast.py", tiny_task.changed(("    model", f"{line}    model")))
-    out, short = tmp_path / "run", ("--horizon", "40", "--no-transfer")
+    out, short = tmp_path / "run", ("--horizon", "40")
     assert train(out, "--iterations", "1", "--physics", "fast", "--cone", "elliptic", *short, task=str(task)) == 0
     given = {"integrator": "euler", "timestep": 0.004, "frame_skip": 2, "cone": "elliptic"}
     assert Run.open(out).config["physics"] == given
@@ -203,7 +203,7 @@ def test_damaged_best_policy_is_replaced_with_a_message(
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
         ("point_mass", ["--learning-rate", "3"], ["--learning-rate", "ppo or sac", "npg"]),
         ("point_mass", ["--video-every", "1", "--camera", "side"], ["'side'"]),
-        ("point_mass", ["--camera", "0"], ["--camera", "--no-video"]),
+        ("point_mass", ["--camera", "0"], ["--camera", "--video"]),
         ("point_mass", ["--video-every", "-1"], ["every", "-1"]),
         ("point_mass", ["--take-over"], ["--take-over has no effect without --resume"]),
     ],

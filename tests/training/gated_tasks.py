@@ -1,4 +1,4 @@
-"""Two point masses with gates: the mean distance to the target after 50 steps must keep a limit."""
+"""Point masses with gates, which limit the mean distance to the target after 50 steps, and one with coarse physics."""
 
 from collections.abc import Callable, Iterator
 
@@ -32,3 +32,10 @@ class Easy(PointMass):
 
 class Impossible(PointMass):
     gate = Near(0.0)
+
+
+class Coarse(PointMass):
+    physics = {"coarse": lw.PhysicsOptions(integrator="discrete", cone="elliptic")}
+    training = lw.Training(
+        algorithm="ppo", settings={"num_steps": 8, "hidden": (4,), "value_hidden": (4,)}, physics="coarse", exact_from=2
+    )

@@ -149,9 +149,8 @@ def test_training_in_python_continues_if_no_video_can_be_drawn(
     assert message.startswith("no further videos (") and "nonsense" in message
 
 
-def test_run_folder_contains_the_result_of_the_transfer_test(npg: lw.NPG, tmp_path: Path) -> None:
-    test = lw.TransferTest()
-    assert not lw.train(npg, tmp_path / "exact", 1, callbacks=[test]).transfer.exists()
+def test_run_folder_contains_the_result_of_the_transfer_test(tmp_path: Path) -> None:
+    test = lw.TransferTest(warp=False)
     coarse = lw.NPG(lw.make("point_mass", nworld=2, frame_skip=2, horizon=20), config=SMALL)
     run = lw.train(coarse, tmp_path / "coarse", 1, callbacks=[test])
     verdict = json.loads(run.transfer.read_text())

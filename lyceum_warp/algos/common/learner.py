@@ -192,6 +192,19 @@ class Learner(abc.ABC):
             state["stored"] = self.replay.stored
         return copy.deepcopy(state)  # state_dict() shares memory with the parameters
 
+    def enter(self, env: Env) -> None:
+        """Go on in another environment of the same task, such as one with finer physics, with the same state.
+
+        This calls the constructor again, with ``env`` and the networks. A subclass with other arguments overrides this
+        method.
+        """
+        state, replay = self.state_dict(), self.replay
+        make: Any = self.__init__  # type: ignore[misc]
+        make(env, self.policy, self.value, self.config, seed=self.seed, team=self.team)
+        if replay is not None:
+            self.replay, replay.env = replay, env
+        self.load_state_dict(state)
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.
 

@@ -130,7 +130,7 @@ class Gait(walking.Biped):
     """A robot with two legs that steps in time with a clock."""
 
     training = lw.Training(
-        algorithm="ppo", iterations=410, physics="coarse",
+        algorithm="ppo", iterations=430, physics="coarse", exact_from=350,
         settings={"log_std": -0.7, "entropy_coef": 0.002, "symmetry": "exact", "mean_every": 0},
     )  # fmt: skip
     rewards = {
