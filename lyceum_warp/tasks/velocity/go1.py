@@ -27,3 +27,4 @@ class Params(walking.Params):
 @lw.register
 class Go1Velocity(walking.Velocity):
     model = "go1.xml"
+    training = lw.Training(algorithm="ppo", settings={"symmetry": "exact"}, iterations=300, physics="coarse")
