@@ -6,8 +6,8 @@
 The clock starts before the command, so the seconds include imports, compilation and graph captures. The clock stops
 when the run's config.json says that the target is reached, or that a policy passes the gate of the task. The seconds
 thus include all tests of policies. With a cold cache, the command compiles all kernels. Before a measurement with a
-warm cache, one iteration of the same command fills the cache. A run that lasts longer than --seconds is stopped. The same
-command continues it, and the result is the sum of the seconds. A run that does not reach its target within --limit
+warm cache, one iteration of the same command fills the cache. A run that lasts longer than --seconds is stopped. The
+same command continues it, and the result is the sum of the seconds. A run that does not reach its target within --limit
 seconds is stored as well. Medians count it as slower than every run that reached the target.
 """
 
