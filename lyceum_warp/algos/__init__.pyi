@@ -15,7 +15,10 @@ from lyceum_warp.algos.common.learner import (
     Iteration as Iteration,
     Learner as Learner,
 )
-from lyceum_warp.algos.common.networks import moved as moved
+from lyceum_warp.algos.common.networks import (
+    LIMIT as LIMIT,
+    moved as moved,
+)
 from lyceum_warp.algos.common.policy import (
     GaussianPolicy as GaussianPolicy,
     Policy as Policy,

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos import NPG, PPO, SAC, Learner, NPGConfig, PPOConfig, SACConfig, Team
+from lyceum_warp.algos import LIMIT, NPG, PPO, SAC, Learner, NPGConfig, PPOConfig, SACConfig, Team
 from lyceum_warp.binding import spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
@@ -135,12 +135,13 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
     The third result is the iteration at which they were saved.
 
     If ``which`` is None, the run is resumed. The learner then usually makes its networks from the hyperparameters, and
-    this function returns None for the policy and for the value function. It returns the networks if the policy has a
-    ``limit``, or if the run started from another run.
+    this function returns None for the policy and for the value function. It returns the networks if the policy has
+    another ``limit`` than ``LIMIT``, or if the run started from another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))
-    if which is None and "from" not in run.config and "limit" not in (content["policy"].get("shape") or {}):
+    limit = (content["policy"].get("shape") or {}).get("limit", LIMIT)
+    if which is None and "from" not in run.config and limit == LIMIT:
         return None, None, content["iteration"]
     value = network_of(content, path, "value") if "value" in content else None
     return network_of(content, path, "policy"), value, content["iteration"]
