@@ -148,7 +148,7 @@ class _Run:
 
     def _one(self, array: wp.array) -> wp.array:
         """Return the row of the world. A single row belongs to all worlds."""
-        return array[self._world : self._world + 1] if array.shape[0] > 1 else array
+        return array[self._world : self._world + 1] if array.size and array.shape[0] > 1 else array
 
     def _rows(self, shape: Sequence[int], dtype: Any = wp.float32, values: wp.array | None = None) -> GuardedRows:
         return GuardedRows(shape, dtype, self._guard, self._worlds.device, values)
