@@ -65,7 +65,8 @@ class BoundTask:
 
         self.spec = models.read_task_spec(task, model)
         """The model before ``edit_model``."""
-        self.model = models.compile_task_model(task, self.spec, data_fields, physics, {*model_fields, *dynamics})
+        varied = {*model_fields, *dynamics}
+        self.model = models.compile_task_model(task, self.spec, data_fields, physics, varied, model)
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)

@@ -69,13 +69,19 @@ def compile_task_model(
     fields: Collection[str],
     physics: PhysicsOptions,
     varied: Collection[str],
+    model: ModelSource | None = None,
 ) -> mujoco.MjModel:
-    """Apply ``edit_model`` of a task and its parents to a copy of a spec, and compile it; see ``compile_model``."""
+    """Apply ``edit_model`` of a task and its parents to a copy of a spec, and compile it; see ``compile_model``.
+
+    Errors name the file of the task's model, or of the given ``model`` from which the spec was read.
+    """
     edited = _edited(task, spec)
     try:
         return compile_model(edited, fields, physics, varied=varied)
     except ValueError as error:
-        raise ValueError(f"the model {spec.modelname!r} of the task {task_name(task)!r}: {error}") from error
+        source = task.model if model is None else model
+        file = source if isinstance(source, str | Path) else getattr(source, "file", None)
+        raise ValueError(f"{file or f'the model of the task {task_name(task)!r}'}: {error}") from error
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
