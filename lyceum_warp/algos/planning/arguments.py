@@ -78,8 +78,7 @@ def planner_arguments(
     config = config.completed(value)
 
     _check_options(options)
-    env_options = _planning(task)[1].changed(options)
-    env_options = env_options.changed({"physics": env_options.physics.resolved(task.physics)})
+    env_options = _resolved(_planning(task)[1].changed(options), task)
     place = place_samples(
         env_options.engine, env_options.device, nthread=env_options.nthread,
         samples=config.samples * config.models * plants, spec=partial(task_spec, task, env_options.model),
@@ -159,8 +158,12 @@ def _planning(task: type[Task]) -> tuple[MPPIConfig, EnvOptions]:
         config = MPPIConfig(**planning.settings)
     with _named(f"planning.options of the task {name!r}"):
         _check_options(planning.options)
-        options = EnvOptions().changed(planning.options)
+        options = _resolved(EnvOptions().changed(planning.options), task)
     return config, options
+
+
+def _resolved(options: EnvOptions, task: type[Task]) -> EnvOptions:
+    return options.changed({"physics": options.physics.resolved(task.physics)})
 
 
 @contextlib.contextmanager
