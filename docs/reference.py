@@ -131,11 +131,8 @@ def warp_function(function: Any, name: str) -> list[str]:
         spelled = {each: "Any" if "Any" in names else " | ".join(names) for each, names in kinds.items()}
         result = f" -> {spelled['return']}" if spelled["return"] else ""
         heads.append(f"{name}({', '.join(f'{each}: {spelled[each]}' for each in arguments)}){result}")
-    text = inspect.getdoc(function) or ""
-    if text.startswith(f"{function.key}("):  # the text begins with a signature for each overload
-        text = text.partition("\n\n")[2]
     lines = [f".. py:function:: {heads[0]}", *(f"                 {head}" for head in heads[1:]), ""]
-    return [*lines, *(f"   {line}" for line in converted(text)), ""]
+    return [*lines, *(f"   {line}" for line in converted(inspect.getdoc(function) or "")), ""]
 
 
 def type_name(annotation: Any) -> str:

@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 
 from lyceum_warp import terms
+from lyceum_warp.binding import overloads
 
 PAGE = Path(__file__).resolve().parent / "terms.md"
 PLACE = re.compile(r"(<!-- functions -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -26,10 +27,7 @@ def functions() -> list[str]:
         for name in dict.fromkeys(node.name for node in tree.body if isinstance(node, ast.FunctionDef)):
             function = getattr(terms, name)
             text, _, _ = inspect.getdoc(function).partition("\n\nArgs:")
-            signatures = [f"`{name}({', '.join(function.input_types)})`"]
-            if text.startswith(f"{name}("):  # the text begins with a signature for each overload
-                head, _, text = text.partition("\n\n")
-                signatures = [f"`{line}`" for line in head.splitlines()]
+            signatures = dict.fromkeys(f"`{name}({', '.join(each.input_types)})`" for each in overloads(function))
             lines.append(f"| {'<br>'.join(signatures)} | {cell(text)} |")
         lines.append("")
     return lines[:-1]
