@@ -21,21 +21,16 @@ from mujoco.batch import Batch
 import lyceum_warp as lw
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.support.arrays import launch_worlds
+from lyceum_warp.support.arrays import torch_view
 
 BLOCK = 10
 """Steps per turn."""
 
 
 def next_controls(env: lw.Env) -> torch.Tensor:
-    if (control := env.task.kernels.control_worlds) is None:
-        low = torch.as_tensor(env.action_space.low, device=env.obs.device)
-        high = torch.as_tensor(env.action_space.high, device=env.obs.device)
-        return env.action.clamp(low, high)
-    controls = wp.zeros_like(env.engine.ctrl)
-    args = [env.worlds.after, env.worlds.params, env.worlds.action, controls]
-    launch_worlds(control, env.nworld, args, env.device)
-    return wp.to_torch(controls)
+    """Return the controls of the next step, which computes them again."""
+    env.worlds.act()
+    return torch_view(env.engine.ctrl).clone()
 
 
 class BareC:
