@@ -28,7 +28,7 @@ def test_run_from_a_gpu_is_evaluated_on_a_cpu(
     run = tmp_path / "run"
     shutil.copytree(trained, run)
     config = json.loads((run / "config.json").read_text())
-    config |= {"device": "cuda:7", "params": config["params"] | {"nconmax": 16}}
+    config |= {"device": "cuda:7", "physics": config["physics"] | {"nconmax": 16}}
     (run / "config.json").write_text(json.dumps(config))
     assert cli.main(["eval", str(run), "--episodes", "2"]) == 0
     assert "2 episodes of the mean policy" in capsys.readouterr().out

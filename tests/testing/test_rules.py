@@ -156,7 +156,7 @@ FULL_BREAKS: list[Break] = [
     ("events", MujocoEngine, "commit", only_after_resets),
     ("substep", Worlds, "physics_phases", once_a_step),
     ("lasting_memory", Worlds, "_clear", clear_all_but("lasting_memory")),
-    ("inputs", MujocoEngine, "__init__", then(lambda engine: setattr(engine, "_written", []))),
+    ("inputs", MujocoEngine, "__init__", then(lambda engine: setattr(engine, "_inputs", []))),
     ("dynamics", Worlds, "_make_nominal", nothing),
     ("dynamics", MujocoEngine, "apply_model", nothing),
     ("keyframe", MujocoEngine, "__init__", then(from_the_default)),

@@ -9,7 +9,7 @@ from training_runs import QUIET, algorithm, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.viz import drawing
+from lyceum_warp.viz import renderer
 
 SMALL = lw.NPGConfig(samples=12, hidden=(4,), value_hidden=(4,))
 
@@ -141,7 +141,7 @@ def test_training_in_python_writes_the_same_videos_as_the_command_line(npg: lw.N
 def test_training_in_python_continues_if_no_video_can_be_drawn(
     npg: lw.NPG, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(drawing, "libraries", lambda: ["nonsense"])
+    monkeypatch.setattr(renderer, "backends", lambda: ["nonsense"])
     with caplog.at_level(logging.WARNING):
         run = lw.train(npg, tmp_path / "run", 2, callbacks=[lw.Videos(1)])
     assert len(run.rows()) == 2 and not (run.folder / "videos").exists()

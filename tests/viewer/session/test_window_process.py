@@ -130,7 +130,7 @@ def test_killed_window_ends_the_view_with_an_error(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(show, "Window", Killed)
     with pytest.raises(show.NoWindowError, match="ended: its process was ended by SIGKILL"):
-        lyceum_warp.view(lyceum_warp.Env("point_mass", nworld=1))
+        lyceum_warp.view(lyceum_warp.make("point_mass"))
 
 
 PROGRAM = """
