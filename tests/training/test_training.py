@@ -48,6 +48,13 @@ def test_run_started_in_python_is_evaluated_and_resumed_on_the_command_line(
     assert Run.open(folder).config["resumed"] == [{"torch": torch.__version__}]
 
 
+def test_resumed_run_keeps_the_limit_of_its_policy(env: lw.Env, tmp_path: Path) -> None:
+    wide = lw.GaussianPolicy(6, 2, (8,), normalize=True, limit=1e6)
+    run = lw.train(algorithm(env, policy=wide), tmp_path / "run", 1)
+    assert cli.main(["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]) == 0
+    assert lw.load(run).shape["limit"] == 1e6
+
+
 def test_run_resumed_in_python_gives_identical_metrics(six: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 2)
