@@ -21,6 +21,12 @@ from lyceum_warp.core.model_fields import NOT_NEGATIVE
 from lyceum_warp.core.task import FUNCTIONS, Row
 from lyceum_warp.kernels import random, rows as kernel_rows, task_kernels
 from lyceum_warp.kernels.step_types import Counters, TaskCode
+from lyceum_warp.support.upstream import refuse_integer_divisions
+
+_MODULE = "lyceum_warp.generated."
+"""Prefix of the names of the generated modules."""
+
+refuse_integer_divisions(_MODULE)
 
 _HELPERS: dict[str, Any] = {
     "wp": wp, "Row": Row, "Counters": Counters, "stream": random.stream, "substream": random.substream,
@@ -86,13 +92,13 @@ class _Generator:
         for form in FUNCTIONS.values():
             if form.default is not None:
                 self._function(f"no_{form.signature}", [form.default])
-        scope["__name__"] = f"lyceum_warp.generated.{source.name}"
+        scope["__name__"] = f"{_MODULE}{source.name}"
         run_source("\n\n".join(self._texts), f"<lyceum_warp {source.path}>", scope)
         terms = source.terms.generated(f"<lyceum_warp {source.path} terms>")
         functions = source.functions | {name: terms[name] for name in source.terms.combined}
         views = {source.world: scope["view"]} | {scope[f"Struct_{x}"]: scope[f"view_{x}"] for x in self._structs}
         return scope | {
-            "module": free_module_name(f"lyceum_warp.generated.{source.kernel_name}"),
+            "module": free_module_name(f"{_MODULE}{source.kernel_name}"),
             "functions": {name: function or scope.get(f"no_{name}") for name, function in functions.items()},
             "written": [name for name, function in functions.items() if function is not None],
             "terms": terms,

@@ -9,7 +9,6 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.divisions import check_divisions
 from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import is_struct, overloads, source_of
@@ -81,7 +80,7 @@ class TaskSource:
         return tuple(name for name in self._lasting() if name in trained)
 
     def check_bodies(self, observers: Mapping[str, wp.Function]) -> None:
-        """Raise a ValueError if a function reads or writes what it must not, or divides integers.
+        """Raise a ValueError if a function reads or writes what it must not.
 
         ``observers`` are the functions of the observation groups, by group name.
         """
@@ -91,14 +90,12 @@ class TaskSource:
         functions |= {observer_name(group): function for group, function in observers.items()}
         for name, function in functions.items():
             check_writes(self.name, name, function, rights)
-            check_divisions(self.name, name, function)
         for name in _BEFORE_FORWARD & functions.keys():
             check_reads(self.name, name, functions[name])
         for name, term in self.terms.functions.items():
             for overload in overloads(term):
                 none = {name: dict.fromkeys(overload.input_types, ())}
                 check_writes(self.name, name, overload, rights | none)
-                check_divisions(self.name, name, overload)
 
     def observers(self, groups: Collection[str]) -> dict[str, wp.Function]:
         """Return the functions that write observation groups, by group name."""

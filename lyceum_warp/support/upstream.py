@@ -62,6 +62,27 @@ def extend_structs() -> None:
     codegen.Struct.__doc__ = _StructDoc()
 
 
+def refuse_integer_divisions(prefix: str) -> None:
+    """Let Warp refuse ``/`` of integers in modules whose names start with ``prefix``.
+
+    Unlike Python, Warp drops the fraction of such a quotient.
+    """
+    codegen: Any = wp._src.codegen
+    add_call = codegen.Adjoint.add_builtin_call
+
+    def checked(adjoint: Any, name: str, args: Any, *rest: Any, **options: Any) -> Any:
+        if name == "div" and adjoint.builder is not None and adjoint.builder.module.name.startswith(prefix):
+            kinds = [codegen.strip_reference(arg.type) for arg in args]
+            if all(wp.types.type_is_int(getattr(kind, "_wp_scalar_type_", kind)) for kind in kinds):
+                raise ValueError(
+                    f"{wp.types.type_repr(kinds[0])} / {wp.types.type_repr(kinds[1])} drops the fraction: write "
+                    "1.0 / 2.0 or float(n) / 2.0, or n // 2 for a whole quotient"
+                )
+        return add_call(adjoint, name, args, *rest, **options)
+
+    codegen.Adjoint.add_builtin_call = checked
+
+
 def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
     """Return whether Warp has loaded a module for a block size, or has it in its cache.
 

@@ -154,12 +154,11 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a quotient of integers in a helper": (
         [("class Tiny", "@wp.func\ndef part(row: Row[float], n: int) -> float:\n    return float(n / row.shape[0])\n\n"
           f"@wp.func\n{REWARD} -> float:\n    return part(action, 1)\n\nclass Tiny")],
-        r"reward of the task 'tiny' divides integers in 'n / row\.shape\[0\]' in part \(.*tiny\.py, line 20\)"
-        r".*: write float\(n\) / float\(row\.shape\[0\]\), or n // row",
+        r"part of the task 'tiny' \(tiny\.py, line 20\): 'return float\(n / row\.shape\[0\]\)': .* n // 2",
     ),
     "a term with a quotient of integers": (
         [line('rewards = {"half": 1.0}'), function("def half(s: World) -> float:\n    return float(1 / 2)")],
-        r"half of the task 'tiny' divides integers in '1 / 2' .*: write 1\.0 / 2\.0",
+        r"half of the task 'tiny' \(tiny\.py, line \d+\): 'return float\(1 / 2\)': .* write 1\.0 / 2\.0",
     ),
     "randomize that reads a derived field in a helper": (
         [field("xpos: Row[wp.vec3]"), function(f"def drop(s: World):\n    s.qpos[1] = -s.xpos[1][2]\n\n"
