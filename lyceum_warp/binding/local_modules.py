@@ -1,11 +1,12 @@
 """Find and import modules from the folder of a task's file, as Python does for a script."""
 
-import ast
 import contextlib
-import importlib.util
+import importlib
+import modulefinder
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 from lyceum_warp.binding.opened_files import Stamps, data_files, stamps
 
@@ -13,56 +14,36 @@ _taken: dict[str, Stamps] = {}
 """Maps each imported local module to the stamps of its file, and of the data files that it read, at its import."""
 
 
+class _Finder(modulefinder.ModuleFinder):
+    """Finds modules in the folders of ``path``, including packages without ``__init__.py``."""
+
+    def find_module(self, name: str, path: Any, parent: Any = None) -> tuple[Any, str, tuple[str, str, int]]:
+        for folder in map(Path, self.path if path is None else path):
+            if any((folder / name).glob("*.py")):
+                return None, str(folder / name), ("", "", 5)  # modulefinder's number for a package
+            if (file := folder / f"{name}.py").is_file():
+                return file.open("rb"), str(file), (".py", "rb", 1)  # modulefinder's number for a source file
+        raise ImportError(name)
+
+    def load_package(self, name: str, folder: str) -> Any:
+        if (Path(folder) / "__init__.py").is_file():
+            return super().load_package(name, folder)
+        package: Any = self.add_module(name)
+        package.__file__, package.__path__ = folder, [folder]
+        return package
+
+
 def local_modules(file: Path) -> dict[str, Path]:
     """Find the modules that a Python file imports from its own folder, directly or indirectly.
 
     No module is run. A package without ``__init__.py`` is returned as its folder.
     """
-    folder = file.resolve().parent
-    found: dict[str, Path] = {}
-    pending = [("", file.resolve())]
-    while pending:
-        name, path = pending.pop()
-        try:
-            tree = ast.parse(path.read_bytes())
-        except (OSError, SyntaxError, ValueError):
-            continue
-        package = name if path.name == "__init__.py" else name.rpartition(".")[0]
-        for wanted in _imported_names(tree, package):
-            if _module_file(folder, wanted) is None:
-                wanted = wanted.rpartition(".")[0]  # an imported name may be an attribute instead of a module
-            for part in _prefixes(wanted):
-                if part not in found and (module := _module_file(folder, part)) not in (None, file.resolve()):
-                    found[part] = module
-                    if module.is_file():
-                        pending.append((part, module))
-    return found
-
-
-def _imported_names(tree: ast.AST, package: str) -> Iterator[str]:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            with contextlib.suppress(ImportError):  # a relative import with too many dots leads out of the package
-                owner = importlib.util.resolve_name("." * node.level + (node.module or ""), package or None)
-                yield from (owner, *(f"{owner}.{alias.name}" for alias in node.names))
-
-
-def _prefixes(name: str) -> list[str]:
-    parts = name.split(".") if name else []
-    return [".".join(parts[: i + 1]) for i in range(len(parts))]
-
-
-def _module_file(folder: Path, name: str) -> Path | None:
-    """Return a module's file in a folder. A package without ``__init__.py`` is returned as its folder."""
-    if not name:
-        return None
-    base = folder.joinpath(*name.split("."))
-    for file in (base / "__init__.py", base.with_name(base.name + ".py")):
-        if file.is_file():
-            return file
-    return base if base.is_dir() and any(base.glob("*.py")) else None
+    finder = _Finder([str(file.resolve().parent)])
+    with contextlib.suppress(OSError, SyntaxError, ValueError):
+        finder.run_script(str(file))
+    modules: dict[str, Any] = finder.modules
+    paths = {name: Path(module.__file__) for name, module in modules.items() if name != "__main__"}
+    return {name: path for name, path in paths.items() if path != file.resolve()}
 
 
 @contextlib.contextmanager
