@@ -5,9 +5,9 @@ generated as text, because Warp compiles functions from their source.
 """
 
 import dataclasses
-import itertools
 import threading
 from collections.abc import Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -96,13 +96,12 @@ class _Generator:
         run_source("\n\n".join(self._texts), f"<lyceum_warp {source.path}>", scope)
         terms = source.terms.generated(f"<lyceum_warp {source.path} terms>")
         functions = source.functions | {name: terms[name] for name in source.terms.combined}
-        views = {source.world: scope["view"]} | {scope[f"Struct_{x}"]: scope[f"view_{x}"] for x in self._structs}
         return scope | {
             "module": free_module_name(f"{_MODULE}{source.kernel_name}"),
-            "functions": {name: function or scope.get(f"no_{name}") for name, function in functions.items()},
+            "functions": SimpleNamespace(**{name: f or scope.get(f"no_{name}") for name, f in functions.items()}),
             "written": [name for name, function in functions.items() if function is not None],
-            "terms": terms,
-            "views": views,
+            "terms": SimpleNamespace(**terms),
+            "views": {scope[f"Struct_{name}"]: scope[f"view_{name}"] for name in self._structs},
         }
 
     def _struct(self, name: str, fields: Iterable[str]) -> None:
@@ -147,9 +146,9 @@ class _Generator:
         self._scope["has_state"] = bool(copies)
 
     def _observations(self) -> None:
-        """Generate the struct of all observation groups, and functions that write, check and copy groups."""
+        """Generate the struct of all observation groups, and functions that write and copy groups."""
         self._struct("Observations", [f"{group}: type_row" for group in self._groups])
-        lines = []
+        lines = ["valid = bool(True)"]
         if any(map(draws_noise, self._groups.values())):  # the noise of a group depends only on the counters
             lines.append("base = substream(stream(counters.key[w], counters.episode[w], counters.step[w]), OBSERVE)")
             lines.append("rng = counters.rng[group * counters.step.shape[0] + w]")
@@ -162,14 +161,9 @@ class _Generator:
                 lines.append(f"    observe_{number}(s, p, {row}, rng)")
             else:
                 lines.append(f"    observe_{number}(s, p, {row})")
+            lines.append(f"    valid = row_in_range(out.{group}[w], 0, 1)")
         arguments = "group: int, s: World, p: Params, out: Observations, w: int, counters: Counters"
-        self._function(f"observe_group({arguments})", lines)
-        checks = [
-            (f"if group == {number}:", f"    valid = row_in_range(out.{group}[w], 0, 1)")
-            for number, group in enumerate(self._groups)
-        ]
-        lines = ["valid = bool(True)", *itertools.chain(*checks), "return valid"]
-        self._function("valid_group(group: int, out: Observations, w: int) -> bool", lines)
+        self._function(f"observe_group({arguments}) -> bool", [*lines, "return valid"])
         copies = [f"copy_row(source.{group}[w], target.{group}[w], lane, lanes)" for group in self._groups]
         arguments = "source: Observations, target: Observations, w: int, lane: int, lanes: int"
         self._function(f"copy_observations({arguments})", copies)

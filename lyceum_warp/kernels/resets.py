@@ -9,31 +9,24 @@ STARTUP = wp.constant(-1)
 """Replaces the episode number in the random stream of ``startup``."""
 
 
-def make_start_worlds(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, startup = task.view, task.functions["startup"]
-
+def make_reset_kernels(task: TaskCode) -> None:
     @task.kernel_for("startup")
-    def start_worlds(mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], counters: Counters, first: int):
+    def start_worlds(
+        mask_in: wp.array[bool], batch: task.Batch, params: wp.array[task.Params], counters: Counters, first: int
+    ):
         """Call ``startup`` in the masked worlds; launched over (nworld,)."""
         w = first + wp.tid()
         if mask_in[w]:
             counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
-            startup(view(batch, w), params[w % params.shape[0]], counters.rng[w])
-
-
-def make_restart(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view = task.view
-    initialize, randomize = task.functions["initialize"], task.functions["randomize"]
+            task.functions.startup(task.view(batch, w), params[w % params.shape[0]], counters.rng[w])
 
     @task.kernel()
     def restart(
         mask_in: wp.array[bool],
         random: bool,
         again: bool,
-        batch: Batch,
-        params: wp.array[Params],
+        batch: task.Batch,
+        params: wp.array[task.Params],
         counters: Counters,
         first: int,
     ):
@@ -50,20 +43,15 @@ def make_restart(task: TaskCode) -> None:
             counters.episode[w] = counters.episode[w] + 1
             counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
         p = params[w % params.shape[0]]
-        s = view(batch, w)
-        initialize(s, p)
+        s = task.view(batch, w)
+        task.functions.initialize(s, p)
         if random:
-            randomize(s, p, counters.rng[w])
-
-
-def make_reject_worlds(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, reject = task.view, task.functions["reject"]
+            task.functions.randomize(s, p, counters.rng[w])
 
     @task.kernel_for("reject")
     def reject_worlds(
-        mask_in: wp.array[bool], batch: Batch, params: wp.array[Params], again_out: wp.array[bool], first: int
+        mask_in: wp.array[bool], batch: task.Batch, params: wp.array[task.Params], again_out: wp.array[bool], first: int
     ):
         """Find the masked worlds whose initial states are rejected; launched over (nworld,)."""
         w = first + wp.tid()
-        again_out[w] = mask_in[w] and reject(view(batch, w), params[w % params.shape[0]])
+        again_out[w] = mask_in[w] and task.functions.reject(task.view(batch, w), params[w % params.shape[0]])

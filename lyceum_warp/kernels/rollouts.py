@@ -99,17 +99,12 @@ def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
     fault_inout[w] = fault_inout[w] | fault_in[w]
 
 
-def make_judge_rows(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, terminated = task.view, task.functions["terminated"]
-    reward, sum_of_terms = task.functions["reward"], task.terms.get("reward")
-    has_terms = "reward" in task.terms
-
+def make_rollout_kernels(task: TaskCode) -> None:
     @task.kernel()
     def judge_rows(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        after: task.Batch,
+        params: wp.array[task.Params],
         weights_in: wp.array2d[float],
         action_in: wp.array2d[float],
         reward_out: wp.array[float],
@@ -119,24 +114,19 @@ def make_judge_rows(task: TaskCode) -> None:
         """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
         row = first + wp.tid()
         p = params[row % params.shape[0]]
-        s1 = view(after, row)
-        if wp.static(has_terms):
+        s0, s1 = task.view(before, row), task.view(after, row)
+        if wp.static(hasattr(task.terms, "reward")):
             weights = weights_in[row % weights_in.shape[0]]
-            reward_out[row] = sum_of_terms(view(before, row), action_in[row], s1, p, weights)
+            reward_out[row] = task.terms.reward(s0, action_in[row], s1, p, weights)
         else:
-            reward_out[row] = reward(view(before, row), action_in[row], s1, p)
-        terminated_out[row] = terminated(s1, p)
-
-
-def make_advance_rows(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, advance = task.view, task.functions["advance"]
+            reward_out[row] = task.functions.reward(s0, action_in[row], s1, p)
+        terminated_out[row] = task.functions.terminated(s1, p)
 
     @task.kernel_for("advance")
     def advance_rows(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        after: task.Batch,
+        params: wp.array[task.Params],
         action_in: wp.array2d[float],
         counters: Counters,
         memory_inout: wp.array2d[float],
@@ -152,4 +142,4 @@ def make_advance_rows(task: TaskCode) -> None:
             copy_row(memory_inout[row], memory_inout[row + n], 0, 1)
             copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
             counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
-            advance(view(before, row), action_in[row], view(after, row), p, counters.rng[w])
+            task.functions.advance(task.view(before, row), action_in[row], task.view(after, row), p, counters.rng[w])

@@ -12,17 +12,15 @@ UNIT = wp.constant(2.0**20)
 """Sums over worlds are multiples of 1 / UNIT, so that they do not depend on the order of the worlds."""
 
 
-def make_tally_worlds(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, view_sums = task.view, task.views.get(task.Sums)
-    tally = task.functions["tally"]
-    tells_failures = "tally" in task.written and "terminated" in tally.input_types
+def make_shared_memory_kernels(task: TaskCode) -> None:
+    view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
+    tells_failures = "tally" in task.written and "terminated" in task.functions.tally.input_types
 
     @task.kernel_for("tally")
     def tally_worlds(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        after: task.Batch,
+        params: wp.array[task.Params],
         action_in: wp.array2d[float],
         reason_in: wp.array[int],
         share_out: wp.array2d[float],
@@ -34,26 +32,21 @@ def make_tally_worlds(task: TaskCode) -> None:
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
         if (reason_in[w] & ALL_FAULTS) == 0:
-            s0, s1, p = view(before, w), view(after, w), params[w % params.shape[0]]
+            s0, s1, p = task.view(before, w), task.view(after, w), params[w % params.shape[0]]
             ended, sums = reason_in[w] != 0, view_sums(share_out[w])
             if wp.static(tells_failures):
-                tally(s0, action_in[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
+                task.functions.tally(s0, action_in[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
             else:
-                tally(s0, action_in[w], s1, p, ended, sums)
+                task.functions.tally(s0, action_in[w], s1, p, ended, sums)
         for i in range(share_out.shape[1]):
             if share_out[w, i] != 0.0 and wp.isfinite(share_out[w, i]):
                 wp.atomic_add(sum_inout, i, wp.int64(wp.round(wp.float64(share_out[w, i]) * wp.float64(UNIT))))
-
-
-def make_share_memory(task: TaskCode) -> None:
-    Params, share = task.Params, task.functions["share"]  # noqa: N806
-    view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
 
     @task.kernel_for("share")
     def share_memory(
         sum_inout: wp.array[wp.int64],
         sum_row_out: wp.array2d[float],
-        params: wp.array[Params],
+        params: wp.array[task.Params],
         shared_inout: wp.array2d[float],
         first: int,
     ):
@@ -61,4 +54,4 @@ def make_share_memory(task: TaskCode) -> None:
         for i in range(sum_inout.shape[0]):
             sum_row_out[0, i] = float(wp.float64(sum_inout[i]) / wp.float64(UNIT))
             sum_inout[i] = wp.int64(0)
-        share(view_shared(shared_inout[0]), view_sums(sum_row_out[0]), params[0])
+        task.functions.share(view_shared(shared_inout[0]), view_sums(sum_row_out[0]), params[0])

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Collection, Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -62,7 +63,7 @@ class TaskCode:
     """
 
     module: str
-    functions: Mapping[str, wp.Function]  # by name, including defaults
+    functions: SimpleNamespace  # the task's functions, including defaults
     written: Collection[str]  # names of the functions that the task defines
     World: Any
     Params: Any
@@ -71,14 +72,13 @@ class TaskCode:
     Shared: Any  # the memory that worlds share, or None
     Sums: Any  # the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
-    views: Mapping[Any, wp.Function]  # ``Kernels.views``
+    views: Mapping[Any, wp.Function]  # (row of floats) -> struct, for all structs but World
     copy_state: wp.Function  # copies the fields that change in a step
-    observe_group: wp.Function
-    valid_group: wp.Function
+    observe_group: wp.Function  # writes an observation group, and returns whether it is valid
     copy_observations: wp.Function
     finite_memory: wp.Function
     valid_model: wp.Function  # whether the model fields that the task writes are valid
-    terms: Mapping[str, wp.Function]  # see ``binding.task_terms``
+    terms: SimpleNamespace  # the generated functions ``reward`` and ``score`` of a task with terms
     has_state: bool  # whether ``copy_state`` is needed
     has_memory: bool  # whether ``finite_memory`` is needed
     checks_model: bool  # whether ``valid_model`` is needed

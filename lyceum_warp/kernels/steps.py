@@ -15,26 +15,18 @@ EVENT = wp.constant(-2)
 """Number of the substream from which ``event`` draws."""
 
 
-def make_keep_before(task: TaskCode) -> None:
-    Batch, copy_state = task.Batch, task.copy_state  # noqa: N806
-
+def make_step_kernels(task: TaskCode) -> None:
     @task.kernel(task.has_state)
-    def keep_before(after: Batch, before_out: Batch, lanes: int, first: int):
+    def keep_before(after: task.Batch, before_out: task.Batch, lanes: int, first: int):
         """Save the fields that a step changes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        copy_state(after, before_out, w, lane, lanes)
-
-
-def make_act(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, control = task.view, task.functions["control"]
-    has_control = "control" in task.written
+        task.copy_state(after, before_out, w, lane, lanes)
 
     @task.kernel()
     def act(
-        batch: Batch,
-        params: wp.array[Params],
+        batch: task.Batch,
+        params: wp.array[task.Params],
         action_in: wp.array2d[float],
         range_in: wp.array2d[float],
         scale_in: wp.array2d[float],
@@ -55,8 +47,8 @@ def make_act(task: TaskCode) -> None:
                 fault = ACTION
         for i in range(action_in.shape[1]):
             safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
-        if wp.static(has_control):
-            control(view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
+        if wp.static("control" in task.written):
+            task.functions.control(task.view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
             for i in range(ctrl_out.shape[1]):
                 if wp.isnan(ctrl_out[w, i]):
                     fault = fault | NAN
@@ -68,40 +60,25 @@ def make_act(task: TaskCode) -> None:
         fault_out[w] = fault
         counters.step[w] = counters.step[w] + 1
 
-
-def make_check_model(task: TaskCode) -> None:
-    Batch = task.Batch  # noqa: N806
-    view, valid_model = task.view, task.valid_model
-
     @task.kernel(task.checks_model)
-    def check_model(batch: Batch, fault_inout: wp.array[int], lanes: int, first: int):
+    def check_model(batch: task.Batch, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the model fields that the task writes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        if not valid_model(view(batch, w), lane, lanes):
+        if not task.valid_model(task.view(batch, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | MODEL
 
-
-def make_substep_memory(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, substep = task.view, task.functions["substep"]
-
     @task.kernel_for("substep")
-    def substep_memory(batch: Batch, params: wp.array[Params], first: int):
+    def substep_memory(batch: task.Batch, params: wp.array[task.Params], first: int):
         """Advance the task's memory by one substep; launched over (nworld,)."""
         w = first + wp.tid()
-        substep(view(batch, w), params[w % params.shape[0]])
-
-
-def make_advance_memory(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, advance = task.view, task.functions["advance"]
+        task.functions.substep(task.view(batch, w), params[w % params.shape[0]])
 
     @task.kernel_for("advance")
     def advance_memory(
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        after: task.Batch,
+        params: wp.array[task.Params],
         action_in: wp.array2d[float],
         counters: Counters,
         first: int,
@@ -110,18 +87,13 @@ def make_advance_memory(task: TaskCode) -> None:
         w = first + wp.tid()
         counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w])
         p = params[w % params.shape[0]]
-        advance(view(before, w), action_in[w], view(after, w), p, counters.rng[w])
-
-
-def make_run_events(task: TaskCode) -> None:
-    Batch, Params = task.Batch, task.Params  # noqa: N806
-    view, event = task.view, task.functions["event"]
+        task.functions.advance(task.view(before, w), action_in[w], task.view(after, w), p, counters.rng[w])
 
     @task.kernel_for("event")
     def run_events(
         restarting_in: wp.array[bool],
-        batch: Batch,
-        params: wp.array[Params],
+        batch: task.Batch,
+        params: wp.array[task.Params],
         counters: Counters,
         continuing_out: wp.array[bool],
         physics_changed_out: wp.array[bool],
@@ -138,7 +110,7 @@ def make_run_events(task: TaskCode) -> None:
         if not restarting_in[w]:
             at = stream(counters.key[w], counters.episode[w], counters.step[w])
             counters.rng[w, 0] = substream(at, EVENT)
-            event(view(batch, w), params[w % params.shape[0]], counters.rng[w])
+            task.functions.event(task.view(batch, w), params[w % params.shape[0]], counters.rng[w])
 
 
 @wp.kernel(enable_backward=False)

@@ -19,35 +19,28 @@ METRICS = wp.constant(2)
 OBSERVE_FIRST = wp.constant(3)
 
 
-def make_check_memory(task: TaskCode) -> None:
-    Batch, finite_memory = task.Batch, task.finite_memory  # noqa: N806
-
+def make_transition_kernels(task: TaskCode) -> None:
     @task.kernel(task.has_memory)
     def check_memory(
-        mask_in: wp.array[bool], before: Batch, after: Batch, fault_inout: wp.array[int], lanes: int, first: int
+        mask_in: wp.array[bool],
+        before: task.Batch,
+        after: task.Batch,
+        fault_inout: wp.array[int],
+        lanes: int,
+        first: int,
     ):
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        if mask_in[w] and not finite_memory(before, after, w, lane, lanes):
+        if mask_in[w] and not task.finite_memory(before, after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
-
-
-def make_judge(task: TaskCode) -> None:
-    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
-    view, observe_group, valid_group = task.view, task.observe_group, task.valid_group
-    terminated, truncated = task.functions["terminated"], task.functions["truncated"]
-    success, evaluate = task.functions["success"], task.functions["evaluate"]
-    reward, measure = task.functions["reward"], task.functions["measure"]
-    has_evaluate, has_measure = "evaluate" in task.written, "measure" in task.written
-    score, has_score = task.terms.get("score"), "score" in task.terms
 
     @task.kernel()
     def judge(
         mask_in: wp.array[bool],
-        before: Batch,
-        after: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        after: task.Batch,
+        params: wp.array[task.Params],
         weights_in: wp.array2d[float],
         action_in: wp.array2d[float],
         counters: Counters,
@@ -56,7 +49,7 @@ def make_judge(task: TaskCode) -> None:
         action_fault_in: wp.array[int],
         found_out: Findings,
         metrics_out: wp.array2d[float],
-        obs_out: Observations,
+        obs_out: task.Observations,
         threads: int,
         first: int,
     ):
@@ -73,50 +66,43 @@ def make_judge(task: TaskCode) -> None:
             found = int(0)
             if (fault_in[w] | action_fault_in[w]) == 0:
                 p = params[w % params.shape[0]]
-                s1 = view(after, w)
+                s1 = task.view(after, w)
                 if part == ENDS:
-                    found_out.terminated[w] = terminated(s1, p)
-                    found_out.truncated[w] = truncated(s1, p)
-                    found_out.success[w] = success(s1, p)
-                    if wp.static(has_evaluate):
-                        found_out.eval[w] = evaluate(s1, p)
+                    found_out.terminated[w] = task.functions.terminated(s1, p)
+                    found_out.truncated[w] = task.functions.truncated(s1, p)
+                    found_out.success[w] = task.functions.success(s1, p)
+                    if wp.static("evaluate" in task.written):
+                        found_out.eval[w] = task.functions.evaluate(s1, p)
                 elif part == GAIN:
-                    if wp.static(has_score):
+                    if wp.static(hasattr(task.terms, "score")):
                         for i in range(metrics_out.shape[1]):
                             metrics_out[w, i] = 0.0
                     if transition:
-                        if wp.static(has_score):
+                        s0 = task.view(before, w)
+                        if wp.static(hasattr(task.terms, "score")):
                             weights = weights_in[w % weights_in.shape[0]]
-                            found_out.reward[w] = score(view(before, w), action_in[w], s1, p, weights, metrics_out[w])
+                            found_out.reward[w] = task.terms.score(s0, action_in[w], s1, p, weights, metrics_out[w])
                         else:
-                            found_out.reward[w] = reward(view(before, w), action_in[w], s1, p)
+                            found_out.reward[w] = task.functions.reward(s0, action_in[w], s1, p)
                         if faults.is_out_of_range(found_out.reward[w]):
                             found = REWARD
                 elif part == METRICS:
-                    if wp.static(has_measure and not has_score):
+                    if wp.static("measure" in task.written and not hasattr(task.terms, "score")):
                         for i in range(metrics_out.shape[1]):
                             metrics_out[w, i] = 0.0
                         if transition:
-                            measure(view(before, w), action_in[w], s1, p, metrics_out[w])
+                            task.functions.measure(task.view(before, w), action_in[w], s1, p, metrics_out[w])
                 else:
                     group = part - OBSERVE_FIRST
-                    observe_group(group, s1, p, obs_out, w, counters)
-                    if not valid_group(group, obs_out, w):
+                    if not task.observe_group(group, s1, p, obs_out, w, counters):
                         found = OBSERVATION
             found_out.fault[part, w] = found
-
-
-def make_conclude(task: TaskCode) -> None:
-    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
-    view, copy_observations = task.view, task.copy_observations
-    evaluate, has_evaluate = task.functions["evaluate"], "evaluate" in task.written
-    has_metrics = "measure" in task.written or "score" in task.terms
 
     @task.kernel()
     def conclude(
         mask_in: wp.array[bool],
-        before: Batch,
-        params: wp.array[Params],
+        before: task.Batch,
+        params: wp.array[task.Params],
         found: Findings,
         step_in: wp.array[int],
         horizon: int,
@@ -126,8 +112,8 @@ def make_conclude(task: TaskCode) -> None:
         action_fault_in: wp.array[int],
         out: Outcome,
         metric_sum_inout: wp.array2d[float],
-        obs_out: Observations,
-        final_obs_inout: Observations,
+        obs_out: task.Observations,
+        final_obs_inout: task.Observations,
         restart_out: wp.array[bool],
         fault_count_inout: wp.array2d[int],
         lanes: int,
@@ -151,10 +137,10 @@ def make_conclude(task: TaskCode) -> None:
         for part in range(found.fault.shape[0]):
             fault = fault | found.fault[part, w]
         if fault == 0:
-            copy_observations(final_obs_inout, obs_out, w, lane, lanes)
+            task.copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
-            copy_observations(obs_out, final_obs_inout, w, lane, lanes)
-        if wp.static(has_metrics):
+            task.copy_observations(obs_out, final_obs_inout, w, lane, lanes)
+        if wp.static("measure" in task.written or hasattr(task.terms, "score")):
             for i in range(lane, out.metrics.shape[1], lanes):
                 if fault != 0 or not transition:
                     out.metrics[w, i] = 0.0
@@ -168,11 +154,11 @@ def make_conclude(task: TaskCode) -> None:
         if fault == 0 and transition:
             gain = found.reward[w]
         out.reward[w] = gain
-        if wp.static(has_evaluate):
+        if wp.static("evaluate" in task.written):
             if fault == 0:
                 out.eval[w] = found.eval[w]
             elif transition:
-                found.eval[w] = evaluate(view(before, w), params[w % params.shape[0]])
+                found.eval[w] = task.functions.evaluate(task.view(before, w), params[w % params.shape[0]])
                 if not faults.is_out_of_range(found.eval[w]):  # else keep the previous evaluation
                     out.eval[w] = found.eval[w]
         else:
@@ -198,21 +184,15 @@ def make_conclude(task: TaskCode) -> None:
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
 
-
-def make_observe_worlds(task: TaskCode) -> None:
-    Batch, Params, Observations = task.Batch, task.Params, task.Observations  # noqa: N806
-    view, observe_group, valid_group = task.view, task.observe_group, task.valid_group
-    copy_observations = task.copy_observations
-
     @task.kernel()
     def observe_worlds(
         mask_in: wp.array[bool],
-        batch: Batch,
-        params: wp.array[Params],
+        batch: task.Batch,
+        params: wp.array[task.Params],
         counters: Counters,
-        good_in: Observations,
+        good_in: task.Observations,
         valid_out: wp.array2d[bool],
-        obs_out: Observations,
+        obs_out: task.Observations,
         parts: int,
         first: int,
     ):
@@ -226,22 +206,18 @@ def make_observe_worlds(task: TaskCode) -> None:
         if mask_in[w]:
             valid = bool(True)
             for group in range(start, valid_out.shape[0], parts):
-                observe_group(group, view(batch, w), params[w % params.shape[0]], obs_out, w, counters)
-                valid_out[group, w] = valid_group(group, obs_out, w)
+                s, p = task.view(batch, w), params[w % params.shape[0]]
+                valid_out[group, w] = task.observe_group(group, s, p, obs_out, w, counters)
                 valid = valid and valid_out[group, w]
             if parts == 1 and not valid:
-                copy_observations(good_in, obs_out, w, 0, 1)
-
-
-def make_replace_observations(task: TaskCode) -> None:
-    Observations, copy_observations = task.Observations, task.copy_observations  # noqa: N806
+                task.copy_observations(good_in, obs_out, w, 0, 1)
 
     @task.kernel()
     def replace_observations(
         mask_in: wp.array[bool],
         valid_in: wp.array2d[bool],
-        good_in: Observations,
-        obs_inout: Observations,
+        good_in: task.Observations,
+        obs_inout: task.Observations,
         lanes: int,
         first: int,
     ):
@@ -256,4 +232,4 @@ def make_replace_observations(task: TaskCode) -> None:
             for group in range(valid_in.shape[0]):
                 valid = valid and valid_in[group, w]
             if not valid:
-                copy_observations(good_in, obs_inout, w, lane, lanes)
+                task.copy_observations(good_in, obs_inout, w, lane, lanes)
