@@ -14,7 +14,7 @@ from lyceum_warp.core.spaces import OWN_PARTS, Space, action_space, control_rang
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
-from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory
+from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, zeros_of
 from lyceum_warp.support.validate import check_tensor
 
 
@@ -103,30 +103,23 @@ class WorldArrays:
                 batch.shared = self.shared
 
     def _allocate_outcome(self) -> None:
-        n, kernels = self.nworld, self.task.kernels
-        self.outcome = step_types.Outcome()
-        self.buffers: dict[str, torch.Tensor] = {}
-        for name, dtype in step_types.OUTCOMES.items():
-            setattr(self.outcome, name, wp.zeros(n, dtype=dtype))
-            self.buffers[name] = torch_view(getattr(self.outcome, name))
-        self.metrics: wp.array = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        self.episode_metrics: wp.array = wp.zeros_like(self.metrics)
-        """Sums of the metrics over the episode up to the last step."""
-        self.outcome.metrics = self.metrics  # type: ignore[assignment]
-        self.outcome.episode_metrics = self.episode_metrics  # type: ignore[assignment]
+        n, metrics = self.nworld, (self.nworld, len(self.task.metrics))
+        self.outcome = zeros_of(step_types.Outcome, n, metrics=metrics, episode_metrics=metrics)
+        self.buffers = {name: torch_view(getattr(self.outcome, name)) for name in step_types.OUTCOMES}
+        self.metrics, self.episode_metrics = self.outcome.metrics, self.outcome.episode_metrics
         self.judged_parts = parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
         """Number of parts of the kernel ``judge``."""
         self._judging = parts if self.device.is_cuda else 1  # threads per transition
-        self._found = step_types.Findings()
-        self._found.reward, self._found.eval = wp.zeros(n, dtype=float), wp.zeros(n, dtype=float)
-        for name in ("terminated", "truncated", "success"):
-            setattr(self._found, name, wp.zeros(n, dtype=bool))
-        self._found.fault = wp.zeros((parts, n), dtype=int)  # type: ignore[assignment]
-        self.obs, self.final_obs = kernels.Observations(), kernels.Observations()
+        self._found = zeros_of(step_types.Findings, n, fault=(parts, n))
+        shapes = {group: (n, space.size) for group, space in self.obs_spaces.items()}
+        self.obs, self.final_obs = (zeros_of(self.task.kernels.Observations, **shapes) for _ in range(2))
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
         # threads per observation
         self._observing = len(self.obs_spaces) if self.device.is_cuda else 1
-        self.obs_groups, self.final_obs_groups = (self._allocate_groups(into) for into in (self.obs, self.final_obs))
+        self.obs_groups, self.final_obs_groups = (
+            {group: torch_view(getattr(observations, group)) for group in shapes}
+            for observations in (self.obs, self.final_obs)
+        )
         self.buffers |= {"obs": self.obs_groups["policy"], "final_obs": self.final_obs_groups["policy"]}
 
     def _allocate_actions(self) -> None:
@@ -142,10 +135,7 @@ class WorldArrays:
 
     def _allocate_counters(self) -> None:
         n = self.nworld
-        self.counters = step_types.Counters()
-        self.counters.step, self.counters.episode = wp.zeros(n, dtype=int), wp.zeros(n, dtype=int)
-        self.counters.key = wp.zeros(n, dtype=wp.uint32)
-        self.counters.rng = wp.zeros((len(self.obs_spaces) * n, 1), dtype=wp.uint32)  # type: ignore[assignment]
+        self.counters = zeros_of(step_types.Counters, n, rng=(len(self.obs_spaces) * n, 1))
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
@@ -168,11 +158,6 @@ class WorldArrays:
         """Worlds that need a new observation after a restart or an event."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
         self.terminated_view = torch_view(self._found.terminated)
-
-    def _allocate_groups(self, into: Any) -> dict[str, torch.Tensor]:
-        for group, space in self.obs_spaces.items():
-            setattr(into, group, wp.zeros((self.nworld, space.size), dtype=float))
-        return {group: torch_view(getattr(into, group)) for group in self.obs_spaces}
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
         """Choose the worlds that the next reset or restore changes; None means all."""

@@ -21,6 +21,7 @@ from lyceum_warp.support.arrays import (
     shared_rows,
     torch_view,
     with_memory,
+    zeros_of,
 )
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
@@ -106,10 +107,9 @@ class OpenLoop:
             self._reward = wp.zeros(rows, dtype=float)
             self._terminated = wp.zeros(rows, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
-            self._obs = task.kernels.Observations()
+            shapes = {group: (n, space.size) for group, space in env.obs_spaces.items()}
+            self._obs = zeros_of(task.kernels.Observations, **shapes)
             self._finite = wp.zeros((len(env.obs_spaces), n), dtype=bool)
-            for group, space in env.obs_spaces.items():
-                setattr(self._obs, group, wp.zeros((n, space.size), dtype=float))
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
             # for each field, _before, _after and _last are views of one buffer
             self._fields: dict[str, wp.array] = {}

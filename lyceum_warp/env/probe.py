@@ -11,7 +11,7 @@ from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import MEMORIES, observer_name
 from lyceum_warp.env.arrays import WorldArrays
 from lyceum_warp.kernels import step_types
-from lyceum_warp.support.arrays import alias, launch_parts, launch_worlds
+from lyceum_warp.support.arrays import alias, launch_parts, launch_worlds, zeros_of
 
 _ROOM = 2**16
 """Bytes of guard memory before and after every row. A write outside a row changes only guard memory."""
@@ -137,14 +137,9 @@ class _Run:
             self._totals = wp.zeros(worlds.sums.size, dtype=wp.int64)
             self._no_fault = wp.zeros(1, dtype=int)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
-            self._findings = step_types.Findings()
-            for name in _RESULTS:
-                setattr(self._findings, name, wp.zeros(1, dtype=step_types.OUTCOMES[name]))
-            self._findings.fault = wp.zeros((worlds.judged_parts, 1), dtype=int)  # type: ignore[assignment]
-            self._counters = step_types.Counters()
-            self._counters.step, self._counters.episode = wp.zeros(1, dtype=int), wp.zeros(1, dtype=int)
-            self._counters.key = wp.zeros(1, dtype=wp.uint32)
-            self._counters.rng = self._streams.array  # type: ignore[assignment]
+            self._findings = zeros_of(step_types.Findings, 1, fault=(worlds.judged_parts, 1))
+            self._counters = zeros_of(step_types.Counters, 1, rng=(0, 1))
+            self._counters.rng = self._streams.array
 
     def _one(self, array: wp.array) -> wp.array:
         """Return the row of the world. A single row belongs to all worlds."""

@@ -46,6 +46,14 @@ def with_memory(array: wp.array) -> wp.array:
     return alias(wp.zeros(_SPARE, dtype=array.dtype, device=array.device), array.dtype, array.shape)
 
 
+def zeros_of(struct: Any, shape: int = 0, /, **shapes: Any) -> Any:
+    """Make an instance of a struct with arrays of zeros of the given shape. ``shapes`` has other shapes by name."""
+    instance = struct()
+    for name, field in struct.vars.items():
+        setattr(instance, name, wp.zeros(shapes.get(name, shape), dtype=field.type.dtype))
+    return instance
+
+
 def torch_view(array: wp.array) -> torch.Tensor:
     """Return a torch tensor that shares an array's memory."""
     return wp.to_torch(array, requires_grad=False)
