@@ -53,7 +53,7 @@ class Parameters:
         self._task_name, self._model, self._nworld = task_name, model, nworld
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
-        self._arrays: dict[str, tuple[np.ndarray, wp.array]] = {}
+        self._arrays: dict[str, tuple[Any, Any]] = {}
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
@@ -118,7 +118,13 @@ class Parameters:
         shape are copied into the existing table.
         """
         for name, kind in self.tables.items():
-            self._upload(name, kind.dtype, device)
+            value = self.values[name]
+            previous, array = self._arrays.get(name, (None, None))
+            if array is None or previous.shape != value.shape:
+                array = wp.array(value, dtype=kind.dtype, device=device)
+            elif previous is not value:
+                array.assign(value)
+            self._arrays[name] = value, array
         differ = any(name in self._struct.vars for name in self.per_world)
         instances = [self._instance(w) for w in range(self._nworld if differ else 1)]
         return wp.array(instances, dtype=self._struct, device=device)
@@ -129,15 +135,6 @@ class Parameters:
         rows = [np.broadcast_to(self.values[name], count) for name in self._weights]
         table: wp.array = wp.array(np.reshape(rows, (len(rows), count)).T, dtype=float, device=device)
         return table
-
-    def _upload(self, name: str, dtype: type, device: wp.Device) -> None:
-        value = self.values[name]
-        previous, array = self._arrays.get(name, (None, None))
-        if previous is None or array is None or array.device != device or previous.shape != value.shape:
-            self._arrays[name] = value, wp.array(value, dtype=dtype, device=device)
-        elif previous is not value:
-            array.assign(value)
-            self._arrays[name] = value, array
 
     def _check_tables(self) -> None:
         for name, kind in self.tables.items():
@@ -154,16 +151,9 @@ class Parameters:
             return self._table(name, value)
         kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
         text = f"the parameter {name}={value!r} of {self._task_name!r}"
-        field = _element_field(getattr(self._owner, name, None))
-        value = self._indices(text, value, field, whole=kind is wp.int32)
-        try:
-            array = np.asarray(value, dtype=np.float64)  # np.asarray also converts Warp's vectors, lists and tensors
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{text} is not a number: {error}") from error
+        array = self._numbers(name, text, value, whole=kind is wp.int32)
         if np.isnan(array).any():
             raise ValueError(f"{text} is not a number")
-        if field:
-            self._check_index(text, array, field)
         shape = tuple(getattr(kind, "_shape_", ()))
         per_world = (self._nworld, *shape)
         if array.shape not in (shape, per_world):
@@ -184,24 +174,16 @@ class Parameters:
         kind, text = self.tables[name], f"the parameter {name} of {self._task_name!r}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
-        field = _element_field(getattr(self._owner, name, None))
-        value = self._indices(text, value, field, whole=whole)
         if isinstance(value, (str, Path)):
             text += f" from {str(value)!r}"
             value = _loaded(text, value)
-        try:
-            value = value.detach().cpu() if hasattr(value, "detach") else value
-            array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{text} must be a table of numbers: {error}") from error
+        array = self._numbers(name, text, value, whole=whole)
         with np.errstate(over="ignore", invalid="ignore"):
             table: np.ndarray = array.astype(np.int32 if whole else np.float32)
         axes = kind.ndim + len(element)
         if table.ndim != axes or table.shape[kind.ndim :] != element or not table.size:
             last = f", the last {element}" if element else ""
             raise ValueError(f"{text} has shape {table.shape}: it takes {axes} axes{last}, with no axis of length 0")
-        if field:
-            self._check_index(text, array, field)
         bad = table != array if whole else ~np.isfinite(table)
         if bad.any():
             place = np.argwhere(bad)[0].tolist()
@@ -209,6 +191,23 @@ class Parameters:
             raise ValueError(f"{text} has {array[tuple(place)]} at {place}: it must be {number}")
         table.flags.writeable = False
         return table
+
+    def _numbers(self, name: str, text: str, value: Any, *, whole: bool) -> np.ndarray:
+        """Convert a value to an array of float64, and elements of the model to their indices."""
+        field = _element_field(getattr(self._owner, name, None))
+        value = self._indices(text, value, field, whole=whole)
+        try:
+            value = value.detach().cpu() if hasattr(value, "detach") else value
+            array = np.asarray(value.numpy() if isinstance(value, wp.array) else value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{text} must be numbers: {error}") from error
+        if field:
+            if field not in self._sizes:
+                self._sizes[field] = rows(self._model, field)
+            if ((array < 0) | (array >= self._sizes[field])).any():
+                last = self._sizes[field] - 1
+                raise ValueError(f"{text} is not an index of {field!r}: give an index from 0 to {last}, or a name")
+        return array
 
     def _indices(self, text: str, value: Any, field: str | None, *, whole: bool) -> Any:
         """Replace model elements by their indices. With ``field``, also replace the elements' names."""
@@ -219,13 +218,6 @@ class Parameters:
                 raise ValueError(f"{text} can't be an element of {value.field!r}: it takes {field or 'numbers'}")
             return elements(self._model, value.field, value.name).start
         return elements(self._model, field, value).start if field and isinstance(value, str) else value
-
-    def _check_index(self, text: str, array: np.ndarray, field: str) -> None:
-        if field not in self._sizes:
-            self._sizes[field] = rows(self._model, field)
-        count = self._sizes[field]
-        if ((array < 0) | (array >= count)).any():
-            raise ValueError(f"{text} is not an index of {field!r}: give an index from 0 to {count - 1}, or a name")
 
     def _instance(self, world: int) -> Any:
         instance = self._struct()
