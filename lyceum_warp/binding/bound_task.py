@@ -78,10 +78,7 @@ class BoundTask:
         ]
         self._sort_model_fields(model_fields, dynamics)
 
-        self.parameters = Parameters(
-            source.params, source.defaults, self.name, self.model, nworld=nworld, timestep=self.timestep,
-            values=params or {}, weights=source.terms.weights,
-        )  # fmt: skip
+        self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
         self.actions = self._actions()
         """The size of each part of an action, or None if the actions are MuJoCo's controls."""
         self.memory, self.shared = self._memory_layouts(), self._shared_layouts()

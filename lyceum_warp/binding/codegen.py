@@ -8,7 +8,7 @@ import dataclasses
 import threading
 from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import warp as wp
@@ -41,12 +41,11 @@ _kernels: dict[Any, task_kernels.Kernels] = {}
 _MAKING = threading.RLock()
 
 
-def kernels_of(
-    source: TaskSource,
-    groups: Mapping[str, wp.Function],
-    memory: Mapping[str, Layout],
-    structs: Mapping[str, Layout],
-) -> task_kernels.Kernels:
+Groups: TypeAlias = Mapping[str, wp.Function]
+Layouts: TypeAlias = Mapping[str, Layout]
+
+
+def kernels_of(source: TaskSource, groups: Groups, memory: Layouts, structs: Layouts) -> task_kernels.Kernels:
     """Return a task's kernels. Tasks with the same functions, structs and sizes share their kernels."""
     layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
     terms = (source.terms.text, *source.terms.functions.items())
@@ -69,13 +68,7 @@ class _Generator:
         structs: The layouts of ``Shared``, ``Sums``, and the observation groups that are structs.
     """
 
-    def __init__(
-        self,
-        source: TaskSource,
-        groups: Mapping[str, wp.Function],
-        memory: Mapping[str, Layout],
-        structs: Mapping[str, Layout],
-    ) -> None:
+    def __init__(self, source: TaskSource, groups: Groups, memory: Layouts, structs: Layouts) -> None:
         self._source, self._groups, self._memory, self._structs = source, groups, memory, structs
         self._texts: list[str] = []
         self._scope = _HELPERS | {"World": source.world, "Params": source.params}

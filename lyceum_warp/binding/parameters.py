@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.core.fields import elements, rows
 from lyceum_warp.core.options import OPTIONS, suggestion
 from lyceum_warp.core.task import Element, FromModel
@@ -32,25 +33,15 @@ class Parameters:
 
     A table is a field that is itself an array, such as ``motion: wp.array2d[float]``. All worlds share it.
 
-    Args:
-        owner: The class with the defaults as attributes.
-        weights: The weights of the task's terms, which are set like parameters.
+    The weights of the task's terms are set like parameters.
     """
 
     def __init__(
-        self,
-        struct: Any,
-        owner: type,
-        task_name: str,
-        model: mujoco.MjModel,
-        *,
-        nworld: int,
-        timestep: float,
-        values: Mapping[str, Any],
-        weights: Mapping[str, float] | None = None,
+        self, source: TaskSource, model: mujoco.MjModel, values: Mapping[str, Any], *, nworld: int, timestep: float
     ) -> None:
-        self._struct, self._owner, self._weights = struct, owner, dict(weights or {})
-        self._task_name, self._model, self._nworld = task_name, model, nworld
+        self._struct, self._owner, self._weights = source.params, source.defaults, source.terms.weights
+        self._task_name, self._model, self._nworld = source.name, model, nworld
+        struct, task_name = self._struct, self._task_name
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
         self._arrays: dict[str, tuple[Any, Any]] = {}
@@ -60,7 +51,9 @@ class Parameters:
                 f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so "
                 f"make() would set the option: rename it in Params"
             )
-        initial = defaults(struct, owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        initial = (
+            defaults(struct, self._owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        )
         self._computed = {name for name, value in initial.items() if isinstance(value, FromModel)}
         names = (*struct.vars, *self._weights)
         self.values: dict[str, Any] = {name: initial[name] for name in names if name in initial}

@@ -1,4 +1,5 @@
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -46,7 +47,9 @@ def model() -> mujoco.MjModel:
 
 
 def parameters(model: mujoco.MjModel, struct: Any = Params, nworld: int = 2, **given: Any) -> Parameters:
-    return Parameters(struct, struct.cls, "arm", model, nworld=nworld, timestep=0.02, values=given)
+    terms = SimpleNamespace(weights={})
+    source: Any = SimpleNamespace(params=struct, defaults=struct.cls, name="arm", terms=terms)
+    return Parameters(source, model, given, nworld=nworld, timestep=0.02)
 
 
 def test_defaults_come_from_the_struct_and_dt_equals_the_timestep(model: mujoco.MjModel) -> None:
