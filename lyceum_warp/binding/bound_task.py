@@ -81,9 +81,9 @@ class BoundTask:
         self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
         self.actions = self._actions()
         """The size of each part of an action, or None if the actions are MuJoCo's controls."""
-        self.memory, self.shared = self._memory_layouts(), self._shared_layouts()
-        """The layouts of ``memory`` and ``lasting_memory``, and those of ``Shared`` and ``Sums``."""
-        self.obs_layouts = obs_layouts(source, self.params)
+        self.obs_layouts, self.memory, self.shared = self._layouts()
+        """The layouts of the observation groups, of ``memory`` and ``lasting_memory``, and of ``Shared`` and ``Sums``.
+        """
         self.observers = source.observers(self.obs_layouts)
         source.check_bodies(self.observers)
         structs = obs_slices(source, self.params) | self.shared
@@ -108,16 +108,11 @@ class BoundTask:
         """The observation groups whose functions draw random numbers."""
         return [group for group, function in self.observers.items() if draws_noise(function)]
 
-    def _memory_layouts(self) -> dict[str, parts.Layout]:
-        return {name: parts.layout(self.source.world, name, self.params, "World") for name in MEMORIES}
-
-    def _shared_layouts(self) -> dict[str, parts.Layout]:
-        structs = {"Shared": self.source.shared, "Sums": self.source.sums}
-        return {
-            name: parts.layout(struct, "obs", self.params, name)
-            for name, struct in structs.items()
-            if struct is not None
-        }
+    def _layouts(self) -> tuple[dict[str, dict[str, int]], dict[str, parts.Layout], dict[str, parts.Layout]]:
+        source, params = self.source, self.params
+        memory = {name: parts.layout(source.world, name, params, "World") for name in MEMORIES}
+        shared = {name: parts.layout(kind, "obs", params, name) for name, kind in source.shared_structs.items()}
+        return obs_layouts(source, params), memory, shared
 
     def _sort_model_fields(self, names: list[str], dynamics: Collection[str]) -> None:
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
@@ -158,8 +153,7 @@ class BoundTask:
         """Change parameters."""
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
-            layouts = obs_layouts(self.source, self.params), self._memory_layouts(), self._shared_layouts()
-            changes = layouts != (self.obs_layouts, self.memory, self.shared)
+            changes = self._layouts() != (self.obs_layouts, self.memory, self.shared)
         except ValueError:  # the size of a part would differ between worlds
             changes = True
         if changes:

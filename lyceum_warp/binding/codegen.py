@@ -72,7 +72,7 @@ class _Generator:
         self._source, self._groups, self._memory, self._structs = source, groups, memory, structs
         self._texts: list[str] = []
         self._scope = _HELPERS | {"World": source.world, "Params": source.params}
-        self._scope |= {"Shared": source.shared, "Sums": source.sums}
+        self._scope |= {"Shared": None, "Sums": None} | source.shared_structs
 
     def run(self) -> dict[str, Any]:
         """Return the fields of ``TaskCode`` by name, among other names."""
@@ -105,8 +105,9 @@ class _Generator:
 
     def _row_views(self) -> None:
         """Generate functions that return a struct whose fields are slices of a row."""
-        structs = {"Shared": self._source.shared, "Sums": self._source.sums}
-        structs |= {group: list(function.input_types.values())[2] for group, function in self._groups.items()}
+        structs = self._source.shared_structs | {
+            group: list(function.input_types.values())[2] for group, function in self._groups.items()
+        }
         for name, layout in self._structs.items():
             self._scope[f"Struct_{name}"] = structs[name]
             lines = view_lines(layout, f"struct_{name}", "row", self._scope)
@@ -120,7 +121,7 @@ class _Generator:
         fields: list[str] = []
         rows: list[str] = []
         copies: list[str] = []
-        if self._source.shared is not None:
+        if self._source.shared_structs:
             fields.append("shared: type_row")
             rows.append("s.shared = view_Shared(batch.shared[0])")
         for name, kind in self._source.types.items():

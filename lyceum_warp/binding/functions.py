@@ -58,7 +58,8 @@ class TaskSource:
         self.params: Any = self._with_functions(declared)
         self._variant = variant_of(name, self._owners, self.world, self.params, declared)
         self.memory: dict[str, Part] = parts_of(self.world, "World")
-        self.shared, self.sums = self._shared_structs()
+        self.shared_structs = self._shared_structs()
+        """``Shared`` and ``Sums`` by name, or nothing."""
         self.types = self._field_types()
         """The types of World's fields and of each kind of memory, by name."""
         self.functions = {name: self._function(form) for name, form in FUNCTIONS.items()}
@@ -172,10 +173,10 @@ class TaskSource:
                 return struct
         return declared
 
-    def _shared_structs(self) -> tuple[Any, Any]:
+    def _shared_structs(self) -> dict[str, Any]:
         field, tally, share = self.world.vars.get("shared"), self._look_up("tally"), self._look_up("share")
         if field is None and tally is None and share is None:
-            return None, None
+            return {}
         structs = [list(function.input_types.values())[i] for function, i in ((tally, 5), (share, 1))
                    if isinstance(function, wp.Function) and len(function.input_types) > i]  # fmt: skip
         if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
@@ -184,7 +185,7 @@ class TaskSource:
                 f"World.shared of the type Shared, and the functions {FUNCTIONS['tally'].signature} and "
                 f"{FUNCTIONS['share'].signature}"
             )
-        return field.type, structs[0]
+        return {"Shared": field.type, "Sums": structs[0]}
 
     def _field_types(self) -> dict[str, Any]:
         for name, part in self.memory.items():
@@ -195,8 +196,8 @@ class TaskSource:
                     f"the memory World.{name} of the task {self.name!r} has the name of an existing field or part of "
                     "the state: rename it"
                 )
-        shared = ["shared"] if self.shared is not None else []
-        types = {name: v.type for name, v in self.world.vars.items() if name not in (*self.memory, *shared)}
+        known = (*self.memory, "shared") if self.shared_structs else self.memory
+        types = {name: v.type for name, v in self.world.vars.items() if name not in known}
         for name in types:
             check_field_name(name)
         kinds = {part.kind for part in self.memory.values()}
@@ -247,8 +248,8 @@ class TaskSource:
 
     def _kind(self, argument: Any) -> str:
         """Return an argument's type as ``FUNCTIONS`` writes it, such as "World" or "Row[float]"."""
-        structs = {"World": self.world, "Params": self.params, "Shared": self.shared, "Sums": self.sums}
-        if names := [name for name, struct in structs.items() if struct is not None and argument is struct]:
+        structs = {"World": self.world, "Params": self.params, **self.shared_structs}
+        if names := [name for name, struct in structs.items() if argument is struct]:
             return names[0]
         if is_struct(argument) and not hasattr(self.definition, "obs"):
             return "Row[float]"
