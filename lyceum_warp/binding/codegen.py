@@ -117,7 +117,7 @@ class _Generator:
             )
 
     def _batch(self) -> None:
-        """Generate the struct of all worlds' fields, the view of one world, and the copy of a world's state."""
+        """Generate the structs of all worlds' fields, the view of one world, and the copy of a world's state."""
         fields: list[str] = []
         rows: list[str] = []
         copies: list[str] = []
@@ -136,6 +136,10 @@ class _Generator:
                 copies += _copy(name, ndim)
         self._struct("Batch", fields)
         self._function("view(batch: Batch, w: int) -> World", ["s = World()", *rows, "return s"])
+        self._scope["type_params"] = wp.array(dtype=self._source.params)
+        arrays = ["params: type_params", "weights: type_row", "action: type_row", "counters: Counters"]
+        self._struct("Transition", ["before: Batch", "after: Batch", *arrays])
+        self._function("params_of(t: Transition, w: int) -> Params", ["return t.params[w % t.params.shape[0]]"])
         self._function("copy_state(source: Batch, target: Batch, w: int, lane: int, lanes: int)", copies or ["pass"])
         self._scope["has_state"] = bool(copies)
 

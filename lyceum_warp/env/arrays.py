@@ -69,7 +69,9 @@ class WorldArrays:
         self._clearable = {name: getattr(self, name) for name in own}
         self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        self.after, self.before = kernels.Batch(), kernels.Batch()
+        self.transition = kernels.Transition()
+        """The arrays of the last step, which the kernels of the task use."""
+        self.after, self.before = self.transition.after, self.transition.before
         self._copies: dict[str, wp.array] = {}
         constant = {f.name: shared_rows(f.value(model), f.dtype, n, self.device) for f in self.task.constants}
         varied = [field.name for field in self.task.dynamics]
@@ -88,6 +90,7 @@ class WorldArrays:
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
         self.weights = self.task.parameters.weights(self.device)
+        self.transition.params, self.transition.weights = self.params, self.weights
         self.action_space = action_space(model, task.action_range, self.task.actions)
         self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
@@ -126,6 +129,7 @@ class WorldArrays:
         n, model, task = self.nworld, self.task.model, self.task.definition
         naction = self.action_space.size
         self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
+        self.transition.action = self.safe_action
         self.buffers["action"] = torch_view(self.action)
         ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
         if self.task.functions["control"] is None:
@@ -136,6 +140,7 @@ class WorldArrays:
     def _allocate_counters(self) -> None:
         n = self.nworld
         self.counters = zeros_of(step_types.Counters, n, rng=(len(self.obs_spaces) * n, 1))
+        self.transition.counters = self.counters
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
         self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)

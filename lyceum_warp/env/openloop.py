@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import Any
 
 import torch
 import warp as wp
@@ -111,11 +110,14 @@ class OpenLoop:
             self._obs = zeros_of(task.kernels.Observations, **shapes)
             self._finite = wp.zeros((len(env.obs_spaces), n), dtype=bool)
             self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # for each field, _before, _after and _last are views of one buffer
+            # for each field, the rows before and after the steps, and the last rows, are views of one buffer
             self._fields: dict[str, wp.array] = {}
-            self._before, self._after, self._last = (task.kernels.Batch() for _ in range(3))
+            self._rows, self._last = task.kernels.Transition(), task.kernels.Transition()
+            self._rows.action = self._actions.reshape((-1, nact))
+            self._rows.counters = self._last.counters = self.worlds.counters
+            batches = (self._rows.before, self._rows.after, self._last.after)
             if task.shared:
-                for batch in (self._before, self._after, self._last):
+                for batch in batches:
                     batch.shared = self.worlds.shared
             constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
             for name in task.types:
@@ -124,7 +126,7 @@ class OpenLoop:
                 if buffer is None:
                     buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
                     self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
-                for batch, start in ((self._before, 0), (self._after, n), (self._last, rows)):
+                for batch, start in zip(batches, (0, n, rows), strict=True):
                     # Warp cannot slice an array without elements
                     part = buffer[start : min(start + rows, rows + n)] if buffer.size else with_memory(buffer)
                     setattr(batch, name, part)
@@ -184,7 +186,7 @@ class OpenLoop:
                 *worlds.physics_phases(),
                 Phase("judge", partial(self._judge_step, t)),
             ]
-        return (*phases, Phase("end", partial(self._end, worlds.after)))
+        return (*phases, Phase("end", partial(self._end, worlds.transition)))
 
     def _start(self) -> None:
         worlds, device = self.worlds, self.env.device
@@ -204,14 +206,11 @@ class OpenLoop:
             columns = worlds.state[:, self.env.state_space.parts[name]]
             rows = flat(buffer).reshape((*buffer.shape[:2], -1))
             wp.launch(rollouts.repeat_columns, rows.shape, [columns, rows], device=device)
+        for transition in (self._rows, self._last):  # env.set_params may have replaced the arrays
+            transition.params, transition.weights = worlds.params, worlds.weights
         self._fault.zero_()
         args = [self._actions, worlds.ranges, worlds.scale, self._fault, self._controls]
         wp.launch(rollouts.controls, self._actions.shape[:2], args, device=device)
-
-    def _transitions(self) -> list[Any]:
-        """Get states before and after all transitions, the parameters, and the actions."""
-        actions = self._actions.reshape((-1, self._actions.shape[2]))
-        return [self._before, self._after, self.worlds.params, actions]
 
     def _advance_memory(self) -> None:
         n, kernels = self.env.nworld, self.env.task.kernels
@@ -221,17 +220,15 @@ class OpenLoop:
                 self._memories[name].reshape((rows, -1)) if name in self._memories else self._no_memory
                 for name in MEMORIES
             ]
-            args = [*self._transitions(), self.worlds.counters, *memories]
-            launch_worlds(kernels.advance_rows, n, args, self.env.device)
+            launch_worlds(kernels.advance_rows, n, [self._rows, *memories], self.env.device)
         else:
             for buffer in self._memories.values():
                 for t in range(self.horizon):
                     wp.copy(buffer[t + 1], buffer[0])
 
     def _judge_rows(self) -> None:
-        rows, (*batches, actions) = self.horizon * self.env.nworld, self._transitions()
-        args = [*batches, self.worlds.weights, actions, self._reward, self._terminated]
-        launch_worlds(self.env.task.kernels.judge_rows, rows, args, self.env.device)
+        args = [self._rows, self._reward, self._terminated]
+        launch_worlds(self.env.task.kernels.judge_rows, self.horizon * self.env.nworld, args, self.env.device)
 
     def _end_of_horizon(self) -> None:
         wp.launch(rollouts.add_to, self.env.nworld, [self.horizon, self.worlds.counters.step], device=self.env.device)
@@ -245,13 +242,12 @@ class OpenLoop:
         worlds, n = self.worlds, self.env.nworld
         worlds.advance_memory()
         rows = slice(t * n, (t + 1) * n)
-        args = [worlds.before, worlds.after, worlds.params, worlds.weights, worlds.safe_action]
-        args += [self._reward[rows], self._terminated[rows]]
+        args = [worlds.transition, self._reward[rows], self._terminated[rows]]
         launch_worlds(self.env.task.kernels.judge_rows, n, args, self.env.device)
 
-    def _end(self, batch: object) -> None:
+    def _end(self, transition: object) -> None:
         worlds, n, device = self.worlds, self.env.nworld, self.env.device
         self.env.engine.find_faults(worlds.everyone)
         wp.launch(rollouts.merge_faults, n, [self.env.engine.fault, self._fault], device=device)
-        args = [worlds.everyone, batch, worlds.params, worlds.counters, self._obs, self._finite, self._obs, 1]
+        args = [worlds.everyone, transition, self._obs, self._finite, self._obs, 1]
         launch_parts(self.env.task.kernels.observe_worlds, 1, n, args, device)

@@ -116,14 +116,14 @@ class _Run:
     def __init__(self, worlds: WorldArrays, world: int, guard: int) -> None:
         self._worlds, self._world, self._guard = worlds, world, guard
         self._task = task = worlds.task
-        self._params, self._weights = self._one(worlds.params), self._one(worlds.weights)
-        self._before, self._state, self._fields = task.kernels.Batch(), task.kernels.Batch(), dict[str, GuardedRows]()
+        self._transition, self._fields = task.kernels.Transition(), dict[str, GuardedRows]()
+        self._transition.params, self._transition.weights = self._one(worlds.params), self._one(worlds.weights)
         for name in task.kernels.Batch.vars:
             array = self._one(getattr(worlds.after, name))
             self._fields[name] = self._rows((1, *array.shape[1:]), array.dtype, array)
-            setattr(self._state, name, self._fields[name].array)
+            setattr(self._transition.after, name, self._fields[name].array)
             before = self._rows((1, *array.shape[1:]), array.dtype, array) if name in MEMORIES else self._fields[name]
-            setattr(self._before, name, before.array)
+            setattr(self._transition.before, name, before.array)
         self._observations, self.groups = task.kernels.Observations(), dict[str, GuardedRows]()
         for group, layout in task.obs_layouts.items():
             self.groups[group] = self._rows((1, sum(layout.values())))
@@ -138,8 +138,9 @@ class _Run:
             self._no_fault = wp.zeros(1, dtype=int)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
             self._findings = zeros_of(step_types.Findings, 1, fault=(worlds.judged_parts, 1))
-            self._counters = zeros_of(step_types.Counters, 1, rng=(0, 1))
-            self._counters.rng = self._streams.array
+            self._transition.counters = zeros_of(step_types.Counters, 1, rng=(0, 1))
+        self._transition.counters.rng = self._streams.array
+        self._transition.action = self._action.array
 
     def _one(self, array: wp.array) -> wp.array:
         """Return the row of the world. A single row belongs to all worlds."""
@@ -150,45 +151,43 @@ class _Run:
 
     def all_functions(self) -> Results:
         """Call each function, and yield what it wrote. Raise a ValueError if it wrote out of range."""
-        kernels, s0, s, p = self._task.kernels, self._before, self._state, self._params
-        action = self._action.array
+        kernels, t = self._task.kernels, self._transition
         shared = self._fields.get("shared")
         yield from self.judge()
         if self._task.functions["control"] is not None:
             worlds, fault = self._worlds, wp.clone(self._no_fault)
-            self._launch(kernels.act, s, p, self._one(worlds.action), worlds.ranges, worlds.scale, self._counters,
-                         action, fault, self._ctrl.array)  # fmt: skip
+            action = self._one(worlds.action)
+            self._launch(kernels.act, t, action, worlds.ranges, worlds.scale, fault, self._ctrl.array)
             yield self._checked("control", self._ctrl, "ctrl", f"the model has {self._ctrl.size}")
             yield from self._written_fields("control")
-        self._launch(kernels.substep_memory, s, p)
+        self._launch(kernels.substep_memory, t.after, t.params)
         yield from self._written_fields("substep")
-        self._launch(kernels.advance_memory, s0, s, p, action, self._counters)
+        self._launch(kernels.advance_memory, t)
         yield from self._written_fields("advance")
         if shared is not None:
             declared = f"Sums declares {self._sums.size}"
-            self._launch(kernels.tally_worlds, s0, s, p, action, self._no_fault, self._sums.array, self._totals)
+            self._launch(kernels.tally_worlds, t, self._no_fault, self._sums.array, self._totals)
             yield self._checked("tally", self._sums, "sums", declared)
-            self._launch(kernels.share_memory, self._totals, self._sums.array, p, shared.array)
+            self._launch(kernels.share_memory, self._totals, self._sums.array, t.params, shared.array)
             yield self._checked("share", self._sums, "sums", declared)
             yield self._checked("share", shared, "shared", f"Shared declares {shared.size}")
         masks = [wp.clone(self._no) for _ in range(4)]
-        self._launch(kernels.run_events, self._no, s, p, self._counters, *masks)
+        self._launch(kernels.run_events, self._no, t, *masks)
         yield from self._written_fields("event")
-        self._launch(kernels.start_worlds, self._yes, s, p, self._counters)
+        self._launch(kernels.start_worlds, self._yes, t)
         yield from self._written_fields("startup")
         for function, random in (("initialize", False), ("randomize", True)):
-            self._launch(kernels.restart, self._yes, random, False, s, p, self._counters)
+            self._launch(kernels.restart, self._yes, random, False, t)
             yield from self._written_fields(function)
         rejected = wp.clone(self._no)
-        self._launch(kernels.reject_worlds, self._yes, s, p, rejected)
+        self._launch(kernels.reject_worlds, self._yes, t.after, t.params, rejected)
         yield "reject", rejected.numpy()
 
     def judge(self) -> Results:
         """Call the functions that judge a transition and observe a state, and yield what each of them wrote."""
-        launch_parts(self._task.kernels.judge, 1, 1, [
-            self._yes, self._before, self._state, self._params, self._weights, self._action.array, self._counters, True,
-            self._no_fault, self._no_fault, self._findings, self._metrics.array, self._observations, 1,
-        ], self._worlds.device)  # fmt: skip
+        args = [self._yes, self._transition, True, self._no_fault, self._no_fault, self._findings]
+        args += [self._metrics.array, self._observations, 1]
+        launch_parts(self._task.kernels.judge, 1, 1, args, self._worlds.device)
         for group, rows in self.groups.items():
             yield self._checked(observer_name(group), rows, "", f"obs declares {rows.size}")
         yield "observe", self._streams.words()

@@ -40,8 +40,7 @@ class Resets(WorldArrays):
         self._clear(self.mask, "lasting_memory")
         self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
         if self.task.kernels.start_worlds is not None:
-            args = [self.mask, self.after, self.params, self.counters]
-            launch_worlds(self.task.kernels.start_worlds, self.nworld, args, self.device)
+            launch_worlds(self.task.kernels.start_worlds, self.nworld, [self.mask, self.transition], self.device)
         if self.task.dynamics:
             self.engine.apply_model(self.mask)
 
@@ -53,7 +52,7 @@ class Resets(WorldArrays):
             backup, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((backup, live) if again else (live, backup)))
         self._make_nominal(mask, self.task.reset_dynamics)
-        args = [mask, randomly, again, self.after, self.params, self.counters]
+        args = [mask, randomly, again, self.transition]
         launch_worlds(self.task.kernels.restart, self.nworld, args, self.device)
         self.engine.commit(mask)
 

@@ -188,10 +188,8 @@ class Worlds(Resets):
     def act(self) -> None:
         """Copy the state before the step, and convert actions to controls."""
         self.keep_before()
-        launch_worlds(self.task.kernels.act, self.nworld, [
-            self.after, self.params, self.action, self.ranges, self.scale, self.counters, self.safe_action,
-            self._action_fault, self.engine.ctrl,
-        ], self.device)  # fmt: skip
+        args = [self.transition, self.action, self.ranges, self.scale, self._action_fault, self.engine.ctrl]
+        launch_worlds(self.task.kernels.act, self.nworld, args, self.device)
         if (check_model := self.task.kernels.check_model) is not None:
             launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
 
@@ -208,12 +206,10 @@ class Worlds(Resets):
     def advance_memory(self) -> None:
         """Advance the task's memory by a step."""
         if (advance := self.task.kernels.advance_memory) is not None:
-            args = [self.before, self.after, self.params, self.safe_action, self.counters]
-            launch_worlds(advance, self.nworld, args, self.device)
+            launch_worlds(advance, self.nworld, [self.transition], self.device)
 
     def _tally(self, kernel: wp.Kernel) -> None:
-        reason = self.outcome.done_reason
-        args = [self.before, self.after, self.params, self.safe_action, reason, self._shares, self.sums]
+        args = [self.transition, self.outcome.done_reason, self._shares, self.sums]
         launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge(
@@ -221,15 +217,12 @@ class Worlds(Resets):
     ) -> None:
         kernels = self.task.kernels
         if kernels.check_memory is not None:
-            launch_lanes(kernels.check_memory, self.nworld, [mask, self.before, self.after, fault], self.device)
-        launch_parts(kernels.judge, self._judging, self.nworld, [
-            mask, self.before, self.after, self.params, self.weights, self.safe_action, self.counters, transition,
-            fault, action_fault, self._found, self.metrics, self.final_obs, self._judging,
-        ], self.device)  # fmt: skip
+            launch_lanes(kernels.check_memory, self.nworld, [mask, self.transition, fault], self.device)
+        args = [mask, self.transition, transition, fault, action_fault, self._found, self.metrics, self.final_obs]
+        launch_parts(kernels.judge, self._judging, self.nworld, [*args, self._judging], self.device)
         launch_lanes(kernels.conclude, self.nworld, [
-            mask, self.before, self.params, self._found, self.counters.step, self.horizon, transition, keep_reason,
-            fault, action_fault, self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting,
-            self.fault_count,
+            mask, self.transition, self._found, self.horizon, transition, keep_reason, fault, action_fault,
+            self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting, self.fault_count,
         ], self.device)  # fmt: skip
         self._hold_success(mask, transition=transition)
 
@@ -246,8 +239,7 @@ class Worlds(Resets):
         for name, copy in before.items():
             wp.copy(copy, live[name])
         launch_worlds(kernel, self.nworld, [
-            self.restarting, self.after, self.params, self.counters, self._continuing, self._physics_changed,
-            self._changed, self._outdated,
+            self.restarting, self.transition, self._continuing, self._physics_changed, self._changed, self._outdated,
         ], self.device)  # fmt: skip
         for name, copy in before.items():
             self._mark_changes(copy, live[name], physics=name not in MEMORIES)
@@ -263,7 +255,7 @@ class Worlds(Resets):
     def _observe(self, mask: wp.array) -> None:
         """Write new observations of the masked worlds after a restart or an event."""
         kernels, finite, parts = self.task.kernels, self._finite_obs, self._observing
-        args = [mask, self.after, self.params, self.counters, self.final_obs, finite, self.obs, parts]
+        args = [mask, self.transition, self.final_obs, finite, self.obs, parts]
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
         if parts > 1:
             args = [mask, finite, self.final_obs, self.obs]
@@ -298,5 +290,6 @@ class Worlds(Resets):
                 wp.copy(getattr(self, name), array)
                 continue
             setattr(self, name, array)
+            setattr(self.transition, name, array)
             for programs in self._programs.values():
                 programs.graphs.forget()

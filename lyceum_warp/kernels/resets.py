@@ -3,7 +3,7 @@
 import warp as wp
 
 from lyceum_warp.kernels.random import stream
-from lyceum_warp.kernels.step_types import Counters, TaskCode
+from lyceum_warp.kernels.step_types import TaskCode
 
 STARTUP = wp.constant(-1)
 """Replaces the episode number in the random stream of ``startup``."""
@@ -11,25 +11,15 @@ STARTUP = wp.constant(-1)
 
 def make_reset_kernels(task: TaskCode) -> None:
     @task.kernel_for("startup")
-    def start_worlds(
-        mask_in: wp.array[bool], batch: task.Batch, params: wp.array[task.Params], counters: Counters, first: int
-    ):
+    def start_worlds(mask_in: wp.array[bool], t: task.Transition, first: int):
         """Call ``startup`` in the masked worlds; launched over (nworld,)."""
         w = first + wp.tid()
         if mask_in[w]:
-            counters.rng[w, 0] = stream(counters.key[w], STARTUP, 0)
-            task.functions.startup(task.view(batch, w), params[w % params.shape[0]], counters.rng[w])
+            t.counters.rng[w, 0] = stream(t.counters.key[w], STARTUP, 0)
+            task.functions.startup(task.view(t.after, w), task.params_of(t, w), t.counters.rng[w])
 
     @task.kernel()
-    def restart(
-        mask_in: wp.array[bool],
-        random: bool,
-        again: bool,
-        batch: task.Batch,
-        params: wp.array[task.Params],
-        counters: Counters,
-        first: int,
-    ):
+    def restart(mask_in: wp.array[bool], random: bool, again: bool, t: task.Transition, first: int):
         """Begin an episode in the masked worlds, or draw another initial state; launched over (nworld,).
 
         The engine has already reset these worlds to the fixed initial state. Another initial state is drawn with the
@@ -39,14 +29,13 @@ def make_reset_kernels(task: TaskCode) -> None:
         if not mask_in[w]:
             return
         if not again:
-            counters.step[w] = 0
-            counters.episode[w] = counters.episode[w] + 1
-            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], 0)
-        p = params[w % params.shape[0]]
-        s = task.view(batch, w)
+            t.counters.step[w] = 0
+            t.counters.episode[w] = t.counters.episode[w] + 1
+            t.counters.rng[w, 0] = stream(t.counters.key[w], t.counters.episode[w], 0)
+        s, p = task.view(t.after, w), task.params_of(t, w)
         task.functions.initialize(s, p)
         if random:
-            task.functions.randomize(s, p, counters.rng[w])
+            task.functions.randomize(s, p, t.counters.rng[w])
 
     @task.kernel_for("reject")
     def reject_worlds(

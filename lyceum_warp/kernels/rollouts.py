@@ -9,7 +9,7 @@ import warp as wp
 from lyceum_warp.core.done import Done
 from lyceum_warp.kernels.random import stream
 from lyceum_warp.kernels.rows import copy_row
-from lyceum_warp.kernels.step_types import Counters, TaskCode
+from lyceum_warp.kernels.step_types import TaskCode
 
 ACTION = wp.constant(int(Done.ACTION))
 
@@ -101,45 +101,28 @@ def merge_faults(fault_in: wp.array[int], fault_inout: wp.array[int]):
 
 def make_rollout_kernels(task: TaskCode) -> None:
     @task.kernel()
-    def judge_rows(
-        before: task.Batch,
-        after: task.Batch,
-        params: wp.array[task.Params],
-        weights_in: wp.array2d[float],
-        action_in: wp.array2d[float],
-        reward_out: wp.array[float],
-        terminated_out: wp.array[bool],
-        first: int,
-    ):
+    def judge_rows(t: task.Transition, reward_out: wp.array[float], terminated_out: wp.array[bool], first: int):
         """Compute reward and termination of a rollout's transitions; launched over (steps * nworld,)."""
         row = first + wp.tid()
-        p = params[row % params.shape[0]]
-        s0, s1 = task.view(before, row), task.view(after, row)
+        s0, s1, p = task.view(t.before, row), task.view(t.after, row), task.params_of(t, row)
         if wp.static(hasattr(task.terms, "reward")):
-            weights = weights_in[row % weights_in.shape[0]]
-            reward_out[row] = task.terms.reward(s0, action_in[row], s1, p, weights)
+            weights = t.weights[row % t.weights.shape[0]]
+            reward_out[row] = task.terms.reward(s0, t.action[row], s1, p, weights)
         else:
-            reward_out[row] = task.functions.reward(s0, action_in[row], s1, p)
+            reward_out[row] = task.functions.reward(s0, t.action[row], s1, p)
         terminated_out[row] = task.functions.terminated(s1, p)
 
     @task.kernel_for("advance")
     def advance_rows(
-        before: task.Batch,
-        after: task.Batch,
-        params: wp.array[task.Params],
-        action_in: wp.array2d[float],
-        counters: Counters,
-        memory_inout: wp.array2d[float],
-        lasting_memory_inout: wp.array2d[float],
-        first: int,
+        t: task.Transition, memory_inout: wp.array2d[float], lasting_memory_inout: wp.array2d[float], first: int
     ):
         """Advance the task's memory along a rollout; launched over (nworld,), one thread for all steps of a world."""
         w = first + wp.tid()
-        n = counters.step.shape[0]
-        p = params[w % params.shape[0]]
-        for t in range(action_in.shape[0] // n):
-            row = t * n + w
+        n, p = t.counters.step.shape[0], task.params_of(t, w)
+        for i in range(t.action.shape[0] // n):
+            row = i * n + w
             copy_row(memory_inout[row], memory_inout[row + n], 0, 1)
             copy_row(lasting_memory_inout[row], lasting_memory_inout[row + n], 0, 1)
-            counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w] + t + 1)
-            task.functions.advance(task.view(before, row), action_in[row], task.view(after, row), p, counters.rng[w])
+            t.counters.rng[w, 0] = stream(t.counters.key[w], t.counters.episode[w], t.counters.step[w] + i + 1)
+            s0, s1 = task.view(t.before, row), task.view(t.after, row)
+            task.functions.advance(s0, t.action[row], s1, p, t.counters.rng[w])

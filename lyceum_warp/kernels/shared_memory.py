@@ -18,10 +18,7 @@ def make_shared_memory_kernels(task: TaskCode) -> None:
 
     @task.kernel_for("tally")
     def tally_worlds(
-        before: task.Batch,
-        after: task.Batch,
-        params: wp.array[task.Params],
-        action_in: wp.array2d[float],
+        t: task.Transition,
         reason_in: wp.array[int],
         share_out: wp.array2d[float],
         sum_inout: wp.array[wp.int64],
@@ -32,12 +29,12 @@ def make_shared_memory_kernels(task: TaskCode) -> None:
         for i in range(share_out.shape[1]):
             share_out[w, i] = 0.0
         if (reason_in[w] & ALL_FAULTS) == 0:
-            s0, s1, p = task.view(before, w), task.view(after, w), params[w % params.shape[0]]
+            s0, s1, p = task.view(t.before, w), task.view(t.after, w), task.params_of(t, w)
             ended, sums = reason_in[w] != 0, view_sums(share_out[w])
             if wp.static(tells_failures):
-                task.functions.tally(s0, action_in[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
+                task.functions.tally(s0, t.action[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
             else:
-                task.functions.tally(s0, action_in[w], s1, p, ended, sums)
+                task.functions.tally(s0, t.action[w], s1, p, ended, sums)
         for i in range(share_out.shape[1]):
             if share_out[w, i] != 0.0 and wp.isfinite(share_out[w, i]):
                 wp.atomic_add(sum_inout, i, wp.int64(wp.round(wp.float64(share_out[w, i]) * wp.float64(UNIT))))

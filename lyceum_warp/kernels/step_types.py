@@ -68,10 +68,12 @@ class TaskCode:
     World: Any
     Params: Any
     Batch: Any  # the task's fields in all worlds
+    Transition: Any  # before, after, params, weights, action and counters of a step in all worlds
     Observations: Any  # the observation groups
     Shared: Any  # the memory that worlds share, or None
     Sums: Any  # the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
+    params_of: wp.Function  # (transition, world) -> Params
     views: Mapping[Any, wp.Function]  # (row of floats) -> struct, for all structs but World
     copy_state: wp.Function  # copies the fields that change in a step
     observe_group: wp.Function  # writes an observation group, and returns whether it is valid

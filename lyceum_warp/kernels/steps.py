@@ -5,7 +5,7 @@ import warp as wp
 from lyceum_warp.core.done import Done
 from lyceum_warp.kernels.random import stream, substream
 from lyceum_warp.kernels.rollouts import control_of
-from lyceum_warp.kernels.step_types import Counters, TaskCode
+from lyceum_warp.kernels.step_types import TaskCode
 
 ACTION = wp.constant(int(Done.ACTION))
 MODEL = wp.constant(int(Done.MODEL))
@@ -25,13 +25,10 @@ def make_step_kernels(task: TaskCode) -> None:
 
     @task.kernel()
     def act(
-        batch: task.Batch,
-        params: wp.array[task.Params],
+        t: task.Transition,
         action_in: wp.array2d[float],
         range_in: wp.array2d[float],
         scale_in: wp.array2d[float],
-        counters: Counters,
-        safe_action_out: wp.array2d[float],
         fault_out: wp.array[int],
         ctrl_out: wp.array2d[float],
         first: int,
@@ -46,9 +43,9 @@ def make_step_kernels(task: TaskCode) -> None:
             if not wp.isfinite(action_in[w, i]):
                 fault = ACTION
         for i in range(action_in.shape[1]):
-            safe_action_out[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
+            t.action[w, i] = wp.where(fault == 0, action_in[w, i], 0.0)
         if wp.static("control" in task.written):
-            task.functions.control(task.view(batch, w), safe_action_out[w], params[w % params.shape[0]], ctrl_out[w])
+            task.functions.control(task.view(t.after, w), t.action[w], task.params_of(t, w), ctrl_out[w])
             for i in range(ctrl_out.shape[1]):
                 if wp.isnan(ctrl_out[w, i]):
                     fault = fault | NAN
@@ -56,9 +53,9 @@ def make_step_kernels(task: TaskCode) -> None:
                 ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
         else:
             for i in range(ctrl_out.shape[1]):
-                ctrl_out[w, i] = control_of(safe_action_out[w, i], i, range_in, scale_in)
+                ctrl_out[w, i] = control_of(t.action[w, i], i, range_in, scale_in)
         fault_out[w] = fault
-        counters.step[w] = counters.step[w] + 1
+        t.counters.step[w] = t.counters.step[w] + 1
 
     @task.kernel(task.checks_model)
     def check_model(batch: task.Batch, fault_inout: wp.array[int], lanes: int, first: int):
@@ -75,26 +72,17 @@ def make_step_kernels(task: TaskCode) -> None:
         task.functions.substep(task.view(batch, w), params[w % params.shape[0]])
 
     @task.kernel_for("advance")
-    def advance_memory(
-        before: task.Batch,
-        after: task.Batch,
-        params: wp.array[task.Params],
-        action_in: wp.array2d[float],
-        counters: Counters,
-        first: int,
-    ):
+    def advance_memory(t: task.Transition, first: int):
         """Advance the task's memory by one step; launched over (nworld,)."""
         w = first + wp.tid()
-        counters.rng[w, 0] = stream(counters.key[w], counters.episode[w], counters.step[w])
-        p = params[w % params.shape[0]]
-        task.functions.advance(task.view(before, w), action_in[w], task.view(after, w), p, counters.rng[w])
+        t.counters.rng[w, 0] = stream(t.counters.key[w], t.counters.episode[w], t.counters.step[w])
+        s0, s1 = task.view(t.before, w), task.view(t.after, w)
+        task.functions.advance(s0, t.action[w], s1, task.params_of(t, w), t.counters.rng[w])
 
     @task.kernel_for("event")
     def run_events(
         restarting_in: wp.array[bool],
-        batch: task.Batch,
-        params: wp.array[task.Params],
-        counters: Counters,
+        t: task.Transition,
         continuing_out: wp.array[bool],
         physics_changed_out: wp.array[bool],
         changed_out: wp.array[bool],
@@ -108,9 +96,9 @@ def make_step_kernels(task: TaskCode) -> None:
         changed_out[w] = False
         outdated_out[w] = restarting_in[w]
         if not restarting_in[w]:
-            at = stream(counters.key[w], counters.episode[w], counters.step[w])
-            counters.rng[w, 0] = substream(at, EVENT)
-            task.functions.event(task.view(batch, w), params[w % params.shape[0]], counters.rng[w])
+            at = stream(t.counters.key[w], t.counters.episode[w], t.counters.step[w])
+            t.counters.rng[w, 0] = substream(at, EVENT)
+            task.functions.event(task.view(t.after, w), task.params_of(t, w), t.counters.rng[w])
 
 
 @wp.kernel(enable_backward=False)

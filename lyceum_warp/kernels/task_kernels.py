@@ -11,6 +11,7 @@ class Kernels(SimpleNamespace):
     """The kernels of a step by name; kernels that the task does not need are None."""
 
     Batch: Any
+    Transition: Any
     Observations: Any
 
 
@@ -21,4 +22,5 @@ def make_kernels(task: TaskCode) -> Kernels:
     resets.make_reset_kernels(task)
     rollouts.make_rollout_kernels(task)
     shared_memory.make_shared_memory_kernels(task)
-    return Kernels(**task.kernels, Batch=task.Batch, Observations=task.Observations)
+    structs = {"Batch": task.Batch, "Transition": task.Transition, "Observations": task.Observations}
+    return Kernels(**task.kernels, **structs)

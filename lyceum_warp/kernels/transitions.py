@@ -4,7 +4,7 @@ import warp as wp
 
 from lyceum_warp.core.done import Done
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.step_types import Counters, Findings, Outcome, TaskCode
+from lyceum_warp.kernels.step_types import Findings, Outcome, TaskCode
 
 TERMINATED = wp.constant(int(Done.TERMINATED))
 TRUNCATED = wp.constant(int(Done.TRUNCATED))
@@ -21,29 +21,17 @@ OBSERVE_FIRST = wp.constant(3)
 
 def make_transition_kernels(task: TaskCode) -> None:
     @task.kernel(task.has_memory)
-    def check_memory(
-        mask_in: wp.array[bool],
-        before: task.Batch,
-        after: task.Batch,
-        fault_inout: wp.array[int],
-        lanes: int,
-        first: int,
-    ):
+    def check_memory(mask_in: wp.array[bool], t: task.Transition, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()
         w = first + k
-        if mask_in[w] and not task.finite_memory(before, after, w, lane, lanes):
+        if mask_in[w] and not task.finite_memory(t.before, t.after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
     @task.kernel()
     def judge(
         mask_in: wp.array[bool],
-        before: task.Batch,
-        after: task.Batch,
-        params: wp.array[task.Params],
-        weights_in: wp.array2d[float],
-        action_in: wp.array2d[float],
-        counters: Counters,
+        t: task.Transition,
         transition: bool,
         fault_in: wp.array[int],
         action_fault_in: wp.array[int],
@@ -65,8 +53,7 @@ def make_transition_kernels(task: TaskCode) -> None:
         for part in range(start, found_out.fault.shape[0], threads):
             found = int(0)
             if (fault_in[w] | action_fault_in[w]) == 0:
-                p = params[w % params.shape[0]]
-                s1 = task.view(after, w)
+                s1, p = task.view(t.after, w), task.params_of(t, w)
                 if part == ENDS:
                     found_out.terminated[w] = task.functions.terminated(s1, p)
                     found_out.truncated[w] = task.functions.truncated(s1, p)
@@ -78,12 +65,12 @@ def make_transition_kernels(task: TaskCode) -> None:
                         for i in range(metrics_out.shape[1]):
                             metrics_out[w, i] = 0.0
                     if transition:
-                        s0 = task.view(before, w)
+                        s0 = task.view(t.before, w)
                         if wp.static(hasattr(task.terms, "score")):
-                            weights = weights_in[w % weights_in.shape[0]]
-                            found_out.reward[w] = task.terms.score(s0, action_in[w], s1, p, weights, metrics_out[w])
+                            weights = t.weights[w % t.weights.shape[0]]
+                            found_out.reward[w] = task.terms.score(s0, t.action[w], s1, p, weights, metrics_out[w])
                         else:
-                            found_out.reward[w] = task.functions.reward(s0, action_in[w], s1, p)
+                            found_out.reward[w] = task.functions.reward(s0, t.action[w], s1, p)
                         if faults.is_out_of_range(found_out.reward[w]):
                             found = REWARD
                 elif part == METRICS:
@@ -91,20 +78,18 @@ def make_transition_kernels(task: TaskCode) -> None:
                         for i in range(metrics_out.shape[1]):
                             metrics_out[w, i] = 0.0
                         if transition:
-                            task.functions.measure(task.view(before, w), action_in[w], s1, p, metrics_out[w])
+                            task.functions.measure(task.view(t.before, w), t.action[w], s1, p, metrics_out[w])
                 else:
                     group = part - OBSERVE_FIRST
-                    if not task.observe_group(group, s1, p, obs_out, w, counters):
+                    if not task.observe_group(group, s1, p, obs_out, w, t.counters):
                         found = OBSERVATION
             found_out.fault[part, w] = found
 
     @task.kernel()
     def conclude(
         mask_in: wp.array[bool],
-        before: task.Batch,
-        params: wp.array[task.Params],
+        t: task.Transition,
         found: Findings,
-        step_in: wp.array[int],
         horizon: int,
         transition: bool,
         keep_reason: bool,
@@ -158,7 +143,7 @@ def make_transition_kernels(task: TaskCode) -> None:
             if fault == 0:
                 out.eval[w] = found.eval[w]
             elif transition:
-                found.eval[w] = task.functions.evaluate(task.view(before, w), params[w % params.shape[0]])
+                found.eval[w] = task.functions.evaluate(task.view(t.before, w), task.params_of(t, w))
                 if not faults.is_out_of_range(found.eval[w]):  # else keep the previous evaluation
                     out.eval[w] = found.eval[w]
         else:
@@ -170,7 +155,7 @@ def make_transition_kernels(task: TaskCode) -> None:
             reason = fault
             if found.terminated[w]:
                 reason = TERMINATED
-            if (horizon > 0 and step_in[w] >= horizon) or (fault == 0 and found.truncated[w]):
+            if (horizon > 0 and t.counters.step[w] >= horizon) or (fault == 0 and found.truncated[w]):
                 reason = reason | TRUNCATED
         if keep_reason:
             reason = reason | out.done_reason[w]
@@ -187,9 +172,7 @@ def make_transition_kernels(task: TaskCode) -> None:
     @task.kernel()
     def observe_worlds(
         mask_in: wp.array[bool],
-        batch: task.Batch,
-        params: wp.array[task.Params],
-        counters: Counters,
+        t: task.Transition,
         good_in: task.Observations,
         valid_out: wp.array2d[bool],
         obs_out: task.Observations,
@@ -206,8 +189,8 @@ def make_transition_kernels(task: TaskCode) -> None:
         if mask_in[w]:
             valid = bool(True)
             for group in range(start, valid_out.shape[0], parts):
-                s, p = task.view(batch, w), params[w % params.shape[0]]
-                valid_out[group, w] = task.observe_group(group, s, p, obs_out, w, counters)
+                s, p = task.view(t.after, w), task.params_of(t, w)
+                valid_out[group, w] = task.observe_group(group, s, p, obs_out, w, t.counters)
                 valid = valid and valid_out[group, w]
             if parts == 1 and not valid:
                 task.copy_observations(good_in, obs_out, w, 0, 1)
