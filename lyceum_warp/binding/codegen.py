@@ -19,7 +19,7 @@ from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.core.fields import is_data_field
 from lyceum_warp.core.model_fields import NOT_NEGATIVE
 from lyceum_warp.core.task import FUNCTIONS, Row
-from lyceum_warp.kernels import random, rows as kernel_rows, task_kernels
+from lyceum_warp.kernels import faults, random, rows as kernel_rows, task_kernels
 from lyceum_warp.kernels.step_types import Counters, TaskCode
 from lyceum_warp.support.upstream import refuse_integer_divisions
 
@@ -31,7 +31,7 @@ refuse_integer_divisions(_MODULE)
 _HELPERS: dict[str, Any] = {
     "wp": wp, "Row": Row, "Counters": Counters, "stream": random.stream, "substream": random.substream,
     "finite_row": kernel_rows.finite_row, "copy_row": kernel_rows.copy_row, "restored_row": kernel_rows.restored_row,
-    "row_in_range": kernel_rows.row_in_range,
+    "row_in_range": faults.row_in_range,
     "OBSERVE": wp.constant(-1),  # number of the substream from which observation noise is drawn
     "type_row": wp.array2d(dtype=float),
 }  # fmt: skip

@@ -1,6 +1,5 @@
 """Find tasks by name, by file or by class, and register users' tasks."""
 
-import ast
 import functools
 import importlib
 import importlib.util
@@ -85,20 +84,11 @@ def _package_modules() -> dict[str, str]:
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
         for module in pkgutil.iter_modules([str(folder)]):
             if module.ispkg:
-                declared = _declared(folder / module.name / "__init__.py").items()
-                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in declared}
+                tasks = importlib.import_module(f"{_PACKAGE}{module.name}").TASKS
+                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in tasks.items()}
             else:
                 found[module.name] = f"{_PACKAGE}{module.name}"
     return found
-
-
-def _declared(file: Path) -> dict[str, str]:
-    """Read the dict ``TASKS``, which maps task names to modules, from a file without running it."""
-    for node in ast.parse(file.read_bytes()).body:
-        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["TASKS"]:
-            declared: dict[str, str] = ast.literal_eval(node.value)
-            return declared
-    raise ValueError(f"{file} declares no TASKS")
 
 
 def _file(task: type[Task]) -> str | None:

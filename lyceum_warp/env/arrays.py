@@ -153,8 +153,6 @@ class WorldArrays:
         self.restarting = wp.zeros(n, dtype=bool)
         """Worlds whose episode ended in the last step."""
         self._rejected = wp.zeros(n, dtype=bool)
-        self._continuing = wp.zeros(n, dtype=bool)
-        """Worlds that did not restart, and thus ran events."""
         self._physics_changed = wp.zeros(n, dtype=bool)
         """Worlds whose physics an event changed."""
         self._changed = wp.zeros(n, dtype=bool)

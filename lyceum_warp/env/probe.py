@@ -171,7 +171,7 @@ class _Run:
             self._launch(kernels.share_memory, self._totals, self._sums.array, t.params, shared.array)
             yield self._checked("share", self._sums, "sums", declared)
             yield self._checked("share", shared, "shared", f"Shared declares {shared.size}")
-        masks = [wp.clone(self._no) for _ in range(4)]
+        masks = [wp.clone(self._no) for _ in range(3)]
         self._launch(kernels.run_events, self._no, t, *masks)
         yield from self._written_fields("event")
         self._launch(kernels.start_worlds, self._yes, t)

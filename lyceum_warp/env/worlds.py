@@ -239,7 +239,7 @@ class Worlds(Resets):
         for name, copy in before.items():
             wp.copy(copy, live[name])
         launch_worlds(kernel, self.nworld, [
-            self.restarting, self.transition, self._continuing, self._physics_changed, self._changed, self._outdated,
+            self.restarting, self.transition, self._physics_changed, self._changed, self._outdated,
         ], self.device)  # fmt: skip
         for name, copy in before.items():
             self._mark_changes(copy, live[name], physics=name not in MEMORIES)
@@ -249,7 +249,7 @@ class Worlds(Resets):
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
         """Mark worlds in which an event changed a given field. ``physics`` is False for a memory field."""
         found = [self._physics_changed, self._changed, self._outdated]
-        args = [self._continuing, flat(before), flat(after), physics, *found]
+        args = [self.restarting, flat(before), flat(after), physics, *found]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:

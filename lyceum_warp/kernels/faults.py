@@ -18,6 +18,15 @@ def is_out_of_range(x: float) -> bool:
 
 
 @wp.func
+def row_in_range(row: wp.array[float], lane: int, lanes: int) -> bool:
+    """Return whether every element that this thread reads is smaller than 1e10 in magnitude."""
+    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
+        if is_out_of_range(row[i]):
+            return False
+    return True
+
+
+@wp.func
 def count_faults(fault: int, count_inout: wp.array[int]):
     """Increment the counters of the fault bits that are set."""
     for bit in range(count_inout.shape[0]):
@@ -98,15 +107,8 @@ def faults_of_fields(
     if not mask_in[w]:
         return
     fault = int(0)
-    for i in range(qpos_in.shape[1]):
-        if is_out_of_range(qpos_in[w, i]):
-            fault = fault | NAN
-    for i in range(qvel_in.shape[1]):
-        if is_out_of_range(qvel_in[w, i]):
-            fault = fault | NAN
-    for i in range(act_in.shape[1]):
-        if is_out_of_range(act_in[w, i]):
-            fault = fault | NAN
+    if not (row_in_range(qpos_in[w], 0, 1) and row_in_range(qvel_in[w], 0, 1) and row_in_range(act_in[w], 0, 1)):
+        fault = NAN
     overflow = overflow_in[w] & ~ignored_bits
     if (overflow & contact_bits) != 0:
         fault = fault | CONTACT

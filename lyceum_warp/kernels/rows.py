@@ -2,17 +2,6 @@
 
 import warp as wp
 
-from lyceum_warp.kernels import faults
-
-
-@wp.func
-def row_in_range(row: wp.array[float], lane: int, lanes: int) -> bool:
-    """Return whether every element that this thread reads is smaller than 1e10 in magnitude."""
-    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
-        if faults.is_out_of_range(row[i]):
-            return False
-    return True
-
 
 @wp.func
 def finite_row(row: wp.array[float], lane: int, lanes: int) -> bool:
@@ -43,7 +32,7 @@ def copy_row(source: wp.array[float], target: wp.array[float], lane: int, lanes:
 
 @wp.kernel(enable_backward=False)
 def mark_changes(
-    mask_in: wp.array[bool],
+    restarting_in: wp.array[bool],
     before_in: wp.array2d[float],
     after_in: wp.array2d[float],
     physics: bool,
@@ -53,13 +42,13 @@ def mark_changes(
     lanes: int,
     first: int,
 ):
-    """Mark the masked worlds whose rows have changed; launched over (nworld, lanes).
+    """Mark the worlds that do not restart and whose rows have changed; launched over (nworld, lanes).
 
     If ``physics`` is set, the worlds are also marked in ``physics_changed``.
     """
     k, lane = wp.tid()
     w = first + k
-    if mask_in[w]:
+    if not restarting_in[w]:
         for i in range(lane, after_in.shape[1], lanes):
             if before_in[w, i] != after_in[w, i]:
                 if physics:

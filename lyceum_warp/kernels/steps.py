@@ -83,15 +83,13 @@ def make_step_kernels(task: TaskCode) -> None:
     def run_events(
         restarting_in: wp.array[bool],
         t: task.Transition,
-        continuing_out: wp.array[bool],
         physics_changed_out: wp.array[bool],
         changed_out: wp.array[bool],
         outdated_out: wp.array[bool],
         first: int,
     ):
-        """Set ``continuing_out`` for the worlds that do not restart, and run their events; launched over (nworld,)."""
+        """Run the events of the worlds that do not restart; launched over (nworld,)."""
         w = first + wp.tid()
-        continuing_out[w] = not restarting_in[w]
         physics_changed_out[w] = False
         changed_out[w] = False
         outdated_out[w] = restarting_in[w]

@@ -7,4 +7,4 @@ TASKS = {
     "humanoid_walk": "humanoid_balance",
     "humanoid_get_up": "humanoid_balance",
 }
-"""The module of each task, by the task's name. The registry reads this dict without running the file."""
+"""The module of each task, by the task's name."""

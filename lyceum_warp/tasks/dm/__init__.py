@@ -32,4 +32,4 @@ TASKS = {
     "dm/walker_stand": "dm_walker",
     "dm/walker_walk": "dm_walker",
 }
-"""The module of each task, by the task's name. The registry reads this dict without running the file."""
+"""The module of each task, by the task's name."""

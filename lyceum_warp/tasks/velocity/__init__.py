@@ -10,4 +10,4 @@ TASKS = {
     "h1_velocity": "h1",
     "t1_velocity": "t1",
 }
-"""The module of each task, by the task's name. The registry reads this dict without running the file."""
+"""The module of each task, by the task's name."""
