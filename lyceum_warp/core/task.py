@@ -176,117 +176,38 @@ class Element(int):
         return element
 
 
-def site(name: str) -> int:
-    """Return a default for ``Params``: a site's index in ``site_xpos`` and other ``site_`` fields."""
-    return Element("site_xpos", name)
+def _elements(name: str, names: str, field: str, index: str) -> tuple[Callable[[str], int], Callable[..., Any]]:
+    """Make a function for an element's index, and one for a table of such indices."""
+
+    def one(name: str) -> int:
+        return Element(field, name)
+
+    def several(*names: str) -> Any:
+        return [Element(field, name) for name in names]
+
+    one.__name__ = one.__qualname__ = name
+    one.__doc__ = f"Return a default for ``Params``: {index}."
+    several.__name__ = several.__qualname__ = names
+    several.__doc__ = f"Return a default for a ``wp.array[int]`` in ``Params``: for each name, {index}."
+    return one, several
 
 
-def sites(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: site indices."""
-    return [site(name) for name in names]
-
-
-def body(name: str) -> int:
-    """Return a default for ``Params``: a body's index in ``xpos`` and other fields of bodies."""
-    return Element("xpos", name)
-
-
-def bodies(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: body indices."""
-    return [body(name) for name in names]
-
-
-def geom(name: str) -> int:
-    """Return a default for ``Params``: a geom's index in ``geom_xpos`` and other ``geom_`` fields."""
-    return Element("geom_xpos", name)
-
-
-def geoms(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: geom indices."""
-    return [geom(name) for name in names]
-
-
-def camera(name: str) -> int:
-    """Return a default for ``Params``: a camera's index in ``cam_xpos`` and other ``cam_`` fields."""
-    return Element("cam_xpos", name)
-
-
-def tendon(name: str) -> int:
-    """Return a default for ``Params``: a tendon's index in ``ten_`` and ``tendon_`` fields."""
-    return Element("ten_length", name)
-
-
-def equality(name: str) -> int:
-    """Return a default for ``Params``: an equality constraint's index in ``eq_`` fields."""
-    return Element("eq_active", name)
-
-
-def actuator(name: str) -> int:
-    """Return a default for ``Params``: an actuator's index in ``actuator_`` fields."""
-    return Element("actuator_force", name)
-
-
-def actuators(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: actuator indices."""
-    return [actuator(name) for name in names]
-
-
-def ctrl(actuator: str) -> int:
-    """Return a default for ``Params``: the index in ``ctrl`` of an actuator's first control.
-
-    Most actuators have one control.
-    """
-    return Element("ctrl", actuator)
-
-
-def act(actuator: str) -> int:
-    """Return a default for ``Params``: the index in ``act`` of an actuator's first activation."""
-    return Element("act", actuator)
-
-
-def joint(name: str) -> int:
-    """Return a default for ``Params``: a joint's index in ``xanchor``, ``xaxis`` and ``jnt_`` fields."""
-    return Element("xanchor", name)
-
-
-def joints(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: joint indices."""
-    return [joint(name) for name in names]
-
-
-def qpos(joint: str) -> int:
-    """Return a default for ``Params``: the index in ``qpos`` of a joint's first coordinate."""
-    return Element("qpos", joint)
-
-
-def qposes(*joints: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``qpos`` index of each joint."""
-    return [qpos(name) for name in joints]
-
-
-def dof(joint: str) -> int:
-    """Return a default for ``Params``: the index of a joint's first degree of freedom, as in ``qvel``."""
-    return Element("qvel", joint)
-
-
-def dofs(*joints: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``qvel`` index of each joint."""
-    return [dof(name) for name in joints]
-
-
-def sensor(name: str) -> int:
-    """Return a default for ``Params``: the index in ``sensordata`` of a sensor's first number."""
-    return Element("sensordata", name)
-
-
-def sensors(*names: str) -> Any:
-    """Return a default for a ``wp.array[int]`` in ``Params``: the first ``sensordata`` index of each sensor."""
-    return [sensor(name) for name in names]
-
-
-def mocap(body: str) -> int:
-    """Return a default for ``Params``: a mocap body's index in ``mocap_pos`` and ``mocap_quat``."""
-    return Element("mocap_pos", body)
+site, sites = _elements("site", "sites", "site_xpos", "a site's index in ``site_xpos`` and other ``site_`` fields")
+body, bodies = _elements("body", "bodies", "xpos", "a body's index in ``xpos`` and other fields of bodies")
+geom, geoms = _elements("geom", "geoms", "geom_xpos", "a geom's index in ``geom_xpos`` and other ``geom_`` fields")
+camera, _ = _elements("camera", "", "cam_xpos", "a camera's index in ``cam_xpos`` and other ``cam_`` fields")
+tendon, _ = _elements("tendon", "", "ten_length", "a tendon's index in ``ten_`` and ``tendon_`` fields")
+equality, _ = _elements("equality", "", "eq_active", "an equality constraint's index in ``eq_`` fields")
+actuator, actuators = _elements(
+    "actuator", "actuators", "actuator_force", "an actuator's index in ``actuator_`` fields"
+)
+ctrl, _ = _elements("ctrl", "", "ctrl", "the index in ``ctrl`` of an actuator's first control; most have one")
+act, _ = _elements("act", "", "act", "the index in ``act`` of an actuator's first activation")
+joint, joints = _elements("joint", "joints", "xanchor", "a joint's index in ``xanchor``, ``xaxis`` and ``jnt_`` fields")
+qpos, qposes = _elements("qpos", "qposes", "qpos", "the index in ``qpos`` of a joint's first coordinate")
+dof, dofs = _elements("dof", "dofs", "qvel", "the index of a joint's first degree of freedom, as in ``qvel``")
+sensor, sensors = _elements("sensor", "sensors", "sensordata", "the index in ``sensordata`` of a sensor's first number")
+mocap, _ = _elements("mocap", "", "mocap_pos", "a mocap body's index in ``mocap_pos`` and ``mocap_quat``")
 
 
 @dataclasses.dataclass(frozen=True)
