@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -81,7 +82,16 @@ ON_DEMAND = {
 SENSED = {"sensordata", *ON_DEMAND}
 """Fields that are computed only if the model's sensors are enabled."""
 
-_TYPES = {3: wp.vec3, 4: quat, 6: wp.spatial_vector, 9: wp.mat33, 10: vec10}
+ELEMENT_TYPES = {
+    2: wp.vec2, 3: wp.vec3, 4: quat, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector, 9: wp.mat33,
+    10: vec10,
+}  # fmt: skip
+
+
+def element_type(shape: tuple[int, ...]) -> Any:
+    """Return the Warp type of the elements of a field, or raise KeyError if there is none."""
+    return ELEMENT_TYPES[shape[1]] if len(shape) == 2 else wp.float32
+
 
 _Kind = mujoco.mjtObj
 
@@ -210,10 +220,8 @@ def describe(
             )
         reset = Stage.NONE
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
-    if len(shape) == 2:
-        return Field(name, shape[:1], _TYPES[shape[1]], refresh, reset, lagged, snapshot, written)
-    dtype = wp.bool if name == "eq_active" else wp.float32
-    return Field(name, shape, dtype, refresh, reset, lagged, snapshot, written)
+    dtype = wp.bool if name == "eq_active" else element_type(shape)
+    return Field(name, shape[:1], dtype, refresh, reset, lagged, snapshot, written)
 
 
 def early_sensor_columns(model: mujoco.MjModel) -> np.ndarray:

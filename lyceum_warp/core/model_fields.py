@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.core.fields import ELEMENT_TYPES, element_type
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import described
 
@@ -96,11 +97,6 @@ NOT_NEGATIVE = _POSITIVE | set(
 )
 """Fields that must not be negative."""
 
-_TYPES = {
-    2: wp.vec2, 3: wp.vec3, 4: wp.vec4, 5: wp.types.vector(length=5, dtype=wp.float32), 6: wp.spatial_vector,
-    10: wp.types.vector(length=10, dtype=wp.float32),
-}  # fmt: skip
-
 
 @dataclasses.dataclass(frozen=True)
 class ModelField:
@@ -139,13 +135,9 @@ class ModelField:
         world, column = np.argwhere(bad)[0].tolist()
         place = np.unravel_index(column, self.value(model).shape) if nominal.size > 1 else ()
         index = "".join(f"[{int(i)}]" for i in place)
-        wanted = (
-            "positive"
-            if self.name in _POSITIVE and nominal[column] > 0
-            else "0 or more"
-            if self.name in NOT_NEGATIVE
-            else "finite"
-        )
+        wanted = "0 or more" if self.name in NOT_NEGATIVE else "finite"
+        if self.name in _POSITIVE and nominal[column] > 0:
+            wanted = "positive"
         return (
             f"{self.name}{index} of world {world} is {rows[world, column]:g} and must be {wanted} "
             f"(its nominal value is {nominal[column]:g})"
@@ -186,10 +178,10 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
     if not varies and name not in VARYING_FIELDS:
         value: Any = getattr(model, name, None)
         numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
-        if not numbers or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in _TYPES):
+        if not numbers or value.ndim > 2 or (value.ndim == 2 and value.shape[1] not in ELEMENT_TYPES):
             reason = _REASONS[name] if name == "timestep" else "it has no rows of real numbers; make it a parameter"
             raise ValueError(f"the model field {name!r} cannot be read in World: {reason}")
-        return _described(name, value.shape, Constants.NONE)
+        return ModelField(name, value.shape[:1], element_type(value.shape), Constants.NONE)
     if name not in VARYING_FIELDS:
         if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
             hint = did_you_mean(name, VARYING_FIELDS, f"those are {', '.join(sorted(VARYING_FIELDS))}")
@@ -201,13 +193,7 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
         constants |= _POSES
     # a task can write a scalar only as an array of one element
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
-    return _described(name, shape, constants)
-
-
-def _described(name: str, shape: tuple[int, ...], constants: Constants) -> ModelField:
-    if len(shape) == 2:
-        return ModelField(name, shape[:1], _TYPES[shape[1]], constants)
-    return ModelField(name, shape, wp.float32, constants)
+    return ModelField(name, shape[:1], element_type(shape), constants)
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}

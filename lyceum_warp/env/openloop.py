@@ -23,7 +23,7 @@ from lyceum_warp.support.arrays import (
     zeros_of,
 )
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_flag, check_kind, whole_number
+from lyceum_warp.support.validate import check_kind, whole_number
 
 
 @document_attributes
@@ -76,9 +76,6 @@ class OpenLoop:
         models: Mapping[str, wp.array] | None = None, states: int = 1,
     ) -> None:  # fmt: skip
         check_kind("env of OpenLoop", env, Env, "as lw.make(..., autoreset=False) makes it")
-        check_kind("keys", keys, wp.array | None, "one random key for each world")
-        check_kind("models", models, Mapping | None, "arrays by the names of model fields")
-        check_flag("nominal_model", nominal_model)
         if env.autoreset:
             raise ValueError("open-loop rollouts need worlds that do not reset: make(..., autoreset=False)")
         self.env, self.worlds = env, env.worlds
@@ -91,10 +88,9 @@ class OpenLoop:
                 f"keys must be a wp.array of shape ({n},) and type uint32 on {env.device}, not of shape {keys.shape} "
                 f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
             )
-        nominal = {name: flat(row).numpy() for name, row in env.engine.nominal.items()} if nominal_model else {}
         self._keys, self._models = keys, dict(models or {})
-        for name in nominal.keys() - self._models.keys():
-            self._models[name] = wp.array(nominal[name], dtype=wp.float64, device=env.device)
+        for name, row in (env.engine.nominal if nominal_model else {}).items():
+            self._models.setdefault(name, wp.array(flat(row).numpy(), dtype=wp.float64, device=env.device))
         rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         length = f"horizon {self.horizon} with frame_skip {task.frame_skip}"

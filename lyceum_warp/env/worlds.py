@@ -233,16 +233,14 @@ class Worlds(Resets):
 
     def _event(self, kernel: wp.Kernel) -> None:
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}
-        live = {name: getattr(self.after, name) for name in before}
         before |= self._model_copies
-        live |= {name: self.engine.arrays[name] for name in self._model_copies}
         for name, copy in before.items():
-            wp.copy(copy, live[name])
+            wp.copy(copy, getattr(self.after, name))
         launch_worlds(kernel, self.nworld, [
             self.restarting, self.transition, self._physics_changed, self._changed, self._outdated,
         ], self.device)  # fmt: skip
         for name, copy in before.items():
-            self._mark_changes(copy, live[name], physics=name not in MEMORIES)
+            self._mark_changes(copy, getattr(self.after, name), physics=name not in MEMORIES)
         state_fields = [name for name in before if name not in MEMORIES and name not in self._model_copies]
         self.engine.commit(self._physics_changed, state_fields)
 
