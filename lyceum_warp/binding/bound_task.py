@@ -65,8 +65,13 @@ class BoundTask:
 
         self.spec = models.read_task_spec(task, model)
         """The model before ``edit_model``."""
-        varied = {*model_fields, *dynamics}
-        self.model = models.compile_task_model(task, self.spec, data_fields, physics, varied, model)
+        edited = models.edited(task, self.spec)
+        try:
+            self.model = models.compile_model(edited, data_fields, physics, varied={*model_fields, *dynamics})
+        except ValueError as error:
+            source = task.model if model is None else model
+            file = source if isinstance(source, str | Path) else getattr(source, "file", None)
+            raise ValueError(f"{file or f'the model of the task {self.name!r}'}: {error}") from error
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)

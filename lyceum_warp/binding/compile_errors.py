@@ -60,17 +60,13 @@ def explained(error: Exception, task: BoundTask) -> Exception:
 
 def _hint(text: str, task: BoundTask) -> str:
     if missing := re.search(r"`(\w+)` is not an attribute of '\w+' \(.*?(\w+)\)", text):
-        return _declaration(missing.group(1), missing.group(2), task)
+        name, struct = missing.groups()
+        if struct == "World" and (is_data_field(name) or is_model_field(name)):
+            return f"add {task.declaration(name)} to World"
+        structs = {"World": task.source.world, "Params": task.source.params}
+        hint = did_you_mean(name, structs[struct].vars) if struct in structs else ""
+        return hint or (f"add {name}: float = 1.0 to Params" if struct == "Params" else f"{struct} has no such field")
     if unknown := re.search(r"find function (?:wp|warp)\.(\w+)", text):
         return did_you_mean(unknown.group(1), builtin_functions())
     matches = ((re.search(pattern, text), fix) for pattern, fix in _FIXES)
     return next((fix.format(*match.groups()) for match, fix in matches if match), "")
-
-
-def _declaration(name: str, struct: str, task: BoundTask) -> str:
-    """Say how to declare a name that a function reads from a struct."""
-    structs = {"World": task.source.world, "Params": task.source.params}
-    if struct == "World" and (is_data_field(name) or is_model_field(name)):
-        return f"add {task.declaration(name)} to World"
-    hint = did_you_mean(name, structs[struct].vars) if struct in structs else ""
-    return hint or (f"add {name}: float = 1.0 to Params" if struct == "Params" else f"{struct} has no such field")

@@ -36,10 +36,11 @@ def read_task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
     """Load a task's model, or the given model, as an MjSpec, and apply ``edit_model`` of the task and its parents."""
-    return _edited(task, read_task_spec(task, model))
+    return edited(task, read_task_spec(task, model))
 
 
-def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
+def edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
+    """Apply ``edit_model`` of a task and its parents to a copy of a spec."""
     copy, name = spec.copy(), task_name(task)
     edits = [vars(owner)["edit_model"] for owner in reversed(task.__mro__) if "edit_model" in vars(owner)]
     for edit in (edit.__get__(None, task) for edit in edits):
@@ -61,27 +62,6 @@ def _edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
                 "and return None"
             )
     return copy
-
-
-def compile_task_model(
-    task: type[Task],
-    spec: mujoco.MjSpec,
-    fields: Collection[str],
-    physics: PhysicsOptions,
-    varied: Collection[str],
-    model: ModelSource | None = None,
-) -> mujoco.MjModel:
-    """Apply ``edit_model`` of a task and its parents to a copy of a spec, and compile it; see ``compile_model``.
-
-    Errors name the file of the task's model, or of the given ``model`` from which the spec was read.
-    """
-    edited = _edited(task, spec)
-    try:
-        return compile_model(edited, fields, physics, varied=varied)
-    except ValueError as error:
-        source = task.model if model is None else model
-        file = source if isinstance(source, str | Path) else getattr(source, "file", None)
-        raise ValueError(f"{file or f'the model of the task {task_name(task)!r}'}: {error}") from error
 
 
 def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:

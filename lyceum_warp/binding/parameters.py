@@ -98,9 +98,7 @@ class Parameters:
             result = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
         except Exception as error:  # the task's function may raise any error
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise ValueError(
-                f"the parameter {name} of {self._task_name!r} can't be computed from the model: {message}"
-            ) from error
+            raise ValueError(f"the parameter {name} of {self._task_name!r} can't be computed: {message}") from error
         value, before = self._converted(name, result), self.values[name]
         return before if name in self.tables and np.array_equal(before, value) else value
 

@@ -87,9 +87,7 @@ class Terms:
                 raise ValueError(f"the weight of {term!r} of the task {self._name!r} must be a number, not {weight!r}")
         self._names("rewards", tuple(rewards))
         if rewards and "dt" not in self._params.vars:
-            raise ValueError(
-                f"rewards of the task {self._name!r} are multiplied by the time step: add dt: float to its Params"
-            )
+            raise ValueError(f"rewards of the task {self._name!r} are multiplied by dt: add dt: float to its Params")
         if taken := [term for term in rewards if term in self._params.vars]:
             raise ValueError(
                 f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params would not know "
@@ -103,9 +101,7 @@ class Terms:
         If ``written`` is True, a function of the task computes all of them, so return ().
         """
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
-            raise ValueError(
-                f"{attribute} of the task {self._name!r} must be names, such as ('forward', 'cost'), not {names!r}"
-            )
+            raise ValueError(f"{attribute} of the task {self._name!r} must be names, as ('x', 'y'), not {names!r}")
         for name in () if written else names:
             if self.lookup(name) is None:
                 more = ", or write measure" if attribute == "metrics" else ""

@@ -215,9 +215,7 @@ def describe(
                 "model has no sensor of them: add the sensors in edit_model"
             )
         if not snapshot or refresh > Stage.NONE:
-            raise ValueError(
-                f"the field {name!r} cannot be cleared, because it belongs to the current state: remove it from cleared"
-            )
+            raise ValueError(f"the field {name!r} belongs to the current state: remove it from cleared")
         reset = Stage.NONE
     shape: tuple[int, ...] = np.shape(getattr(mujoco.MjData(model), name))
     dtype = wp.bool if name == "eq_active" else element_type(shape)

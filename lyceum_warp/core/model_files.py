@@ -55,7 +55,7 @@ class ModelFile:
             files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*.xml"))
             close = closest(file, files) or files[:10]
             raise FileNotFoundError(
-                f"there is no model file {file!r} in {folder}; the folder has {', '.join(close) or 'no XML files'}"
+                f"there is no model file {file!r} in {folder}; it has {', '.join(close) or 'no XML files'}"
             )
         return folder / file
 

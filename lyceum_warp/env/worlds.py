@@ -14,7 +14,7 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.env.resets import Resets
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
-from lyceum_warp.kernels import rows, steps
+from lyceum_warp.kernels import rows
 from lyceum_warp.support.arrays import (
     flat,
     launch_lanes,
@@ -222,14 +222,9 @@ class Worlds(Resets):
         launch_parts(kernels.judge, self._judging, self.nworld, [*args, self._judging], self.device)
         launch_lanes(kernels.conclude, self.nworld, [
             mask, self.transition, self._found, self.horizon, transition, keep_reason, fault, action_fault,
-            self.outcome, self.metric_sums, self.obs, self.final_obs, self.restarting, self.fault_count,
+            self.outcome, self.metric_sums, self.task.definition.success_steps, self.success_counts, self.obs,
+            self.final_obs, self.restarting, self.fault_count,
         ], self.device)  # fmt: skip
-        self._hold_success(mask, transition=transition)
-
-    def _hold_success(self, mask: wp.array, *, transition: bool) -> None:
-        if self.success_counts.size:
-            args = [mask, transition, self.task.definition.success_steps, self.success_counts, self.outcome.success]
-            launch_worlds(steps.hold_success, self.nworld, args, self.device)
 
     def _event(self, kernel: wp.Kernel) -> None:
         before = {name: copy for name, copy in self._copies.items() if name in self.task.writes["event"]}

@@ -97,24 +97,3 @@ def make_step_kernels(task: TaskCode) -> None:
             at = stream(t.counters.key[w], t.counters.episode[w], t.counters.step[w])
             t.counters.rng[w, 0] = substream(at, EVENT)
             task.functions.event(task.view(t.after, w), task.params_of(t, w), t.counters.rng[w])
-
-
-@wp.kernel(enable_backward=False)
-def hold_success(
-    mask_in: wp.array[bool],
-    transition: bool,
-    needed: int,
-    count_inout: wp.array2d[float],
-    success_inout: wp.array[bool],
-    first: int,
-):
-    """Report success only after ``needed`` successful steps in a row, in the masked worlds; launched over (nworld,).
-
-    ``count``, (nworld, 1), holds the successful steps so far. A transition increases or clears the count; the
-    evaluation of a state alone does not change the count.
-    """
-    w = first + wp.tid()
-    if mask_in[w]:
-        if transition:
-            count_inout[w, 0] = wp.where(success_inout[w], wp.min(count_inout[w, 0] + 1.0, float(needed)), 0.0)
-        success_inout[w] = success_inout[w] and count_inout[w, 0] >= float(needed)

@@ -97,6 +97,8 @@ def make_transition_kernels(task: TaskCode) -> None:
         action_fault_in: wp.array[int],
         out: Outcome,
         metric_sum_inout: wp.array2d[float],
+        success_steps: int,
+        success_count_inout: wp.array2d[float],
         obs_out: task.Observations,
         final_obs_inout: task.Observations,
         restart_out: wp.array[bool],
@@ -109,7 +111,8 @@ def make_transition_kernels(task: TaskCode) -> None:
         The kernel writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and
         the observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and
         the last good observations. Such a transition counts as truncated, so that learners bootstrap from the
-        last good observations.
+        last good observations. Success needs ``success_steps`` successful steps in a row. ``success_count``, (nworld,
+        1), holds those so far. The evaluation of a state alone does not change the count.
 
         If ``transition`` is not set, the kernel evaluates a state and ends no episode. ``found.terminated`` then holds
         the result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
@@ -150,6 +153,11 @@ def make_transition_kernels(task: TaskCode) -> None:
             out.eval[w] = gain
         found.terminated[w] = fault == 0 and found.terminated[w]
         out.success[w] = fault == 0 and found.success[w]
+        if success_steps > 1:
+            if transition:
+                count = wp.min(success_count_inout[w, 0] + 1.0, float(success_steps))
+                success_count_inout[w, 0] = wp.where(out.success[w], count, 0.0)
+            out.success[w] = out.success[w] and success_count_inout[w, 0] >= float(success_steps)
         reason = int(0)
         if transition:
             reason = fault

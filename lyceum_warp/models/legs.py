@@ -131,9 +131,7 @@ class Legs:
         for element in elements:
             if element.name:
                 return str(element.name)
-        raise ValueError(
-            f"body number {body}, its joints and its geoms have no names: give the body of each foot a name"
-        )
+        raise ValueError(f"body number {body}, its joints and its geoms have no names: name the body of each foot")
 
     def _leg_joints(self) -> list[str]:
         chains = [walkers.leg_of(self.model, foot.body) for foot in self.feet]

@@ -461,9 +461,7 @@ def use_servos(spec: mujoco.MjSpec, joints: Sequence[str], *, reach: float = 1.0
         if model.jnt_actfrclimited[joint]:
             limits.append(float(model.jnt_actfrcrange[joint, 1]))
         if not math.isfinite(limit := min(limits)):
-            raise ValueError(
-                f"the motor of the joint {name!r} has no limit: give the motor a ctrlrange or a forcerange"
-            )
+            raise ValueError(f"the motor of the joint {name!r} has no limit: give it a ctrlrange or a forcerange")
         kp, dof = limit / reach, int(model.jnt_dofadr[joint])
         kd = max(2.0 * math.sqrt(kp * model.dof_M0[dof]) - model.dof_damping[dof].sum(), 0.0)
         servo = spec.actuators[actuator]

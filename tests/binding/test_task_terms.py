@@ -151,7 +151,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "no seconds in a step": (
         [*term(UPRIGHT), ("    dt: float", "    gain: float = 1.0")],
-        "rewards of the task 'tiny' are multiplied by the time step: add dt: float to its Params",
+        "rewards of the task 'tiny' are multiplied by dt: add dt: float to its Params",
     ),
     "a metric without a function": (
         [(TASK, f'{TASK}\n    metrics = ("height",)')],

@@ -59,7 +59,7 @@ def test_package_mujoco_menagerie_provides_robots_that_other_sources_lack(
 
 
 def test_error_of_a_missing_menagerie_file_suggests_similar_names(sources: dict[str, Path]) -> None:
-    with pytest.raises(FileNotFoundError, match=r"file 'leg/scone\.xml' in .*; the folder has leg/scene\.xml, arm"):
+    with pytest.raises(FileNotFoundError, match=r"file 'leg/scone\.xml' in .*; it has leg/scene\.xml, arm"):
         lw.menagerie_model("leg/scone.xml").spec()
 
 

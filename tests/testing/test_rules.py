@@ -150,7 +150,6 @@ FULL_BREAKS: list[Break] = [
     ("noise", Worlds, "_judge_state", count_steps_as_none),
     ("metrics", Worlds, "_clear", clear_all_but("metric_sums")),
     ("success_steps", Worlds, "_clear", clear_all_but("success_counts")),
-    ("success_steps", Worlds, "_hold_success", nothing),
     ("events", Worlds, "_event", in_every_world),
     ("events", Worlds, "_mark_changes", nothing),
     ("events", MujocoEngine, "commit", only_after_resets),
