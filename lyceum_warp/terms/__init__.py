@@ -19,7 +19,6 @@ argument's name has the same meaning in all functions:
     body: index of a body
     body_inertia: the model field
     body_ipos: the model field
-    body_iquat: the model field
     body_mass: the model field
     command: forward and lateral velocity (m/s) and yaw rate (rad/s), in the base's axes
     command_high: greatest forward and lateral velocity (m/s) and yaw rate (rad/s)
@@ -28,7 +27,6 @@ argument's name has the same meaning in all functions:
     contact_time: row of memory: seconds since each foot touched down (0 in the air)
     default_pose: array of Params: default position of each joint (rad)
     delay: row of memory with 1 number: a delay in steps
-    density: half the logarithm of the factor that multiplies the density
     drawn_velocity: row of memory with 1 vector: the drawn command
     dt: seconds in a step
     earlier_action: row of memory: the action two steps ago
@@ -76,7 +74,6 @@ argument's name has the same meaning in all functions:
     linear_velocity: velocity of the base's origin in the base's axes (m/s)
     linear_velocity_variance: squared error at which the term is 1 / e (m^2/s^2)
     low: lower end of the range
-    matrix: a symmetric matrix, 3 x 3
     most: largest integer
     most_air_time: longest air time for which a foot counts (s)
     noise: bound of uniform noise, or standard deviation of normal noise
@@ -100,8 +97,6 @@ argument's name has the same meaning in all functions:
     seconds: range of the duration (s)
     sensordata: the field
     share: probability
-    shear: s12, s13 and s23 of the matrix D
-    shift: offset of the body's mass in the body's axes (m)
     site_xpos: the field
     sliding_friction: range of the sliding friction
     soft_limit: fraction of a joint's range that has no cost, around the middle of the range
@@ -109,7 +104,6 @@ argument's name has the same meaning in all functions:
     spinning_friction: range of the spinning friction
     standing: row of memory with 1 number, which is 1 if the robot should stand
     standing_pose_std: array of Params: standard deviation of each joint while standing (rad)
-    stretch: logarithms of the diagonal of the matrix D
     substep_dt: seconds in a substep
     subtree_angmom: the field
     swing_height: row of memory: greatest height of each foot in its last swing (m)

@@ -59,11 +59,6 @@ from lyceum_warp.terms.histories import (
     put_history as put_history,
     read_history as read_history,
 )
-from lyceum_warp.terms.inertia import (
-    change_inertia as change_inertia,
-    draw_inertia as draw_inertia,
-    symmetric_eigenvectors as symmetric_eigenvectors,
-)
 from lyceum_warp.terms.joints import (
     absolute_power as absolute_power,
     gait_pose as gait_pose,
