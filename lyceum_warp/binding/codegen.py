@@ -72,7 +72,7 @@ class _Generator:
         self._source, self._groups, self._memory, self._structs = source, groups, memory, structs
         self._texts: list[str] = []
         self._scope = _HELPERS | {"World": source.world, "Params": source.params}
-        self._scope |= {"Shared": None, "Sums": None} | source.shared_structs
+        self._scope |= source.shared_structs
 
     def run(self) -> dict[str, Any]:
         """Return the fields of ``TaskCode`` by name, among other names."""
@@ -94,7 +94,6 @@ class _Generator:
             "functions": SimpleNamespace(**{name: f or scope.get(f"no_{name}") for name, f in functions.items()}),
             "written": [name for name, function in functions.items() if function is not None],
             "terms": SimpleNamespace(**terms),
-            "views": {scope[f"Struct_{name}"]: scope[f"view_{name}"] for name in self._structs},
         }
 
     def _struct(self, name: str, fields: Iterable[str]) -> None:
@@ -140,8 +139,8 @@ class _Generator:
         arrays = ["params: type_params", "weights: type_row", "action: type_row", "counters: Counters"]
         self._struct("Transition", ["before: Batch", "after: Batch", *arrays])
         self._function("params_of(t: Transition, w: int) -> Params", ["return t.params[w % t.params.shape[0]]"])
-        self._function("copy_state(source: Batch, target: Batch, w: int, lane: int, lanes: int)", copies or ["pass"])
-        self._scope["has_state"] = bool(copies)
+        if copies:
+            self._function("copy_state(source: Batch, target: Batch, w: int, lane: int, lanes: int)", copies)
 
     def _observations(self) -> None:
         """Generate the struct of all observation groups, and functions that write and copy groups."""
@@ -176,11 +175,9 @@ class _Generator:
             line for name, check in checks.items() if name in self._source.types
             for line in (f"if not {check}:", "    finite = False")
         ]  # fmt: skip
-        self._function(
-            "finite_memory(before: Batch, after: Batch, w: int, lane: int, lanes: int) -> bool",
-            ["finite = bool(True)", *lines, "return finite"],
-        )
-        self._scope["has_memory"] = bool(lines)
+        if lines:
+            arguments = "before: Batch, after: Batch, w: int, lane: int, lanes: int"
+            self._function(f"finite_memory({arguments}) -> bool", ["finite = bool(True)", *lines, "return finite"])
 
     def _model_check(self) -> None:
         """Generate a function that finds NaN and invalid negative numbers in the model fields that the task writes."""
@@ -194,10 +191,9 @@ class _Generator:
                 lines.append(f"for i in range(lane, s.{name}.shape[0], lanes):")
                 lines.append(f"    if {' or '.join(f'not ({element} >= 0.0)' for element in elements)}:")
                 lines.append("        valid = False")
-        self._function(
-            "valid_model(s: World, lane: int, lanes: int) -> bool", ["valid = bool(True)", *lines, "return valid"]
-        )
-        self._scope["checks_model"] = bool(lines)
+        if lines:
+            lines = ["valid = bool(True)", *lines, "return valid"]
+            self._function("valid_model(s: World, lane: int, lanes: int) -> bool", lines)
 
 
 def _copy(name: str, ndim: int) -> list[str]:

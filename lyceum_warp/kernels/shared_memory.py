@@ -13,7 +13,6 @@ UNIT = wp.constant(2.0**20)
 
 
 def make_shared_memory_kernels(task: TaskCode) -> None:
-    view_sums, view_shared = task.views.get(task.Sums), task.views.get(task.Shared)
     tells_failures = "tally" in task.written and "terminated" in task.functions.tally.input_types
 
     @task.kernel_for("tally")
@@ -30,7 +29,7 @@ def make_shared_memory_kernels(task: TaskCode) -> None:
             share_out[w, i] = 0.0
         if (reason_in[w] & ALL_FAULTS) == 0:
             s0, s1, p = task.view(t.before, w), task.view(t.after, w), task.params_of(t, w)
-            ended, sums = reason_in[w] != 0, view_sums(share_out[w])
+            ended, sums = reason_in[w] != 0, task.view_Sums(share_out[w])
             if wp.static(tells_failures):
                 task.functions.tally(s0, t.action[w], s1, p, ended, sums, (reason_in[w] & TERMINATED) != 0)
             else:
@@ -51,4 +50,4 @@ def make_shared_memory_kernels(task: TaskCode) -> None:
         for i in range(sum_inout.shape[0]):
             sum_row_out[0, i] = float(wp.float64(sum_inout[i]) / wp.float64(UNIT))
             sum_inout[i] = wp.int64(0)
-        task.functions.share(view_shared(shared_inout[0]), view_sums(sum_row_out[0]), params[0])
+        task.functions.share(task.view_Shared(shared_inout[0]), task.view_Sums(sum_row_out[0]), params[0])

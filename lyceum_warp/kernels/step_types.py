@@ -1,7 +1,7 @@
 """Define the structs of a step's arrays, and collect the functions of a task that the kernels of a step call."""
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from types import SimpleNamespace
 from typing import Any
 
@@ -70,20 +70,16 @@ class TaskCode:
     Batch: Any  # the task's fields in all worlds
     Transition: Any  # before, after, params, weights, action and counters of a step in all worlds
     Observations: Any  # the observation groups
-    Shared: Any  # the memory that worlds share, or None
-    Sums: Any  # the sums over worlds, or None
     view: wp.Function  # (batch, world) -> World
     params_of: wp.Function  # (transition, world) -> Params
-    views: Mapping[Any, wp.Function]  # (row of floats) -> struct, for all structs but World
-    copy_state: wp.Function  # copies the fields that change in a step
+    view_Shared: wp.Function | None = None  # noqa: N815 (row of floats) -> Shared
+    view_Sums: wp.Function | None = None  # noqa: N815 (row of floats) -> Sums
+    copy_state: wp.Function | None = None  # copies the fields that change in a step, if there are any
     observe_group: wp.Function  # writes an observation group, and returns whether it is valid
     copy_observations: wp.Function
-    finite_memory: wp.Function
-    valid_model: wp.Function  # whether the model fields that the task writes are valid
+    finite_memory: wp.Function | None = None  # whether the task's memory is finite, if there is any
+    valid_model: wp.Function | None = None  # whether the model fields that the task writes are valid, if it writes any
     terms: SimpleNamespace  # the generated functions ``reward`` and ``score`` of a task with terms
-    has_state: bool  # whether ``copy_state`` is needed
-    has_memory: bool  # whether ``finite_memory`` is needed
-    checks_model: bool  # whether ``valid_model`` is needed
     kernels: dict[str, wp.Kernel | None] = dataclasses.field(default_factory=dict, init=False)
 
     def kernel(self, needed: bool = True) -> Callable[[Any], Any]:

@@ -16,7 +16,7 @@ EVENT = wp.constant(-2)
 
 
 def make_step_kernels(task: TaskCode) -> None:
-    @task.kernel(task.has_state)
+    @task.kernel(task.copy_state is not None)
     def keep_before(after: task.Batch, before_out: task.Batch, lanes: int, first: int):
         """Save the fields that a step changes; launched over (nworld, lanes)."""
         k, lane = wp.tid()
@@ -57,7 +57,7 @@ def make_step_kernels(task: TaskCode) -> None:
         fault_out[w] = fault
         t.counters.step[w] = t.counters.step[w] + 1
 
-    @task.kernel(task.checks_model)
+    @task.kernel(task.valid_model is not None)
     def check_model(batch: task.Batch, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the model fields that the task writes; launched over (nworld, lanes)."""
         k, lane = wp.tid()

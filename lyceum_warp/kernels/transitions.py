@@ -20,7 +20,7 @@ OBSERVE_FIRST = wp.constant(3)
 
 
 def make_transition_kernels(task: TaskCode) -> None:
-    @task.kernel(task.has_memory)
+    @task.kernel(task.finite_memory is not None)
     def check_memory(mask_in: wp.array[bool], t: task.Transition, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
         k, lane = wp.tid()

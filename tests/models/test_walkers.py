@@ -171,9 +171,7 @@ def test_motors_are_replaced_by_critically_damped_servos_with_the_same_limits() 
     assert kp == 40.0 and knee.biasprm[1] == -40.0 and hip.gainprm[0] == 60.0
     inertia = mujoco.MjModel.from_xml_string(XML.format(shape="box")).dof_M0[model.joint("knee").dofadr[0]]
     assert kd == pytest.approx(2 * np.sqrt(kp * inertia))
-    with pytest.raises(
-        ValueError, match="motor of the joint 'peg' has no limit: give it a ctrlrange or a forcerange"
-    ):
+    with pytest.raises(ValueError, match="motor of the joint 'peg' has no limit: give it a ctrlrange or a forcerange"):
         walkers.use_servos(spec, ["peg"])
 
 
