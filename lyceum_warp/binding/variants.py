@@ -101,7 +101,8 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     modules = list(dict.fromkeys(sys.modules[owner.__module__] for owner in owners))
     values = [value for module in modules for value in _values(module, owners)]
     structs = _new_structs(filter(is_struct, values), {declared: params, world: world, params: params})
-    replacements = _next_functions(owners) | _declared_replacements(values)
+    declaring = [value for value in values if isinstance(value, wp.Function) and hasattr(value, "replaces")]
+    replacements = _next_functions(owners) | {function.replaces: function for function in reversed(declaring)}
     modules = _with_helpers(modules, owners, {*structs, *structs.values(), world, params})
     functions = _functions(modules, owners)
     arguments = {kind for function in functions for overload in overloads(function)
@@ -112,17 +113,10 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replacements.items()))
     if key not in _variants:
         variant = _variants[key] = Variant(modules, functions, structs, replacements)
-        for original, replacement in replacements.items():
+        for replacement in replacements.values():
             copy = variant.seen(replacement, _home(replacement))
             check_structs(task, copy, {world: world.cls, params: declared.cls})
-            _check_replacement(task, variant, original, replacement)
     return _variants[key]
-
-
-def _declared_replacements(values: Sequence[Any]) -> dict[wp.Function, wp.Function]:
-    """Map each function to the one whose attribute ``replaces`` names it. The first of the values wins."""
-    functions = [value for value in values if isinstance(value, wp.Function) and hasattr(value, "replaces")]
-    return {function.replaces: function for function in reversed(functions)}
 
 
 def _functions(modules: Sequence[types.ModuleType], owners: Sequence[type[Task]]) -> list[wp.Function]:
@@ -244,18 +238,3 @@ def check_structs(task: str, function: wp.Function, declared: Mapping[Any, type]
 
 def _file(cls: type) -> str:
     return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)
-
-
-def _check_replacement(task: str, variant: Variant, old: wp.Function, new: wp.Function) -> None:
-    """Check that a replacement takes the same arguments as the function that it replaces."""
-    old_types = list(variant.seen(old, _home(new)).input_types.values())
-    new_types = list(variant.seen(new, _home(new)).input_types.values())
-    same = len(old_types) == len(new_types) and all(
-        a is b if is_struct(a) or is_struct(b) else wp.types.types_equal(a, b)
-        for a, b in zip(old_types, new_types, strict=True)
-    )
-    if not same:
-        raise ValueError(
-            f"{name_of(new)} of the task {task!r} replaces {name_of(old)} of {_home(old)}, so it must take the same "
-            f"arguments: {', '.join(old.input_types)}"
-        )
