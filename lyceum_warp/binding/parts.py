@@ -24,7 +24,7 @@ class Slice:
     @property
     def size(self) -> int:
         """Number of floats."""
-        return self.count * _floats(self.dtype)
+        return self.count * int(np.prod(getattr(self.dtype, "_shape_", ()), dtype=int))
 
 
 Layout = dict[str, Slice]
@@ -73,10 +73,6 @@ def view_lines(layout: Layout, struct: str, row: str, scope: dict[str, Any]) -> 
         pointer = f"{row}.ptr + wp.uint64({4 * part.start})"
         lines.append(f"{struct}.{name} = wp.array(ptr={pointer}, shape=({part.count},), dtype=dtype_{struct}_{name})")
     return lines
-
-
-def _floats(dtype: Any) -> int:
-    return int(np.prod(getattr(dtype, "_shape_", ()), dtype=int))
 
 
 def length(what: str, size: int | str, params: Mapping[str, Any]) -> int:

@@ -44,7 +44,9 @@ class Worlds(Resets):
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
         super().__init__(task, engine)
-        self._workers = self._make_workers()
+        # Warp's kernels in debug mode are not thread-safe
+        parallel = self.device.is_cpu and not engine.capturable and wp.config.mode != "debug"
+        self._workers = Workers(engine.launch_threads) if parallel and engine.launch_threads > 1 else None
         self._programs: dict[tuple[int, bool, bool], Programs] = {}
         horizon = task.definition.horizon if options.horizon is None else options.horizon
         self.configure(horizon=horizon, autoreset=options.autoreset, graphs=options.graphs)
@@ -70,13 +72,6 @@ class Worlds(Resets):
         self._programs.clear()
         del self.programs
 
-    def _make_workers(self) -> Workers | None:
-        # Warp's kernels in debug mode are not thread-safe
-        if not self.device.is_cpu or self.engine.capturable or wp.config.mode == "debug":
-            return None
-        nthread = self.engine.launch_threads
-        return Workers(nthread) if nthread > 1 else None
-
     # phases
 
     def step_phases(self, substeps: int | None = None, *, skip: bool = False) -> list[Phase]:
@@ -91,12 +86,12 @@ class Worlds(Resets):
 
         restarting = self.restarting
         restart, refresh = self.restart_phases(restarting, randomly=True), self.refresh_phases(restarting)
-        if not (events := self._event_phases()):
+        if (kernel := self.task.kernels.run_events) is None:
             return [*self.transition_phases(substeps), *only(restarting, restart, refresh, self._observe_phases())]
         return [
             *self.transition_phases(substeps),
             *only(restarting, restart),
-            *events,
+            Phase("event", partial(self._event, kernel)),
             *only(self._physics_changed, self._moved_phases()),
             *only(restarting, refresh),
             *self._observe_phases(),
@@ -137,10 +132,6 @@ class Worlds(Resets):
             *self.refresh_phases(self.mask),
             Phase("judge", self._judge_state, by_world=True),
         ]
-
-    def _event_phases(self) -> list[Phase]:
-        kernel = self.task.kernels.run_events
-        return [] if kernel is None else [Phase("event", partial(self._event, kernel))]
 
     def _moved_phases(self) -> list[Phase]:
         phases, changed = [], self._physics_changed

@@ -55,8 +55,11 @@ class Legs:
         self.has_home = mujoco.mj_name2id(model, _Kind.mjOBJ_KEY, "home") >= 0
         self.data = mujoco.MjData(model)
         self.data.qpos[:] = walkers.home_qpos(model)
-        if not self.has_home:
-            self._bend()
+        if not self.has_home:  # move hinge joints into the middle 90 % of their ranges
+            hinges = np.flatnonzero(model.jnt_limited & (model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE))
+            low, high = model.jnt_range[hinges].T
+            places, margin = model.jnt_qposadr[hinges], 0.05 * (high - low)
+            self.data.qpos[places] = np.clip(self.data.qpos[places], low + margin, high - margin)
         mujoco.mj_kinematics(model, self.data)
         self.feet = [self._named_foot(name) for name in feet] or self._lowest_feet()
         self.joints = list(joints) or self._leg_joints()
@@ -73,13 +76,6 @@ class Legs:
         """Height of the soles in the home pose, m."""
         self.height = float(self.data.xpos[self.base, 2]) - self.ground
         """Height of the base above the soles in the home pose, m."""
-
-    def _bend(self) -> None:
-        """Move hinge joints into the middle 90 % of their ranges."""
-        hinges = np.flatnonzero(self.model.jnt_limited & (self.model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE))
-        low, high = self.model.jnt_range[hinges].T
-        places, margin = self.model.jnt_qposadr[hinges], 0.05 * (high - low)
-        self.data.qpos[places] = np.clip(self.data.qpos[places], low + margin, high - margin)
 
     def _spheres(self, body: int) -> np.ndarray:
         geoms = walkers.contact_geoms(self.model, body)

@@ -273,10 +273,12 @@ def foot_geoms(model: mujoco.MjModel, p: Any) -> list[int]:
 
 def contact_geoms(model: mujoco.MjModel, body: int) -> list[int]:
     """List a body's geoms that can touch a geom of the world body."""
-    ground = np.flatnonzero(model.geom_bodyid == 0).tolist()
+    ground, geoms = np.flatnonzero(model.geom_bodyid == 0), np.flatnonzero(model.geom_bodyid == body)
+    types, affinities = model.geom_contype, model.geom_conaffinity
+    touches = types[geoms, None] & affinities[ground] | types[ground] & affinities[geoms, None]
     pairs = {frozenset(pair) for pair in zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)}
-    geoms = np.flatnonzero(model.geom_bodyid == body).tolist()
-    return [geom for geom in geoms if any(_collide(model, geom, other, pairs) for other in ground)]
+    listed = [[frozenset((geom, other)) in pairs for other in ground.tolist()] for geom in geoms.tolist()]
+    return geoms[(touches.astype(bool) | np.reshape(listed, touches.shape).astype(bool)).any(axis=1)].tolist()
 
 
 def foot_forces(model: mujoco.MjModel, p: Any) -> list[int]:
@@ -326,11 +328,6 @@ def _straight(model: mujoco.MjModel) -> mujoco.MjData:
     data.qpos[start : start + 7] = 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
     mujoco.mj_kinematics(model, data)
     return data
-
-
-def _collide(model: mujoco.MjModel, geom: int, other: int, pairs: set[frozenset[int]]) -> bool:
-    bits = model.geom_contype[geom] & model.geom_conaffinity[other]
-    return bool(bits | (model.geom_contype[other] & model.geom_conaffinity[geom])) or frozenset((geom, other)) in pairs
 
 
 def _with_margin(model: mujoco.MjModel, geom: int, spheres: np.ndarray) -> np.ndarray:
