@@ -6,6 +6,7 @@ from typing import Any
 
 from lyceum_warp.binding.functions import TaskSource
 from lyceum_warp.core.task import FUNCTIONS
+from lyceum_warp.support.suggestions import did_you_mean
 
 _LOWEST = {"frame_skip": 1, "draws": 1, "settle": 0, "horizon": 0, "success_steps": 1}
 """Attributes that are whole numbers, each with its smallest value."""
@@ -29,6 +30,9 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
             f"has success_steps = {task.success_steps}, but an episode has {task.horizon} steps, so no episode can "
             "succeed: lower success_steps, or raise horizon"
         )
+    if unknown := [name for name in task.params if name not in source.params.vars]:
+        hint = did_you_mean(unknown[0], source.params.vars, "add it to Params")
+        yield f"has {unknown[0]!r} in params, which is no field of Params: {hint}"
     for attribute in ("lagged", "cleared"):
         for name in getattr(task, attribute):
             if name not in source.world.vars:

@@ -53,7 +53,8 @@ class TaskSource:
         self._variant: Variant | None = None
         self.world: Any = self._struct("World")
         declared: Any = self._struct("Params")
-        self.defaults: type = declared.cls
+        replaced = {"__module__": declared.cls.__module__, **definition.params}
+        self.defaults: type = type("Params", (declared.cls,), replaced) if definition.params else declared.cls
         """The class whose attributes are the defaults of Params."""
         self.params: Any = self._with_functions(declared)
         self._variant = variant_of(name, self._owners, self.world, self.params, declared)

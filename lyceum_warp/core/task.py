@@ -387,6 +387,8 @@ class Task:
     "critic": {"position": 5, "mass": 1}}``. Then ``observe`` writes the group ``policy`` (``env.obs``).
     ``observe_critic`` has the same arguments and writes the group ``critic``. Omit ``obs`` if the last argument of
     ``observe`` is a Warp struct whose fields have the default ``lw.part(size)``."""
+    params: ClassVar[Mapping[str, Any]] = {}
+    """Defaults that replace those of ``Params``, such as ``{"move_speed": 8.0}`` for a faster variant of a task."""
     rewards: ClassVar[Mapping[str, float]] = {}
     """Terms of the reward with weights per second, such as ``{"upright": 1.0, "effort": -0.1}``. They replace
     ``reward``. A term is a function in the task's module that returns a float. Its arguments are found by name. A name

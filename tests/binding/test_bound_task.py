@@ -167,3 +167,13 @@ def test_parameters_that_change_the_observation_size_raise_an_error_and_are_not_
     assert env.task.params["exclude_current_positions_from_observation"] is True
     env.step(torch.zeros(2, 3))
     assert env.get_obs().shape == (2, 11)
+
+
+def test_params_of_a_class_replace_defaults_and_share_kernels(tmp_path: Path) -> None:
+    source = tiny_task.changed(("    dt: float", "    dt: float\n    gain: float = 1.0"))
+    file = tiny_task.write(tmp_path, f'{source}\nclass Fast(Tiny):\n    params = {{"gain": 3.0}}\n')
+    tiny, fast = (bound(Path(f"{file}:{name}")) for name in ("Tiny", "Fast"))
+    assert (tiny.params["gain"], fast.params["gain"]) == (1.0, 3.0) and fast.kernels is tiny.kernels
+    file.write_text(file.read_text().replace('{"gain"', '{"gian"'))
+    with pytest.raises(ValueError, match="the task 'fast' has 'gian' in params.*did you mean gain"):
+        bound(Path(f"{file}:Fast"))

@@ -104,13 +104,8 @@ class G1Stand(balancing.Balance):
             joint.damping, joint.frictionloss = [damping, 0.0, 0.0], 0.0
 
 
-@wp.struct
-class WalkParams(Params):
-    forward_speed: float = 0.6
-
-
 @lw.register
 class G1Walk(G1Stand):
     """A Unitree G1 with a rigid upper body walks forward, and keeps its balance when it is pushed."""
 
-    Params, evaluate = WalkParams, balancing.evaluate_distance
+    params, evaluate = {"forward_speed": 0.6}, balancing.evaluate_distance

@@ -52,21 +52,11 @@ class HumanoidStand(balancing.Balance):
     )
 
 
-@wp.struct
-class WalkParams(Params):
-    forward_speed: float = 0.8
-
-
 @lw.register
 class HumanoidWalk(HumanoidStand):
     """Gymnasium's humanoid walks forward, and keeps its balance when it is pushed."""
 
-    Params, evaluate = WalkParams, balancing.evaluate_distance
-
-
-@wp.struct
-class GetUpParams(Params):
-    push_times: wp.array[float] = [15.0]
+    params, evaluate = {"forward_speed": 0.8}, balancing.evaluate_distance
 
 
 @wp.func
@@ -92,7 +82,7 @@ def stands(s: World, p: Params) -> bool:
 class HumanoidGetUp(HumanoidStand):
     """Gymnasium's humanoid gets up from its back or its front, and succeeds if it stands for a second."""
 
-    Params = GetUpParams
+    params = {"push_times": [15.0]}
     initialize, randomize, success = lie_down, turn_over, stands
     terminations, success_steps = (), 67
     rewards = HumanoidStand.rewards | {

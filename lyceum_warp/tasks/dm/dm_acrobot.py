@@ -129,13 +129,8 @@ class AcrobotSwingup(lw.Task):
     )
 
 
-@wp.struct
-class SparseParams(Params):
-    margin: float = 0.0
-
-
 @lw.register
 class AcrobotSwingupSparse(AcrobotSwingup):
     """Swing up a double pendulum. The reward is 1 near the target and 0 elsewhere."""
 
-    Params = SparseParams
+    params = {"margin": 0.0}

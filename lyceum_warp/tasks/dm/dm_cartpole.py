@@ -54,38 +54,23 @@ class CartpoleBalance(lw.Task):
     obs = {"position": 3, "velocity": 2}
 
 
-@wp.struct
-class BalanceSparseParams(Params):
-    sparse: bool = True
-
-
 @lw.register
 class CartpoleBalanceSparse(CartpoleBalance):
     """Balance a pole on a cart. The reward is 1 near the goal and 0 elsewhere."""
 
-    Params = BalanceSparseParams
-
-
-@wp.struct
-class SwingupParams(Params):
-    swing_up: bool = True
+    params = {"sparse": True}
 
 
 @lw.register
 class CartpoleSwingup(CartpoleBalance):
     """Swing up a pole on a cart, and balance it."""
 
-    Params = SwingupParams
+    params = {"swing_up": True}
     planning = lw.Planning(settings={"horizon": 50}, options={"timestep": 0.02, "integrator": "euler"})
-
-
-@wp.struct
-class SwingupSparseParams(SwingupParams):
-    sparse: bool = True
 
 
 @lw.register
 class CartpoleSwingupSparse(CartpoleBalance):
     """Swing up a pole on a cart. The reward is 1 near the goal and 0 elsewhere."""
 
-    Params = SwingupSparseParams
+    params = {"swing_up": True, "sparse": True}

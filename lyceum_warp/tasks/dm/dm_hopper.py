@@ -53,13 +53,8 @@ class HopperStand(lw.Task):
     obs = {"position": 6, "velocity": 7, "touch": 2}
 
 
-@wp.struct
-class HopParams(Params):
-    hop_speed: float = 2.0
-
-
 @lw.register
 class HopperHop(HopperStand):
     """A planar hopper hops at 2 m/s."""
 
-    Params = HopParams
+    params = {"hop_speed": 2.0}

@@ -83,25 +83,15 @@ class HumanoidStand(lw.Task):
         suite.count_contacts(spec)
 
 
-@wp.struct
-class WalkParams(Params):
-    move_speed: float = 1.0
-
-
 @lw.register
 class HumanoidWalk(HumanoidStand):
     """A humanoid walks at 1 m/s."""
 
-    Params = WalkParams
-
-
-@wp.struct
-class RunParams(Params):
-    move_speed: float = 10.0
+    params = {"move_speed": 1.0}
 
 
 @lw.register
 class HumanoidRun(HumanoidStand):
     """A humanoid runs at up to 10 m/s."""
 
-    Params = RunParams
+    params = {"move_speed": 10.0}

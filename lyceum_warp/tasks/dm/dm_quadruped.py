@@ -120,14 +120,9 @@ class QuadrupedWalk(lw.Task):
         spec.geom("floor").size[:2] = cls.floor
 
 
-@wp.struct
-class RunParams(Params):
-    speed: float = 5.0
-
-
 @lw.register
 class QuadrupedRun(QuadrupedWalk):
     """A quadruped gets up and runs at 5 m/s."""
 
-    Params = RunParams
+    params = {"speed": 5.0}
     floor = 100.0

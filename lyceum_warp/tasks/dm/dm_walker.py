@@ -55,25 +55,15 @@ class WalkerStand(lw.Task):
     obs = {"orientations": 14, "height": 1, "velocity": 9}
 
 
-@wp.struct
-class WalkParams(Params):
-    move_speed: float = 1.0
-
-
 @lw.register
 class WalkerWalk(WalkerStand):
     """A planar walker walks at 1 m/s."""
 
-    Params = WalkParams
-
-
-@wp.struct
-class RunParams(Params):
-    move_speed: float = 8.0
+    params = {"move_speed": 1.0}
 
 
 @lw.register
 class WalkerRun(WalkerStand):
     """A planar walker runs at up to 8 m/s."""
 
-    Params = RunParams
+    params = {"move_speed": 8.0}
