@@ -4,11 +4,9 @@ The joints' gains stand in the model, MuJoCo Playground's g1_mjx_feetonly.xml: k
 the G1 has a gait clock.
 """
 
-import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import walkers
 from lyceum_warp.tasks.velocity import gait, gates, walking
 
 SIDES, FEET = ("left", "right"), ("left_foot", "right_foot")
@@ -50,11 +48,7 @@ class G1(walking.Biped):
     model = lw.playground_model("locomotion/g1/xmls/scene_mjx_feetonly_flat_terrain.xml")
     gate = gates.NanoG1(legs=len(LEGS))
     physics = {"coarse": lw.PhysicsOptions(integrator="discrete", frame_skip=2, timestep=0.01)}
-
-    @staticmethod
-    def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add force sensors to the feet, and ignore the friction of the ground."""
-        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+    edit_model = walking.playground_model_edit(FEET)
 
 
 @lw.register

@@ -1,10 +1,8 @@
 """H1Velocity: a Unitree H1 walks at a commanded velocity with its ten leg joints; torso and arms keep their pose."""
 
-import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import walkers
 from lyceum_warp.tasks.velocity import walking
 
 FEET = ("left_foot", "right_foot")
@@ -23,8 +21,4 @@ class Params(walking.BipedParams):
 @lw.register
 class H1Velocity(walking.Biped):
     model = lw.playground_model("locomotion/h1/xmls/scene_mjx_feetonly.xml")
-
-    @staticmethod
-    def edit_model(spec: mujoco.MjSpec) -> None:
-        """Add force sensors to the feet, and ignore the friction of the ground."""
-        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+    edit_model = walking.playground_model_edit(FEET)

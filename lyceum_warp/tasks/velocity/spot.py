@@ -1,10 +1,8 @@
 """SpotVelocity: a Boston Dynamics Spot walks at a commanded velocity. Feet are spheres."""
 
-import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import walkers
 from lyceum_warp.tasks.velocity import walking
 
 LEGS, FEET = ("fl", "fr", "hl", "hr"), ("FL", "FR", "HL", "HR")
@@ -26,8 +24,4 @@ class Params(walking.Params):
 class SpotVelocity(walking.Velocity):
     model = lw.playground_model("locomotion/spot/xmls/scene_mjx_feetonly_flat_terrain.xml")
     keyframe, frame_skip = "home", 5
-
-    @staticmethod
-    def edit_model(spec: mujoco.MjSpec) -> None:
-        """Ignore the friction of the ground, and use the humanoids' physics options."""
-        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+    edit_model = walking.playground_model_edit(FEET)

@@ -1,10 +1,8 @@
 """T1Velocity: a Booster T1 walks at a commanded velocity with its twelve leg joints; its upper body keeps still."""
 
-import mujoco
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import walkers
 from lyceum_warp.tasks.velocity import walking
 
 FEET = ("left_foot", "right_foot")
@@ -23,7 +21,4 @@ class Params(walking.BipedParams):
 @lw.register
 class T1Velocity(walking.Biped):
     model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
-
-    @staticmethod
-    def edit_model(spec: mujoco.MjSpec) -> None:
-        walkers.prepare_walker(spec, FEET, timestep=0.004, iterations=(3, 5))
+    edit_model = walking.playground_model_edit(FEET)

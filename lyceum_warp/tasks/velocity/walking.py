@@ -12,6 +12,8 @@ the shape of the ground.
 """
 
 import math
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -391,6 +393,11 @@ dof_pos_limits = terms.joint_limits
 @wp.func
 def evaluate(s: World, p: Params) -> float:  # velocity error, m/s
     return terms.velocity_error(command(s, p), terms.linear_velocity(s.qpos, s.qvel))
+
+
+def playground_model_edit(feet: Sequence[str]) -> Any:
+    """Return ``edit_model`` for a robot of MuJoCo Playground: add force sensors, and ignore the ground's friction."""
+    return staticmethod(partial(walkers.prepare_walker, feet=feet, timestep=0.004, iterations=(3, 5)))
 
 
 class Velocity(lw.Task):
