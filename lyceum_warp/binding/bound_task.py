@@ -1,6 +1,7 @@
 """Bind a task to its model and its parameters, and make its kernels."""
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import warp as wp
