@@ -458,7 +458,7 @@ class Env:
         if not torch.isfinite(action).all():
             world, i = (~torch.isfinite(action)).nonzero()[0].tolist()
             name = self.action_space.part_at(i)
-            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}, not finite")
+            raise ValueError(f"the action {name!r} of world {world} is {action[world, i].item()}: it must be finite")
 
     def field(self, name: str, element: str | None = None) -> torch.Tensor:
         """Get a live view of a field of MjData or MjModel, by MuJoCo's name.
