@@ -70,8 +70,8 @@ class BoundTask:
         try:
             self.model = models.compile_model(edited, data_fields, physics, varied={*model_fields, *dynamics})
         except ValueError as error:
-            source = task.model if model is None else model
-            file = source if isinstance(source, str | Path) else getattr(source, "file", None)
+            origin: Any = task.model if model is None else model
+            file = origin if isinstance(origin, str | Path) else getattr(origin, "file", None)
             raise ValueError(f"{file or f'the model of the task {self.name!r}'}: {error}") from error
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.timestep: float = self.model.opt.timestep * self.frame_skip
