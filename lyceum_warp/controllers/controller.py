@@ -35,6 +35,26 @@ class PlanningController(Controller, Protocol):
     There is no need to derive from ``PlanningController``.
     """
 
+    actions: torch.Tensor
+    """The last plan, (horizon, nact), all finite. The first action belongs to the given state."""
+    timestep: float
+    """Simulated seconds between two actions of the plan. By default this is the plant's time step.
+
+    One of the two time steps must be an integer multiple of the other.
+    """
+    between: Literal["hold", "linear"]
+    """How actions are interpolated between two steps of the plan; see ``MPPIConfig.between``."""
+    plants: int
+    """Number of plants for which the controller plans, by default 1. Control loops require one plant."""
+    samples: int
+    """Number of samples per plan."""
+    summary: Mapping[str, float]
+    """Quality of the last plan: ``failed_samples``, and the effective sample size as ``effective_samples``."""
+    settings: Mapping[str, Any]
+    """Settings to store in ``Trajectory.controller``. Values without a JSON type are converted to strings."""
+    env: Env
+    """Environment that simulates the plans. Do not use the plant here, because planning changes the state."""
+
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /, *, shift: int = 1) -> torch.Tensor:
         """Make a plan.
 
@@ -53,47 +73,4 @@ class PlanningController(Controller, Protocol):
 
     def reset(self, seed: int | None, /) -> object:
         """Prepare for a new episode. The loops call this method with the run's seed, unless ``reset=False``."""
-        ...
-
-    @property
-    def actions(self) -> torch.Tensor:
-        """The last plan, (horizon, nact), all finite. The first action belongs to the given state."""
-        ...
-
-    @property
-    def timestep(self) -> float:
-        """Simulated seconds between two actions of the plan. By default this is the plant's time step.
-
-        One of the two time steps must be an integer multiple of the other.
-        """
-        ...
-
-    @property
-    def between(self) -> Literal["hold", "linear"]:
-        """How actions are interpolated between two steps of the plan; see ``MPPIConfig.between``."""
-        ...
-
-    @property
-    def plants(self) -> int:
-        """Number of plants for which the controller plans, by default 1. Control loops require one plant."""
-        ...
-
-    @property
-    def samples(self) -> int:
-        """Number of samples per plan."""
-        ...
-
-    @property
-    def summary(self) -> Mapping[str, float]:
-        """Quality of the last plan: ``failed_samples``, and the effective sample size as ``effective_samples``."""
-        ...
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Settings to store in ``Trajectory.controller``. Values without a JSON type are converted to strings."""
-        ...
-
-    @property
-    def env(self) -> Env:
-        """Environment that simulates the plans. Do not use the plant here, because planning changes the state."""
         ...
