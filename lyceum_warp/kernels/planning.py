@@ -70,6 +70,7 @@ def perturb(
     noise_in: wp.array3d[float],
     scale_in: wp.array2d[float],
     diagonal: bool,
+    deviation_in: wp.array3d[float],
     smoothing: wp.vec3,
     include_plan: bool,
     low_in: wp.array[float],
@@ -79,8 +80,9 @@ def perturb(
     """Add correlated, smoothed noise to plans, and clip the actions to their bounds; launched over (nsample, nact).
 
     ``scale_in`` is the lower Cholesky factor L of the noise covariance: n_t = L z_t for standard normal z_t. Smoothing
-    follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). If ``include_plan``
-    is set, a plant's first sample is the plan without noise.
+    follows trajopt: e_t = n_t in the first two steps, then e_t = b0 n_t + b1 e_(t-1) + b2 e_(t-2). If there are
+    deviations, one for each element of the plan, they multiply e_t. If ``include_plan`` is set, a plant's first sample
+    is the plan without noise.
     """
     k, i = wp.tid()
     nsample, plants = noise_in.shape[1], nominal_in.shape[1]
@@ -96,35 +98,8 @@ def perturb(
             e = smoothing[0] * e + smoothing[1] * last + smoothing[2] * before_last
         before_last = last
         last = e
-        if exact:
-            e = 0.0
-        action_out[t, k, i] = wp.clamp(nominal_in[t, p, i] + e, low_in[i], high_in[i])
-
-
-@wp.kernel(enable_backward=False)
-def perturb_adapted(
-    nominal_in: wp.array3d[float],
-    noise_in: wp.array3d[float],
-    deviation_in: wp.array3d[float],
-    smoothing: wp.vec3,
-    include_plan: bool,
-    low_in: wp.array[float],
-    high_in: wp.array[float],
-    action_out: wp.array3d[float],
-):
-    """Add noise as ``perturb`` does, but with a standard deviation for each element of the plan."""
-    k, i = wp.tid()
-    nsample, plants = noise_in.shape[1], nominal_in.shape[1]
-    p = plant_of(k, nsample, plants)
-    exact = include_plan and k == first_row(p, nsample, plants)
-    last, before_last = float(0.0), float(0.0)
-    for t in range(noise_in.shape[0]):
-        s = noise_in[t, k, i]
-        if t >= 2:
-            s = smoothing[0] * s + smoothing[1] * last + smoothing[2] * before_last
-        before_last = last
-        last = s
-        e = deviation_in[t, p, i] * s
+        if deviation_in.shape[0] > 0:
+            e = deviation_in[t, p, i] * e
         if exact:
             e = 0.0
         action_out[t, k, i] = wp.clamp(nominal_in[t, p, i] + e, low_in[i], high_in[i])
@@ -181,11 +156,19 @@ def combine_models(world_return_in: wp.array[float], worst: bool, return_out: wp
 
 
 @wp.kernel(enable_backward=False, module=_TILES)
-def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[float], summary_out: wp.array2d[float]):
-    """Weigh samples by w = exp((R - max R) / temperature), divided by the sum; launched with one block for each plant.
+def weigh(
+    return_in: wp.array[float],
+    rank_in: wp.array[int],
+    elites: int,
+    temperature: float,
+    weight_out: wp.array[float],
+    summary_out: wp.array2d[float],
+):
+    """Weigh samples; launched with one block for each plant.
 
-    If all samples failed, all weights are zero. The summary is the best return, the mean return, the effective sample
-    size 1 / sum w^2, and the number of failed samples.
+    With ``elites``, the best samples that did not fail have equal weights. Otherwise, w = exp((R - max R) /
+    temperature), divided by the sum. If all samples failed, all weights are zero. The summary is the best return, the
+    mean return, the effective sample size 1 / sum w^2, and the number of failed samples.
     """
     p, lane = wp.tid()
     n = return_in.shape[0] // summary_out.shape[0]
@@ -196,24 +179,28 @@ def weigh(return_in: wp.array[float], temperature: float, weight_out: wp.array[f
     best = wp.tile_extract(wp.tile_max(wp.tile(best)), 0)
     total, square, mean, good = float(0.0), float(0.0), float(0.0), float(0.0)
     for k in range(first + lane, end, wp.block_dim()):
+        weight = float(0.0)
         if return_in[k] > -wp.inf:
-            weight = wp.exp((return_in[k] - best) / temperature)
+            if elites == 0:
+                weight = wp.exp((return_in[k] - best) / temperature)
+            elif rank_in[k] < elites:
+                weight = 1.0
             total += weight
             square += weight * weight
             mean += return_in[k]
             good += 1.0
+        weight_out[k] = weight
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     square = wp.tile_extract(wp.tile_sum(wp.tile(square)), 0)
     mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
     good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
     for k in range(first + lane, end, wp.block_dim()):
-        weight_out[k] = 0.0
         if return_in[k] > -wp.inf:
-            weight_out[k] = wp.exp((return_in[k] - best) / temperature) / total
+            weight_out[k] = weight_out[k] / total
     if lane == 0:
         summary_out[p, 0] = best
         summary_out[p, 1] = mean / good
-        summary_out[p, 2] = total * total / square
+        summary_out[p, 2] = wp.where(elites == 0, total * total / square, total)
         summary_out[p, 3] = float(n) - good
 
 
@@ -230,41 +217,6 @@ def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
         if return_in[j] > return_in[k] or (return_in[j] == return_in[k] and j < k):
             better += 1
     rank_out[k] = better
-
-
-@wp.kernel(enable_backward=False, module=_TILES)
-def weigh_elites(
-    return_in: wp.array[float],
-    rank_in: wp.array[int],
-    elites: int,
-    weight_out: wp.array[float],
-    summary_out: wp.array2d[float],
-):
-    """Weigh the best samples equally and the others by zero; launched with one block for each plant.
-
-    ``weigh`` explains the entries of the summary. Failed samples have zero weight, even if fewer than ``elites``
-    samples remain.
-    """
-    p, lane = wp.tid()
-    n = return_in.shape[0] // summary_out.shape[0]
-    first, end = p * n, (p + 1) * n
-    best, mean, good = float(-wp.inf), float(0.0), float(0.0)
-    for k in range(first + lane, end, wp.block_dim()):
-        if return_in[k] > -wp.inf:
-            best = wp.max(best, return_in[k])
-            mean += return_in[k]
-            good += 1.0
-    best = wp.tile_extract(wp.tile_max(wp.tile(best)), 0)
-    mean = wp.tile_extract(wp.tile_sum(wp.tile(mean)), 0)
-    good = wp.tile_extract(wp.tile_sum(wp.tile(good)), 0)
-    count = wp.min(float(elites), good)
-    for k in range(first + lane, end, wp.block_dim()):
-        weight_out[k] = wp.where(rank_in[k] < elites and return_in[k] > -wp.inf, 1.0 / count, 0.0)
-    if lane == 0:
-        summary_out[p, 0] = best
-        summary_out[p, 1] = mean / good
-        summary_out[p, 2] = count
-        summary_out[p, 3] = float(n) - good
 
 
 @wp.kernel(enable_backward=False, module=_TILES)

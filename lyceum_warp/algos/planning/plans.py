@@ -37,7 +37,8 @@ class Plans:
             self._low: wp.array = wp.array(space.low, dtype=float)
             self._high: wp.array = wp.array(space.high, dtype=float)
             self._fill: wp.array = wp.array(config.fill_action(space), dtype=float)
-            self._scale: wp.array = wp.array(factor, dtype=float)
+            # adapted deviations multiply standard normal noise
+            self._scale: wp.array = wp.array(np.eye(space.size) if adapts_noise else factor, dtype=float)
             self._first_deviation: wp.array = wp.array(np.diag(factor), dtype=float)
             self.seed = wp.zeros(plants, dtype=int)
             self.count = wp.zeros(plants, dtype=int)
@@ -77,16 +78,11 @@ class Plans:
         wp.launch(planning.draw_noise, dim, [self.seed, self.count, self.noise], device=device)
         wp.launch(planning.draw_keys, len(keys), [self.seed, self.count, keys], device=device)
         wp.launch(rollouts.add_to, plants, [1, self.count], device=device)
-        smoothing = wp.vec3(*config.noise_smoothing)
-        options = [smoothing, bool(config.include_plan), self._low, self._high, self.samples]
         if self.deviation is not None:
-            assert self.nominal_deviation is not None
             self._shift_rows(first, self.deviation, self._first_deviation, False, self.nominal_deviation)
-            deviations = [self.nominal, self.noise, self.nominal_deviation]
-            wp.launch(planning.perturb_adapted, dim, [*deviations, *options], device=device)
-        else:
-            factors = [self.nominal, self.noise, self._scale, self._diagonal]
-            wp.launch(planning.perturb, dim, [*factors, *options], device=device)
+        noise = [self.nominal, self.noise, self._scale, self._diagonal, self.nominal_deviation]
+        options = [wp.vec3(*config.noise_smoothing), bool(config.include_plan), self._low, self._high, self.samples]
+        wp.launch(planning.perturb, dim, [*noise, *options], device=device)
         self._interpolate(self.samples, self._world_actions)
 
     def interpolate(self) -> None:

@@ -114,8 +114,8 @@ class ExponentialWeights(PlanUpdate):
 
     def weigh(self, samples: PlanSamples) -> None:
         """Weight samples by exp(return / temperature)."""
-        returns, weights = by_sample(samples.returns), by_sample(samples.weights)
-        args = [returns, self.temperature, weights, wp.from_torch(samples.summary)]
+        args = [by_sample(samples.returns), None, 0, self.temperature]
+        args += [by_sample(samples.weights), wp.from_torch(samples.summary)]
         launch_blocks(planning.weigh, len(samples.returns), args)
 
 
@@ -136,8 +136,8 @@ class EliteWeights(PlanUpdate):
         returns, rank = by_sample(samples.returns), by_sample(self._rank)
         plants, count = samples.returns.shape
         wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
-        args = [returns, rank, self.elites, by_sample(samples.weights), wp.from_torch(samples.summary)]
-        launch_blocks(planning.weigh_elites, plants, args)
+        args = [returns, rank, self.elites, 1.0, by_sample(samples.weights), wp.from_torch(samples.summary)]
+        launch_blocks(planning.weigh, plants, args)
 
 
 class BestSample(EliteWeights):
