@@ -15,8 +15,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp.core.fields import describe
 from lyceum_warp.engines import memory
-from lyceum_warp.engines.deterministic import order_kernels as order
-from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.deterministic.contact_order import _ROWS, _SPARSE_ROWS, CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.deterministic.sort_memory import Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
@@ -115,7 +114,7 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
     wanted, counts = contents(d.efc), d.nefc.numpy()
     addresses = d.contact.efc_address.numpy().copy()
     assert counts.max() > 20
-    names = [name for name in order.Rows.vars if not name.startswith("jtdaj")]  # type: ignore[attr-defined]
+    names = [*_ROWS, *_SPARSE_ROWS, "J"]
     rng = np.random.default_rng(2)
     for w, n in enumerate(counts):
         kinds = np.minimum(wanted["type"][w, :n], 5)
@@ -145,17 +144,6 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
             np.testing.assert_array_equal(found[name][w, :nblock], wanted[name][w, :nblock], err_msg=name)
     n = int(d.nacon.numpy()[0])
     np.testing.assert_array_equal(d.contact.efc_address.numpy()[:n], addresses[:n])
-
-
-def test_contact_field_without_a_sorting_rule_raises_an_error(
-    forwarded: tuple[WarpEngine, CanonicalOrder], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    engine, _ = forwarded
-    # type: ignore[attr-defined]
-    known = {name: kind for name, kind in order.Contacts.vars.items() if name != "adhesion"}
-    monkeypatch.setattr(order.Contacts, "vars", known)
-    with pytest.raises(ValueError, match="does not know the contact field 'adhesion' of this mujoco_warp"):
-        CanonicalOrder(copy.copy(engine.m), engine.d)
 
 
 class Capturing:
