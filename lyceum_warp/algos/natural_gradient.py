@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import torch
 
 from lyceum_warp.algos.common.dense import DensePolicy
-from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.distributed import Team, flatten, unflatten
 from lyceum_warp.algos.common.policy import GaussianPolicy
 
 
@@ -58,10 +58,7 @@ class FisherProduct:
 
     def __call__(self, vector: torch.Tensor) -> torch.Tensor:
         """Compute (F + damping I) v, (parameters,)."""
-        parts = [
-            part.view_as(p)
-            for part, p in zip(vector.split([p.numel() for p in self.parameters]), self.parameters, strict=True)
-        ]
+        parts = unflatten(vector, self.parameters)
         log_std_part = vector if self.log_std_at is None else parts.pop(self.log_std_at)
         pulled = self.jacobian.pull(self.jacobian.push(parts) * self.precision)
         if self.log_std_at is not None:
@@ -111,11 +108,6 @@ def conjugate_gradient(
         previous, square = square, residual @ residual
         direction = residual + (square / previous).masked_fill(~(previous > 0), 0.0) * direction
     return x
-
-
-def flatten(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
-    """Concatenate tensors into one vector."""
-    return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 
 def _place(tensor: torch.Tensor, tensors: Iterable[torch.Tensor]) -> int | None:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import torch
 
 from lyceum_warp.algos.common.dense import dense_policy, predict
-from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.distributed import Team, unflatten
 from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.networks import Activation, Normalizer
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
@@ -442,13 +442,12 @@ class NPG(OnPolicyLearner):
         limit = self.config.kl_limit * desired + 1e-6  # margin for rounding
         parameters = [p for p in self.policy.parameters() if p.requires_grad]
         old = [p.clone() for p in parameters]
-        steps = [part.view_as(p) for part, p in zip(step.split([p.numel() for p in parameters]), old, strict=True)]
         old_log_std = self.policy.log_std.clone()
         lowest = old_log_std.clamp_max(self.config.min_log_std)
 
         def apply(fraction: torch.Tensor) -> torch.Tensor:
             """Apply a fraction of the step, and return the KL divergence."""
-            for parameter, before, part in zip(parameters, old, steps, strict=True):
+            for parameter, before, part in zip(parameters, old, unflatten(step, old), strict=True):
                 moved = before + fraction * part
                 if parameter is self.policy.log_std:
                     moved = torch.maximum(moved, lowest)

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import torch
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from lyceum_warp.algos.common.distributed import Captured, Team
+from lyceum_warp.algos.common.distributed import Captured, Team, flatten, unflatten
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
@@ -542,13 +542,13 @@ class GradientStep:
         """Make a gradient step, and return the loss and ``numbers``, each summed over all processes."""
         # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(loss, self.parameters)
-        parts = [*gradients, *(number.detach() for number in (loss, *numbers))]
-        sums = self.team.sum(torch.cat([part.reshape(-1).float() for part in parts]))
-        sizes = [p.numel() for p in self.parameters]
-        for parameter, part in zip(self.parameters, sums.split([*sizes, 1 + len(numbers)]), strict=False):
-            parameter.grad = part.view_as(parameter)
+        details = torch.stack([number.detach().float() for number in (loss, *numbers)])
+        sums = self.team.sum(flatten(part.float() for part in (*gradients, details)))
+        *gradient_sums, details = unflatten(sums, [*self.parameters, details])
+        for parameter, part in zip(self.parameters, gradient_sums, strict=True):
+            parameter.grad = part
         self.optimizer.step()
-        return sums[sum(sizes) :]
+        return details
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:

@@ -7,7 +7,7 @@ therefore affects only the rounding of sums.
 import contextlib
 import os
 import weakref
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch
 from torch import distributed
@@ -104,10 +104,10 @@ class Team:
         """
         if self.size > 1:
             tensors = list(tensors)
-            flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
-            distributed.broadcast(flat, 0)
-            for tensor, part in zip(tensors, flat.split([t.numel() for t in tensors]), strict=True):
-                tensor.copy_(part.view_as(tensor))
+            vector = flatten(tensors)
+            distributed.broadcast(vector, 0)
+            for tensor, part in zip(tensors, unflatten(vector, tensors), strict=True):
+                tensor.copy_(part)
 
     @contextlib.contextmanager
     def together(self) -> Iterator[None]:
@@ -130,6 +130,17 @@ class Team:
             raise
         if self.sum(failed).item() > 0:
             raise SystemExit(2)
+
+
+def flatten(tensors: Iterable[torch.Tensor]) -> torch.Tensor:
+    """Concatenate tensors into one vector."""
+    return torch.cat([tensor.reshape(-1) for tensor in tensors])
+
+
+def unflatten(vector: torch.Tensor, tensors: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+    """Split a vector into views with the shapes of ``tensors``."""
+    parts = vector.split([tensor.numel() for tensor in tensors])
+    return [part.view_as(tensor) for part, tensor in zip(parts, tensors, strict=True)]
 
 
 class Captured:

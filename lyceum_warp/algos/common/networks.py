@@ -25,16 +25,18 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {
 }  # fmt: skip
 
 
-def check_memory(sizes: Sequence[int], **arguments: Any) -> None:
-    """Check that a fully connected network with layers of the given sizes fits into memory.
+def check_memory(sizes: Sequence[int], networks: int = 1) -> None:
+    """Check that fully connected networks with layers of the given sizes fit into memory.
 
     Raises:
         ValueError: The weights do not fit into memory.
     """
-    needed, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
-    if free is not None and needed > free:
-        network = ", ".join(f"{name}={value}" for name, value in arguments.items())
-        raise ValueError(f"a network of {network} needs {needed / 1e9:.3g} GB, but only {free / 1e9:.3g} GB are free")
+    bytes_each, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
+    if free is not None and (size := networks * bytes_each) > free:
+        raise ValueError(
+            f"networks with layers of the sizes {list(sizes)} need {size / 1e9:.3g} GB, but only {free / 1e9:.3g} GB "
+            "are free: make hidden smaller"
+        )
 
 
 def mlp(
@@ -49,8 +51,9 @@ def mlp(
     ``sizes`` includes the input and the output. ``last_scale`` multiplies the last layer's initial weights.
 
     Raises:
-        ValueError: The activation is unknown.
+        ValueError: The activation is unknown, or the weights do not fit into memory.
     """
+    check_memory(sizes)
     check_word("activation", activation, list(ACTIVATIONS))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
     kind = ACTIVATIONS[activation]

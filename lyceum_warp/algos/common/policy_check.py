@@ -4,10 +4,11 @@ from typing import Any
 
 import torch
 
+from lyceum_warp.algos.common.distributed import flatten
 from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.value import ValueFunction
-from lyceum_warp.algos.natural_gradient import FisherProduct, flatten
+from lyceum_warp.algos.natural_gradient import FisherProduct
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.validate import check_group, check_kind, described, first_sentence
 

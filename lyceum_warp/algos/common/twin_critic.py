@@ -57,7 +57,7 @@ class TwinCritic(Normalized):
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
         sizes = [nobs + nact, *layer_sizes(hidden), whole_number("quantiles", quantiles, low=1)]
         check_word("activation", activation, list(ACTIVATIONS))
-        check_memory([2 * size for size in sizes], nobs=nobs, hidden=hidden, nact=nact)
+        check_memory(sizes, networks=2)
         super().__init__(nobs, normalize, limit)
         self.group = group
         self.shape = {

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.dense import DensePasses
-from lyceum_warp.algos.common.distributed import Captured, Team
+from lyceum_warp.algos.common.distributed import Captured, Team, flatten, unflatten
 from lyceum_warp.algos.common.timing import one_thread
 from lyceum_warp.algos.common.value import BOUND, ValueFunction
 
@@ -30,13 +30,10 @@ class ValueFit:
         self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
         # with one tensor, one all-reduce suffices
         self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
-        for parameter, part in zip(self.parameters, self._split(self.gradient), strict=True):
-            parameter.grad = part.view_as(parameter)
+        for parameter, part in zip(self.parameters, unflatten(self.gradient, self.parameters), strict=True):
+            parameter.grad = part
         self.captured: CapturedStep | None = None
-        self._good = torch.nn.utils.parameters_to_vector(self.parameters).detach()
-
-    def _split(self, flat: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return flat.split([p.numel() for p in self.parameters])
+        self._good = flatten(self.parameters).detach()
 
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
@@ -79,7 +76,7 @@ class ValueFit:
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
         """Back up the parameters and moments if all are finite, without waiting for the device."""
-        present = torch.cat([numbers.reshape(-1) for numbers in self._numbers()])
+        present = flatten(self._numbers())
         # Adam's initial moments are zero
         good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
         finite = self.team.sum((~present.isfinite()).any().float()) == 0
@@ -89,8 +86,8 @@ class ValueFit:
     @torch.no_grad()
     def _restore(self) -> None:
         numbers = self._numbers()
-        for tensor, part in zip(numbers, self._good.split([tensor.numel() for tensor in numbers]), strict=True):
-            tensor.copy_(part.view_as(tensor))
+        for tensor, part in zip(numbers, unflatten(self._good, numbers), strict=True):
+            tensor.copy_(part)
 
     def _local(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
         """Get the places and the weights of this process's samples among the samples of a mini-batch."""
@@ -127,7 +124,7 @@ class DenseSteps:
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
         self.fit, self.team = fit, fit.team
         self.count = int((fit.optimizer.state.get(fit.parameters[0]) or {}).get("step", 0))
-        self.parameters = torch.cat([parameter.reshape(-1) for parameter in passes.parameters])
+        self.parameters = flatten(passes.parameters)
         self.first, self.second = self._moments("exp_avg"), self._moments("exp_avg_sq")
         self.gradient, self.root = fit.gradient, torch.empty_like(self.parameters)
         self.passes = DensePasses(self._shaped(self.parameters), passes.activation)
@@ -136,11 +133,10 @@ class DenseSteps:
     def _moments(self, name: str) -> torch.Tensor:
         state = self.fit.optimizer.state
         moments = [(state.get(p) or {}).get(name, torch.zeros_like(p)) for p in self.fit.parameters]
-        return torch.cat([moment.detach().reshape(-1) for moment in moments])
+        return flatten(moments).detach()
 
-    def _shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
-        sizes = [p.numel() for p in self.fit.parameters]
-        return [part.view_as(p) for part, p in zip(flat.split(sizes), self.fit.parameters, strict=True)]
+    def _shaped(self, vector: torch.Tensor) -> list[torch.Tensor]:
+        return unflatten(vector, self.fit.parameters)
 
     def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
         """Run an epoch with a permutation of all processes' samples."""

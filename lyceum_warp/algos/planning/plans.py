@@ -78,7 +78,7 @@ class Plans:
         wp.launch(planning.draw_noise, dim, [self.seed, self.count, self.noise], device=device)
         wp.launch(planning.draw_keys, len(keys), [self.seed, self.count, keys], device=device)
         wp.launch(rollouts.add_to, plants, [1, self.count], device=device)
-        if self.deviation is not None:
+        if self.deviation is not None and self.nominal_deviation is not None:
             self._shift_rows(first, self.deviation, self._first_deviation, False, self.nominal_deviation)
         noise = [self.nominal, self.noise, self._scale, self._diagonal, self.nominal_deviation]
         options = [wp.vec3(*config.noise_smoothing), bool(config.include_plan), self._low, self._high, self.samples]

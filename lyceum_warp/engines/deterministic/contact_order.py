@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import mujoco_warp as mjw
 import warp as wp
@@ -80,8 +81,8 @@ class _Scratch:
         self.copies_back: wp.array = wp.array([_copy(*pair[::-1]) for pair in self.arrays], dtype=order.Copy)
 
 
-def _copy(source: wp.array, target: wp.array) -> order.Copy:
-    copy = order.Copy()
+def _copy(source: wp.array, target: wp.array) -> Any:
+    copy: Any = order.Copy()
     copy.source, copy.target = source, target
     return copy
 
