@@ -9,17 +9,16 @@ import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, given, parameters
 from lyceum_warp.cli.display import console, note, say, table
-from lyceum_warp.tuning import DIVERGENCE_STEPS, NUDGE, Difference, Tuning, tune
+from lyceum_warp.tuning import Difference, Tuning, tune
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Tune:
     """Measure the gains and side effects of physics options, and find the fastest that do not change a task's returns.
 
-    Each setting is compared with the unchanged task by steps per second, memory, faults, the divergence of
-    trajectories, and returns. The returns come from the same episodes under random actions and, with --run, under a
-    policy. Every result is appended to a JSON Lines file, so the same command continues a stopped search.
-    docs/physics.md explains the table.
+    Each setting is compared with the unchanged task by steps per second, memory, faults and returns. The returns come
+    from the same episodes under random actions and, with --run, under a policy. Every result is appended to a JSON
+    Lines file, so the same command continues a stopped search. docs/physics.md explains the table.
 
     $ lyceum-warp tune hopper --short
     $ lyceum-warp tune humanoid --run runs/humanoid-20260101-120000
@@ -88,13 +87,6 @@ def _report(tuning: Tuning, options: Tune) -> None:
     columns |= _planning_columns(rows, reference) if options.planning else _columns(rows, reference)
     columns["verdict"] = [row["verdict"] for row in rows]
     console.print(table(columns))
-    if not options.planning:
-        nudged = ", ".join(f"{value:.1e}" for value in reference["nudged_divergence"])
-        say(
-            f"{reference['in_contact']:.0%} of the states are in contact. The columns diverg. show the distance from "
-            "the unchanged task after 1, 10 and 50 steps. The unit is the distance that a perturbation of the initial "
-            f"state by {NUDGE:g} causes: {nudged}."
-        )
     for row in tuning.rows:
         if row["verdict"] == "refused":
             say(f"refused: {row['name']}: {row['refused']}")
@@ -122,9 +114,6 @@ def _columns(rows: list[dict[str, Any]], reference: dict[str, Any]) -> dict[str,
         "kB/\nworld": [f"{row['bytes_per_world'] / 1e3:.1f}" for row in rows],
         "faults/\nmillion": [f"{row['faults_per_million']:.3g}" if row["returns"] else "" for row in rows],
     }
-    for i, steps in enumerate(DIVERGENCE_STEPS):
-        unit = max(reference["nudged_divergence"][i], 1e-300)
-        columns[f"diverg.\n{steps}"] = [_short(row["divergence"][i] / unit) for row in rows]
     for name, heading in (("returns", "return, %"), ("clearly_worse", "clearly worse, %")):
         for source in reference.get(name, ()):
             intervals = [Difference(**row[name][source]) if source in row[name] else "" for row in rows]
@@ -140,7 +129,3 @@ def _planning_columns(rows: list[dict[str, Any]], reference: dict[str, Any]) -> 
     for kind in reference["ranks"]:
         columns[f"ranks,\n{kind}"] = ["{mean:.2f} [{low:.2f}, {high:.2f}]".format(**row["ranks"][kind]) for row in rows]
     return columns
-
-
-def _short(ratio: float) -> str:
-    return f"{ratio:.0e}" if ratio >= 1e4 else f"{ratio:.2g}" if ratio < 10 else f"{ratio:,.0f}"

@@ -3,7 +3,3 @@ from lyceum_warp.tuning.search import (
     Tuning as Tuning,
     tune as tune,
 )
-from lyceum_warp.tuning.trial import (
-    DIVERGENCE_STEPS as DIVERGENCE_STEPS,
-    NUDGE as NUDGE,
-)

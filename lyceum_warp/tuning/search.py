@@ -77,8 +77,8 @@ def tune(
 ) -> Tuning:
     """Find the fastest physics options that do not change a task's returns.
 
-    Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults,
-    divergence and returns. Returns are compared on pairs of episodes with the same initial states and random numbers.
+    Every setting is compared with the unchanged task in the same process, by steps per second, memory, faults
+    and returns. Returns are compared on pairs of episodes with the same initial states and random numbers.
     Settings are first tried alone. Then the best settings of all groups are combined. If the combination changes the
     returns, the setting with the smallest speed-up is removed, and the rest is tried again.
 

@@ -1,4 +1,4 @@
-"""Compare a physics setting with the unchanged task: speed, memory, faults, divergence and returns."""
+"""Compare a physics setting with the unchanged task: speed, memory, faults and returns."""
 
 import dataclasses
 import math
@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import mujoco
 import numpy as np
 import torch
 import warp as wp
@@ -17,13 +16,10 @@ from lyceum_warp.env import Env
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import TOLERANCES, buys, difference, episodes_needed, failures
 
-DIVERGENCE_STEPS = (1, 10, 50)
-NUDGE = 1e-6
-"""Standard deviation of a perturbation of positions and velocities. The growth of this perturbation shows how chaotic
-the task is."""
+_ACTIONS = 50
+"""Number of recorded actions that follow each recorded state."""
 _HALF_WIDTHS = {"returns": TOLERANCES["strict"] / 2, "clearly_worse": TOLERANCES["strict"]}
 """Target half-widths of the confidence intervals. They determine the number of episodes."""
-_CONTACT_STATES = 64
 
 Policy = Callable[[torch.Tensor], torch.Tensor]
 
@@ -40,7 +36,7 @@ class Effort:
     steps: int
     """Maximum number of steps in an episode, or 0 for the task's horizon."""
     recorded_at: tuple[int, ...]
-    """States are recorded after these numbers of steps. Speed and divergence are measured from the recorded states."""
+    """States are recorded after these numbers of steps. Speed is measured from the recorded states."""
 
 
 FULL = Effort(repeats=15, block_seconds=0.3, judging_seconds=60.0, steps=0, recorded_at=(5, 20, 50, 100))
@@ -78,7 +74,6 @@ class Trials:
         """Record states. Half of the worlds follow the policy, and the others act at random."""
         env, draw = self.reference, random_actions(self.reference, self.seed)
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
-        self._parts = [env.state_space.parts[name] for name in ("qpos", "qvel")]
         self._starts: list[torch.Tensor] = []
         self._actions: list[torch.Tensor] = []
         env.rand_reset(self.seed)
@@ -90,21 +85,10 @@ class Trials:
         for start in self._starts:
             env.set_state(start)
             actions = []
-            for _ in range(max(DIVERGENCE_STEPS)):
+            for _ in range(_ACTIONS):
                 actions.append(self._mixed(next(draw), policy_worlds))
                 env.step(actions[-1])
             self._actions.append(torch.stack(actions))
-        self._exact = [self._velocities(env, k) for k in range(len(self._starts))]
-        noise = torch.Generator("cpu").manual_seed(self.seed)
-        nudged = []
-        for k, start in enumerate(self._starts):
-            start = start.clone()
-            for part in self._parts:
-                moved = torch.randn(start[:, part].shape, generator=noise, dtype=torch.float64)
-                start[:, part] += NUDGE * moved.to(start.device)
-            nudged.append(self._velocities(env, k, start))
-        self.nudged = self._distance(nudged)
-        self.in_contact = self._share_in_contact()
         self._block = 1
         self._block = max(1, round(self.effort.block_seconds / self._seconds(env, 0)))
 
@@ -112,19 +96,6 @@ class Trials:
         if self.policy is None:
             return random
         return torch.where(policy_worlds, self.policy(self.reference.obs), random)
-
-    def _share_in_contact(self) -> float:
-        """Estimate the fraction of recorded states that have contacts."""
-        model, size = self.reference.task.model, self.reference.engine.integration_size
-        data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
-        states = torch.cat(self._starts)[:, :size].cpu().numpy()
-        states = states[:: max(1, len(states) // _CONTACT_STATES)]
-        count = 0
-        for state in states:
-            mujoco.mj_setState(model, data, state, kind)
-            mujoco.mj_fwdPosition(model, data)
-            count += data.ncon > 0
-        return count / len(states)
 
     # one setting
 
@@ -137,10 +108,8 @@ class Trials:
             return row | {"refused": str(error)}
         speed, speedup, low = self._speed(env)
         row |= {"steps_per_second": speed, "speedup": speedup, "speedup_low": low}
-        row |= {"in_contact": self.in_contact, "bytes_per_world": env.bytes_per_world}
+        row |= {"bytes_per_world": env.bytes_per_world}
         row["memory"] = env.bytes_per_world / self.reference.bytes_per_world
-        row["divergence"] = self._distance([self._velocities(env, k) for k in range(len(self._starts))])
-        row["nudged_divergence"] = self.nudged
         row |= {name: {} for name in self.judges}
         faults, steps = np.zeros(2), np.zeros(2)
         if not setting.physics or buys(low, row["memory"]):
@@ -177,26 +146,6 @@ class Trials:
             env.step(actions[step % len(actions)])
         wp.synchronize_device(env.device)
         return time.perf_counter() - start
-
-    def _velocities(self, env: Env, k: int, start: torch.Tensor | None = None) -> torch.Tensor:
-        """Record the velocities 1, 10 and 50 steps after ``_starts[k]``, (3, nworld, nv) float64; NaN after a fault."""
-        env.set_state(self._starts[k] if start is None else start)
-        velocities, bad = [], torch.zeros(env.nworld, dtype=torch.bool, device=env.obs.device)
-        for step, action in enumerate(self._actions[k], 1):
-            env.step(action)
-            bad |= env.done_reason & int(FAULTS) != 0
-            if step in DIVERGENCE_STEPS:
-                velocities.append(env.get_state()[:, self._parts[1]].masked_fill(bad[:, None], torch.nan))
-        return torch.stack(velocities)
-
-    def _distance(self, velocities: list[torch.Tensor]) -> list[float]:
-        """Compare velocities with those of the unchanged task after 1, 10 and 50 steps.
-
-        A state's distance is the root mean square over its relative differences. The result is the median over states.
-        """
-        exact, changed = torch.cat(self._exact, 1), torch.cat(velocities, 1)
-        scale = exact.square().nanmean(1, keepdim=True).sqrt().clamp_min(1e-9)
-        return ((changed - exact) / scale).square().mean(2).sqrt().nanmedian(1).values.tolist()
 
     def _compare(self, env: Env, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Get pairs of returns, (2, episodes), and count faults and steps with and without the setting.

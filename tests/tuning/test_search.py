@@ -36,7 +36,6 @@ def tuned(brief: None, tmp_path_factory: pytest.TempPathFactory) -> lw.Tuning:
 def test_best_setting_is_the_fastest_row_with_unchanged_returns(tuned: lw.Tuning) -> None:
     speeds = [row["speedup"] for row in tuned.rows]
     assert speeds == sorted(speeds, reverse=True)
-    assert tuned.reference["divergence"] == [0.0, 0.0, 0.0]
     same = [row for row in tuned.rows if row["verdict"] == "same"]
     assert tuned.best == (same[0] if same else None)
     if tuned.best is not None:

@@ -28,25 +28,20 @@ def trials(task: str = "half_cheetah", *, policy: bool = False, episodes: int | 
 
 def test_unchanged_task_gives_unchanged_returns() -> None:
     row = trials(policy=True).measure(SAME)
-    assert row["divergence"] == [0.0, 0.0, 0.0] and row["memory"] == 1.0
+    assert row["memory"] == 1.0
     assert set(row["returns"]) == set(row["clearly_worse"]) == {"random", "policy"}
     for found in row["returns"].values():
         assert found == {"mean": 0.0, "low": 0.0, "high": 0.0, "episodes": 16}
     assert row["faults_per_million"] == row["reference_faults_per_million"] == 0.0
 
 
-def test_coarse_physics_change_returns_and_states_more_than_a_perturbation_does() -> None:
-    own = trials(policy=True)
-    row = own.measure(CRUDE)
+def test_coarse_physics_change_returns() -> None:
+    row = trials(policy=True).measure(CRUDE)
     assert verdict({**row, "speedup_low": 2.0}, "loose") in ("different", "faults")
-    assert all(1e-8 < small < 1e-3 < found for small, found in zip(own.nudged, row["divergence"], strict=True))
 
 
-def test_sparse_jacobian_changes_results_only_by_rounding() -> None:
-    own = trials("hopper", nworld=8)
-    row = own.measure(Setting("", "", {"jacobian": "sparse"}))
-    assert row["divergence"][0] < 1e-9 < own.nudged[0] and "clearly_worse" not in row
-    assert 0.0 < own.in_contact < 1.0  # some robots are in the air
+def test_rows_of_tasks_with_terminations_have_no_clearly_worse_episodes() -> None:
+    assert "clearly_worse" not in trials("hopper", nworld=8).measure(SAME)
 
 
 @pytest.mark.long
@@ -65,7 +60,7 @@ def test_trial_of_an_invalid_setting_gives_the_error_of_mujoco() -> None:
 @pytest.mark.long
 def test_too_small_buffers_of_the_warp_engine_are_reported_as_faults() -> None:
     own = trials("hopper", engine="warp", nworld=8, nconmax=16, njmax=64)
-    assert own.measure(SAME)["divergence"] == [0.0, 0.0, 0.0]
+    assert own.measure(SAME)["returns"]["random"]["mean"] == 0.0
     row = own.measure(Setting("", "", {"nconmax": 1, "njmax": 2}))
     assert row["memory"] < 0.95 and row["faults_per_million"] > row["reference_faults_per_million"]
     assert verdict(row, "strict") == "faults"
