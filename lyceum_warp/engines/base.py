@@ -145,12 +145,6 @@ class Engine(abc.ABC):
         Every engine must implement this method by Warp launches only, so that graphs can capture it.
         """
 
-    def check_room(self) -> None:  # noqa: B027
-        """Log a warning if worlds exceed the limits on contacts or constraints.
-
-        It is called once, after the first reset.
-        """
-
     @abc.abstractmethod
     def reset(self, mask: wp.array) -> None:
         """Put the masked worlds into the initial state.

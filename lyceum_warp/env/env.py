@@ -229,8 +229,6 @@ class Env:
             if self.task.dynamics and not _replica:  # after construction, invalid values are faults
                 self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
             Probe(worlds).check_observations()
-            if not _replica:
-                self.engine.check_room()
         except Exception as error:
             if (clear := explained(error, self.task)) is error:
                 raise

@@ -74,14 +74,6 @@ def test_buffers_have_room_for_welds_that_a_task_activates(
     assert not caplog.messages
 
 
-def test_buffers_too_small_for_the_first_states_log_a_warning(
-    task_file: TaskFile, caplog: pytest.LogCaptureFixture
-) -> None:
-    lw.make(task_file("welded.py", TASK), engine="warp", nworld=2, njmax=8)
-    (message,) = caplog.messages
-    assert "begin with up to 48 constraints" in message and "njmax=8 and nconmax=" in message
-
-
 def test_randomized_fields_that_add_contacts_log_a_warning(
     task_file: TaskFile, caplog: pytest.LogCaptureFixture
 ) -> None:

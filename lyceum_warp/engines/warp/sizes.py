@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import hashlib
 import logging
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection
 from typing import Any
 
 import mujoco
@@ -14,9 +14,6 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
-from lyceum_warp.core.model_fields import ModelField
-from lyceum_warp.engines.c.batch_faults import call_batch
-from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.kernels import faults
 
 log = logging.getLogger(__name__)
@@ -26,8 +23,6 @@ _WORLDS, _HOLDS, _SUBSTEPS = 48, 25, 20
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
 elements, so a probe may miss many contacts. The second pair is MuJoCo Warp's default."""
-
-_FIRST = 32  # the number of worlds to check
 
 _FRICTION = {"dof_frictionloss", "tendon_frictionloss"}
 _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
@@ -74,34 +69,6 @@ def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> 
             "nconmax=%d and njmax=%d were measured on the model's own %s, which the task randomizes: "
             "give make() larger values if worlds end with contact_overflow or constraint_overflow",
             nconmax, njmax, ", ".join(names),
-        )  # fmt: skip
-
-
-def warn_of_little_room(
-    model: mujoco.MjModel,
-    states: np.ndarray,
-    fields: Iterable[ModelField],
-    values: Mapping[str, np.ndarray],
-    *,
-    nconmax: float,
-    njmax: int,
-) -> None:
-    """Log a warning if worlds start with more contacts or constraints than the capacities allow.
-
-    ``values`` are the model fields of the worlds. ``nconmax`` is an average over the worlds.
-    """
-    batch = Batch(model, min(len(states), _FIRST))
-    contacts, constraints = batch.bind("ncon"), batch.bind("nefc")
-    WorldModels(batch, fields).apply(
-        {name: rows[: batch.nsim].reshape(batch.nsim, -1) for name, rows in values.items()}
-    )
-    batch.state[:] = states[: batch.nsim]
-    call_batch(batch, batch.forward)
-    if contacts.mean() > nconmax or constraints.max() > njmax:
-        log.warning(
-            "worlds begin with up to %d constraints and %.3g contacts on average, but njmax=%d and nconmax=%d: "
-            "give make() larger values to avoid the faults constraint_overflow and contact_overflow",
-            constraints.max(), contacts.mean(), njmax, nconmax,
         )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import forward, sizes
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
 from lyceum_warp.engines.warp.group import Conditional, group_size
-from lyceum_warp.engines.warp.sizes import data_bytes, probe_sizes, warn_of_little_room, warn_of_unknown_sizes
+from lyceum_warp.engines.warp.sizes import data_bytes, probe_sizes, warn_of_unknown_sizes
 from lyceum_warp.engines.warp.varied_model import (
     ModelConstants,
     ModelRows,
@@ -252,13 +252,6 @@ class WarpEngine(Engine):
         bits = [sizes.CONTACT_BITS, sizes.CONSTRAINT_BITS, sizes.IGNORED_BITS]
         args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
-
-    def check_room(self) -> None:
-        with self._on_device():
-            mjw.get_state(self.m, self.d, self._state, _SPEC)
-        values = {name: self.arrays[name].numpy() for name in self.dynamics}
-        room = {"nconmax": self.d.naconmax / self.nworld, "njmax": self.njmax}
-        warn_of_little_room(self.model, self._state.numpy(), self.dynamics.values(), values, **room)
 
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
