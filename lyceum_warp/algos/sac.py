@@ -15,6 +15,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
@@ -24,6 +25,7 @@ from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision, room
 from lyceum_warp.algos.common.networks import Activation, trainable
+from lyceum_warp.algos.common.policy_check import check_sizes
 from lyceum_warp.algos.common.replay import Replay, Transitions, default_capacity
 from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
@@ -290,7 +292,13 @@ class SAC(Learner):
             env.obs_spaces[group].size, nact, config.value_hidden, activation=config.value_activation,
             layer_norm=config.layer_norm, quantiles=config.quantiles, group=group, **options,
         )  # fmt: skip
-        _check_sizes(self.policy, self.value, env, low, high)
+        check_sizes(self.policy, env)
+        check_sizes(self.value, env, "the value function", group=value_group(env, group))
+        if (bounds := (self.policy.shape["low"], self.policy.shape["high"])) != (low, high):
+            raise ValueError(
+                f"the policy's actions are from {bounds[0]} to {bounds[1]}, but actions of the task {env.task.name!r} "
+                f"are from {low} to {high}"
+            )
         trainable(self.policy.to(device))
         trainable(self.value.to(device))
         self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
@@ -553,25 +561,5 @@ class GradientStep:
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:
     """Get lower and upper bounds of actions, each (nact,). -limit and limit replace infinite bounds."""
-    space = env.action_space
-    assert space.low is not None and space.high is not None
-    return tuple(  # type: ignore[return-value]
-        [float(x) if math.isfinite(x) else sign * limit for x in bounds]
-        for bounds, sign in ((space.low, -1.0), (space.high, 1.0))
-    )
-
-
-def _check_sizes(policy: SquashedPolicy, value: TwinCritic, env: Env, low: list[float], high: list[float]) -> None:
-    name, nact = env.task.name, env.action_space.size
-    for module, space in ((policy, env.obs_space), (value, env.obs_spaces[value_group(env, value.group)])):
-        sizes = module.shape["nobs"], module.shape["nact"]
-        if sizes != (space.size, nact):
-            raise ValueError(
-                f"the {type(module).__name__} takes {sizes[0]} observations and {sizes[1]} actions, but the task "
-                f"{name!r} has {space.size} observations and {nact} actions"
-            )
-    if (policy.shape["low"], policy.shape["high"]) != (low, high):
-        raise ValueError(
-            f"the policy's actions are from {policy.shape['low']} to {policy.shape['high']}, but actions of the task "
-            f"{name!r} are from {low} to {high}"
-        )
+    low, high = np.array([env.action_space.low, env.action_space.high], dtype=float)
+    return np.where(np.isfinite(low), low, -limit).tolist(), np.where(np.isfinite(high), high, limit).tolist()

@@ -88,7 +88,7 @@ def test_planner_uses_named_physics_from_its_arguments_or_from_task_planning() -
     assert plan.env.options.physics == FAST and plan.settings["frame_skip"] == 2 and "base" not in plan.settings
     assert lw.MPPI(planned, horizon=2, samples=2, physics="exact").env.options.physics == PhysicsOptions()
     planned.planning = lw.Planning(options={"physics": "quick"})
-    with pytest.raises(ValueError, match="planning.options of the task 'planned': the task has no physics 'quick'"):
+    with pytest.raises(ValueError, match="planning of the task 'planned': the task has no physics 'quick'"):
         lw.MPPI(planned)
 
 

@@ -40,16 +40,16 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     _check_derivatives(policy, obs, twice=twice)
 
 
-def check_sizes(policy: Any, env: Env, name: str = "the policy") -> None:
-    """Check that a policy fits an environment's observations and actions; error messages call it ``name``.
+def check_sizes(module: Any, env: Env, name: str = "the policy", *, group: str = "policy") -> None:
+    """Check that a policy or critics fit an environment's observations and actions; error messages use ``name``.
 
     Raises:
-        ValueError: The sizes of the policy and the environment differ.
+        ValueError: The sizes of the module and the environment differ.
     """
-    nobs, nact = env.obs_space.size, env.action_space.size
-    if (policy.nobs, policy.nact) != (nobs, nact):
+    nobs, nact = env.obs_spaces[group].size, env.action_space.size
+    if (module.nobs, module.nact) != (nobs, nact):
         raise ValueError(
-            f"{name} takes {policy.nobs} observations and gives {policy.nact} actions, but the task "
+            f"{name} is made for {module.nobs} observations and {module.nact} actions, but the task "
             f"{env.task.name!r} has {nobs} observations and {nact} actions"
         )
 

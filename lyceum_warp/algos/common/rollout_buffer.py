@@ -1,6 +1,6 @@
 """Store the samples of a fixed number of steps in a preallocated buffer."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -9,6 +9,7 @@ import warp as wp
 
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.policy import GaussianPolicy
+from lyceum_warp.core.spaces import Space
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
@@ -202,14 +203,14 @@ class Rollout:
 
     def extremes(self) -> str:
         """Describe the reward and the observation of each group that have the largest magnitude, for error messages."""
-        rows: dict[str, tuple[torch.Tensor, Mapping[str, slice]]] = {"reward": (self.reward.unsqueeze(-1), {})}
+        rows = {"reward": (self.reward.unsqueeze(-1), Space())}
         for group, obs in self.obs_groups.items():
             name = "observation" if group == "policy" else f"observation of the group {group!r}"
-            rows[name] = obs, self.env.obs_spaces[group].parts
+            rows[name] = obs, self.env.obs_spaces[group]
         texts = []
-        for name, (values, parts) in rows.items():
+        for name, (values, space) in rows.items():
             t, world, column = map(int, np.unravel_index(int(values.abs().argmax()), values.shape))
-            part = "".join(f" in {part!r}" for part, columns in parts.items() if columns.start <= column < columns.stop)
+            part = f" in {space.part_at(column)!r}" if space.parts else ""
             where = f"in step {t + 1} of world {self.env.first_world + world}"
             texts.append(f"the largest {name} is {values[t, world, column]:g}{part} {where}")
         return "; ".join(texts)

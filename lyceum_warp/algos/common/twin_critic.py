@@ -60,6 +60,7 @@ class TwinCritic(Normalized):
         check_memory(sizes, networks=2)
         super().__init__(nobs, normalize, limit)
         self.group = group
+        self.nobs, self.nact = nobs, nact
         self.shape = {
             "nobs": nobs, "nact": nact, "hidden": layer_sizes(hidden), "activation": activation,
             "layer_norm": layer_norm, "quantiles": quantiles, "normalize": normalize, "limit": limit, "group": group,

@@ -1,8 +1,7 @@
 """Divide a planner's arguments into settings, options and parameters, with defaults from the task's ``planning``."""
 
-import contextlib
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -78,7 +77,8 @@ def planner_arguments(
     config = config.completed(value)
 
     _check_options(options)
-    env_options = _resolved(_planning(task)[1].changed(options), task)
+    env_options = _planning(task)[1].changed(options)
+    env_options = env_options.changed({"physics": env_options.physics.resolved(task.physics)})
     place = place_samples(
         env_options.engine, env_options.device, nthread=env_options.nthread,
         samples=config.samples * config.models * plants, spec=partial(task_spec, task, env_options.model),
@@ -154,21 +154,11 @@ def _planning(task: type[Task]) -> tuple[MPPIConfig, EnvOptions]:
     """Make the settings and the options of a task's ``planning``."""
     planning, name = task.planning, task_name(task)
     check_kind(f"planning of the task {name!r}", planning, Planning, "as lw.Planning(settings={'horizon': 16})")
-    with _named(f"planning.settings of the task {name!r}"):
-        config = MPPIConfig(**planning.settings)
-    with _named(f"planning.options of the task {name!r}"):
-        _check_options(planning.options)
-        options = _resolved(EnvOptions().changed(planning.options), task)
-    return config, options
-
-
-def _resolved(options: EnvOptions, task: type[Task]) -> EnvOptions:
-    return options.changed({"physics": options.physics.resolved(task.physics)})
-
-
-@contextlib.contextmanager
-def _named(part: str) -> Iterator[None]:
     try:
-        yield
+        config = MPPIConfig(**planning.settings)
+        _check_options(planning.options)
+        options = EnvOptions().changed(planning.options)
+        options = options.changed({"physics": options.physics.resolved(task.physics)})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{part}: {error}") from error
+        raise ValueError(f"planning of the task {name!r}: {error}") from error
+    return config, options

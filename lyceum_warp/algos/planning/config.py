@@ -97,9 +97,12 @@ class MPPIConfig:
         check_fields(self, _BOUNDS)
         object.__setattr__(self, "noise", _noise(self.noise))
         object.__setattr__(self, "smoothing", _smoothing(self.smoothing))
-        object.__setattr__(self, "fill", _fill(self.fill))
+        if not isinstance(self.fill, str) or self.fill not in ("zero", "repeat"):
+            fill = _numbers("fill", self.fill, "'zero', 'repeat' or an action of finite numbers", low=-math.inf)
+            object.__setattr__(self, "fill", fill)
         if self.min_noise is not None:
-            object.__setattr__(self, "min_noise", _deviations("min_noise", self.min_noise))
+            deviations = _numbers("min_noise", self.min_noise, "a standard deviation, or one for each action", low=0.0)
+            object.__setattr__(self, "min_noise", deviations)
         for name, most in (("elites", "samples"), ("knots", "horizon")):
             if (value := getattr(self, name)) is not None and value > getattr(self, most):
                 raise ValueError(f"{name}={value} must be at most {most}, which is {getattr(self, most)}")
@@ -212,10 +215,10 @@ def _tuples(array: np.ndarray) -> Any:
     return array.item() if array.ndim == 0 else tuple(map(_tuples, array))
 
 
-def _deviations(name: str, value: Any) -> Any:
+def _numbers(name: str, value: Any, rule: str, *, low: float) -> Any:
     array = _array(value)
-    if array is None or array.ndim > 1 or not array.size or (array < 0).any():
-        raise ValueError(f"{name} must be a standard deviation, or one for each action, not {value!r}")
+    if array is None or array.ndim > 1 or not array.size or (array < low).any():
+        raise ValueError(f"{name} must be {rule}, not {value!r}")
     return _tuples(array)
 
 
@@ -248,12 +251,3 @@ def _smoothing(smoothing: Any) -> Any:
             "the unit circle, so choose |b2| < 1 and |b1| < 1 - b2"
         )
     return b0, b1, b2
-
-
-def _fill(fill: Any) -> Any:
-    if isinstance(fill, str) and fill in ("zero", "repeat"):
-        return fill
-    array = _array(fill)
-    if array is None or array.ndim > 1 or not array.size:
-        raise ValueError(f"fill must be 'zero', 'repeat' or an action of finite numbers, not {fill!r}")
-    return _tuples(array)

@@ -325,10 +325,9 @@ class Planner:
         if not np.isfinite(values.dot(values)) and not (finite := np.isfinite(values)).all():
             index = int(np.flatnonzero(~finite)[0])
             plant, column = divmod(index, self.env.state_space.size)
-            parts = self.env.state_space.parts.items()
-            part = next(name for name, part in parts if part.start <= column < part.stop)
             raise ValueError(
-                f"the state{self._of(plant)} has {values[index]} in its {part!r}: pass finite states to the planner"
+                f"the state{self._of(plant)} has {values[index]} in its {self.env.state_space.part_at(column)!r}: pass "
+                "finite states to the planner"
             )
         return state
 
@@ -392,11 +391,11 @@ class Planner:
         parts: list[Phase | Callable[[], None]] = [perturb, *self._loop.phases]
         if self._value_in_torch:
             parts.append(self._evaluate)
+        weigh: Any = self._weigh_in_torch
+        fit: Any = self._fit
         if self._update.capturable:
-            parts += [Phase("weigh", self._weigh), Phase("average", self._average)]
-        else:
-            parts += [Phase("returns", self._add_up), self._weigh_in_torch, Phase("average", self._average_samples)]
-            parts.append(self._fit)
+            weigh, fit = Phase("weigh", partial(self._update.weigh, self._arrays)), Phase("fit", self._fit)
+        parts += [Phase("returns", self._add_up), weigh, Phase("average", self._average), fit]
         # combine phases into as few graphs as possible; functions that use torch run between the graphs
         calls: list[Any] = []
         for is_phase, group in itertools.groupby(parts, lambda part: isinstance(part, Phase)):
@@ -415,19 +414,11 @@ class Planner:
             models = [self._world_return, config.risk == "worst", self._return]
             wp.launch(planning.combine_models, len(self._return), models, device=device)
 
-    def _weigh(self) -> None:
-        self._add_up()
-        self._update.weigh(self._arrays)
-
-    def _average_samples(self) -> None:
+    def _average(self) -> None:
         launch_blocks(planning.check_weights, self.plants, [self._return, self._weight, self._valid, self._problem])
         plans = self._plans
         args = [self._weight, plans.samples, plans.nominal, self._valid, plans.plan]
         launch_blocks(planning.average, plans.plan.size, args)
-
-    def _average(self) -> None:
-        self._average_samples()
-        self._fit()
 
     def _fit(self) -> None:
         self._update.fit(self._arrays)

@@ -90,7 +90,7 @@ def test_unsuitable_network_raises_a_one_line_error(shared_env: SharedEnv, netwo
         (Net(), r"policy must be a GaussianPolicy, not Net: lw.GaussianPolicy\(nobs, nact, network=net\) makes one"),
         (
             lw.GaussianPolicy(5, 2),
-            "takes 5 observations and gives 2 actions, but the task 'point_mass' has 6 observations and 2 actions",
+            "is made for 5 observations and 2 actions, but the task 'point_mass' has 6 observations and 2 actions",
         ),
     ],
 )

@@ -55,11 +55,11 @@ def test_planning_attribute_of_the_task_applies_to_the_planner() -> None:
     ("planning", "message"),
     [
         ({"horizon": 3}, r"planning of the task 'planned' .*lw.Planning\(.*\{'horizon': 3\}"),
-        (Planning(settings={"horizont": 3}), "planning.settings .* 'planned': .*'horizont': did you mean horizon"),
-        (Planning(options={"integratr": "rk4"}), "planning.options .*'integratr': did you mean integrator"),
+        (Planning(settings={"horizont": 3}), "planning .* 'planned': .*'horizont': did you mean horizon"),
+        (Planning(options={"integratr": "rk4"}), "planning .*'integratr': did you mean integrator"),
         (Planning(params={"limt": 3.0}), "'planned' .*'limt': did you mean limit"),
-        (Planning(settings={"horizon": 0}), "planning.settings of the task 'planned': horizon .* 0"),
-        (Planning(options={"nworld": 3}), "planning.options of the task 'planned': .*nworld"),
+        (Planning(settings={"horizon": 0}), "planning of the task 'planned': horizon .* 0"),
+        (Planning(options={"nworld": 3}), "planning of the task 'planned': .*nworld"),
     ],
 )  # fmt: skip
 def test_invalid_planning_raises_an_error_that_names_the_task_and_the_entry(planning: Any, message: str) -> None:
