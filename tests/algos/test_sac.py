@@ -200,7 +200,7 @@ def test_training_continues_from_given_networks(env: lw.Env) -> None:
         lw.SAC(env, wide)
     with pytest.raises(
         ValueError,
-        match="the value function is made for 1 observations and 1 actions, .* has 2 observations and 1 actions",
+        match="the value function is made for 1 observations and 1 actions, .* has 2 obs",
     ):
         lw.SAC(env, value=lw.TwinCritic(1, 1, group="critic"))
 
