@@ -7,8 +7,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
-from lyceum_warp.env.curriculum import Curriculum, start_episodes
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Curriculum, Env, start_episodes
 from lyceum_warp.support.validate import memoryless_action, whole_number
 
 

@@ -78,6 +78,8 @@ class Engine(abc.ABC):
     """The fields that cannot be computed from the integration state. They have the order of the state vector."""
     integration_size: int
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
+    estimated_bytes: int = 0
+    """The estimate of ``bytes_per_world``; 0 if the engine has none."""
     state_size: int
     """The number of floats in one world's state: the integration state, ``snapshots`` and the model fields."""
 

@@ -96,20 +96,13 @@ def open_engine(
     """
     fields, dynamics = list(fields), list(dynamics)
     factory, kwargs = _resolved(engine, device, options)
+    needed = 0
     if hasattr(factory, "bytes_per_world"):
-        needed = int(factory.bytes_per_world(model, fields, dynamics, **kwargs)) + reserved
-        check_fit(needed, nworld, device, model=_model_name(model))
-    return factory(model, nworld, device, fields, dynamics, initial, **kwargs)
-
-
-def bytes_per_world(
-    engine: str | EngineFactory, model: mujoco.MjModel, device: wp.Device, fields: Iterable[Field],
-    dynamics: Iterable[ModelField] = (), **options: Any,
-) -> int:  # fmt: skip
-    """Estimate the bytes of memory per world for the engine that ``open_engine`` makes; 0 if unknown."""
-    factory, kwargs = _resolved(engine, device, options)
-    estimate = getattr(factory, "bytes_per_world", None)
-    return 0 if estimate is None else int(estimate(model, list(fields), list(dynamics), **kwargs))
+        needed = int(factory.bytes_per_world(model, fields, dynamics, **kwargs))
+        check_fit(needed + reserved, nworld, device, model=_model_name(model))
+    made = factory(model, nworld, device, fields, dynamics, initial, **kwargs)
+    made.estimated_bytes = needed
+    return made
 
 
 def options_for_few_worlds(engine: str | EngineFactory, device: str | wp.Device | None) -> dict[str, Any]:

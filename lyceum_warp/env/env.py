@@ -22,7 +22,7 @@ from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOp
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.placement import bytes_per_world, find_device, open_engine, options_for_few_worlds
+from lyceum_warp.engines.placement import find_device, open_engine, options_for_few_worlds
 from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.probe import Probe
 from lyceum_warp.env.worlds import Worlds
@@ -630,9 +630,7 @@ class Env:
     @property
     def bytes_per_world(self) -> float:
         """Estimate the memory per world in bytes, without the model, which all worlds share."""
-        physics = self.options.engine, self.task.model, self.device, self.task.fields
-        engine = bytes_per_world(*physics, dynamics=self.task.dynamics, **self.options.for_engine())
-        return engine + own_bytes_per_world(self.task)
+        return self.engine.estimated_bytes + own_bytes_per_world(self.task)
 
     @property
     def fault_counts(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ from lyceum_warp.core.fields import describe, state_columns
 from lyceum_warp.core.model_fields import describe_model_field
 from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
-from lyceum_warp.engines.placement import bytes_per_world, open_engine
+from lyceum_warp.engines.placement import open_engine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 XML = """<mujoco><option integrator="implicitfast" cone="elliptic" timestep=".004"/>
@@ -207,7 +207,7 @@ def test_worlds_reset_to_the_given_initial_state(engine: type[Engine], varied: t
 def test_worlds_with_different_models_need_more_memory(engine: type[Engine]) -> None:
     dynamics = [describe_model_field(MODEL, name) for name in DRAWN]
     floats = sum(field.size for field in dynamics)
-    plain, varied = (bytes_per_world(engine, MODEL, CPU, [], fields) for fields in ((), dynamics))
+    plain, varied = (engine.bytes_per_world(MODEL, [], fields) for fields in ((), dynamics))
     assert plain + 8 * floats <= varied < plain + 40 * floats + 4000
 
 

@@ -89,7 +89,7 @@ def test_too_many_worlds_for_the_memory_raise_an_error_before_the_engine_is_made
     engine: Any, model: mujoco.MjModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cpu = wp.get_device("cpu")
-    each = placement.bytes_per_world(engine, model, cpu, [])
+    each = open_engine(engine, model, 1, cpu, []).estimated_bytes
     assert each > 8 * mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION.value)
     monkeypatch.setattr(memory, "free_memory", lambda device: int(10.5 * each / 0.9))
     open_engine(engine, model, 10, cpu, [])

@@ -148,11 +148,8 @@ class DensePolicy(GaussianPolicy):
         if len(obs) > len(self._normalized):
             self._normalized = torch.empty_like(obs)
         rows = self._normalized[: len(obs)]
-        array = rows.numpy()
-        np.subtract(obs.numpy(), normalizer.shift.numpy(), out=array)
-        np.multiply(array, normalizer.scale.numpy(), out=array)
-        np.clip(array, -normalizer.limit, normalizer.limit, out=array)
-        return self.passes(rows)
+        torch.sub(obs, normalizer.shift, out=rows).mul_(normalizer.scale)
+        return self.passes(rows.clamp_(-normalizer.limit, normalizer.limit))
 
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Sample actions; see ``GaussianPolicy.sample``."""

@@ -11,8 +11,7 @@ from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy import Policy, acting
 from lyceum_warp.engines.memory import check_fit
-from lyceum_warp.env.curriculum import Curriculum, start_episodes
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Curriculum, Env, start_episodes
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, described, memoryless_action, whole_number
 

@@ -14,8 +14,7 @@ from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy import Policy
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.engines.placement import options_on_cores
-from lyceum_warp.env.curriculum import Curriculum
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Curriculum, Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.intervals import clear_losses, mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number

@@ -12,9 +12,7 @@ import torch
 
 from lyceum_warp.algos.planning.config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.planning.updates import PlanUpdate
-from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.binding.models import task_spec
-from lyceum_warp.binding.registry import task_name
+from lyceum_warp.binding import TaskSource, task_name, task_spec
 from lyceum_warp.core.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.core.task import Planning, Task
 from lyceum_warp.engines.placement import place_samples

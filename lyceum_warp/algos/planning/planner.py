@@ -42,21 +42,17 @@ from lyceum_warp.algos.planning.arguments import plain, planner_arguments, plant
 from lyceum_warp.algos.planning.config import MPPIConfig
 from lyceum_warp.algos.planning.plans import Plans
 from lyceum_warp.algos.planning.updates import (
-    BestSample,
     CrossEntropy,
+    EliteWeights,
     ExponentialWeights,
     PlanSamples,
     PlanUpdate,
     launch_blocks,
 )
 from lyceum_warp.binding.registry import find_task
-from lyceum_warp.core.done import Done
-from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import Task
+from lyceum_warp.core import Done, EnvOptions, Task
 from lyceum_warp.engines.memory import NotEnoughMemoryError
-from lyceum_warp.env.arrays import memory_columns
-from lyceum_warp.env.env import Env
-from lyceum_warp.env.openloop import OpenLoop
+from lyceum_warp.env import Env, OpenLoop, memory_columns
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning
 from lyceum_warp.support.arrays import flat, torch_view
@@ -546,7 +542,7 @@ def _update_of(config: MPPIConfig) -> PlanUpdate:
     if config.update == "cem":
         assert config.elites is not None and config.min_noise is not None
         return CrossEntropy(config.elites, config.min_noise, config.noise_smoothing)
-    return ExponentialWeights(config.temperature) if config.update == "mppi" else BestSample()
+    return ExponentialWeights(config.temperature) if config.update == "mppi" else EliteWeights(elites=1)
 
 
 class MPPI(Planner):  # noqa: D101

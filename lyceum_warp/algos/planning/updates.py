@@ -120,7 +120,13 @@ class ExponentialWeights(PlanUpdate):
 
 
 class EliteWeights(PlanUpdate):
-    """Give the best samples equal weights, and all other samples the weight 0."""
+    """Give the best samples equal weights, and all other samples the weight 0.
+
+    With a single elite, this is predictive sampling: the sample with the largest return becomes the new plan. The
+    previous plan is one of the samples, so only a better plan can replace it. Predictive sampling was proposed by
+    Howell et al., 2022 ("Predictive sampling: real-time behaviour synthesis with MuJoCo"), for plans that are splines
+    with a few knots.
+    """
 
     capturable = True
 
@@ -138,18 +144,6 @@ class EliteWeights(PlanUpdate):
         wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
         args = [returns, rank, self.elites, 1.0, by_sample(samples.weights), wp.from_torch(samples.summary)]
         launch_blocks(planning.weigh, plants, args)
-
-
-class BestSample(EliteWeights):
-    """Update plans by predictive sampling: the sample with the largest return becomes the new plan.
-
-    The previous plan is one of the samples, so only a better plan can replace it. Predictive sampling was proposed by
-    Howell et al., 2022 ("Predictive sampling: real-time behaviour synthesis with MuJoCo"), for plans that are splines
-    with a few knots.
-    """
-
-    def __init__(self) -> None:
-        super().__init__(elites=1)
 
 
 class CrossEntropy(EliteWeights):
