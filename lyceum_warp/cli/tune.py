@@ -94,8 +94,6 @@ def _report(tuning: Tuning, options: Tune) -> None:
             kind = min(row["ranks"], key=lambda kind: row["ranks"][kind]["mean"])
             mean = row["ranks"][kind]["mean"]
             say(f"not suggested: {row['name']}: the rank correlation of samples is {mean:.2f} in {kind} states")
-    for reason in tuning.not_tried:
-        say(f"not tried: {reason}")
     if tuning.best is None:
         unknown = sum(row["verdict"] == "not shown" for row in tuning.rows)
         hint = f" ({unknown} not shown: more --episodes may decide)" if unknown else ""

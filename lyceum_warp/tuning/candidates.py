@@ -62,16 +62,6 @@ def candidates(env: Env) -> list[Setting]:
     return settings
 
 
-def not_tried(env: Env) -> list[str]:
-    """List the settings that the search omits on the environment's engine, each with the reason."""
-    reasons = ["the PGS solver: MuJoCo Warp lacks it, so the package uses Newton on both engines"]
-    if env.engine.name != "warp":
-        reasons.append("nconmax and njmax: the C engine allocates contacts and constraints as they appear")
-    elif env.task.model.nv > _DENSE_LIMIT:
-        reasons.append(f"a dense Jacobian: MuJoCo Warp supports it up to {_DENSE_LIMIT} degrees of freedom")
-    return reasons
-
-
 def combined(settings: Iterable[Setting]) -> Setting | None:
     """Combine settings, or return None if the result equals one of them.
 

@@ -13,7 +13,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_word, whole_number
 from lyceum_warp.training import Configuration, Run, load
-from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, not_tried, task_line
+from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, task_line
 from lyceum_warp.tuning.judgement import TOLERANCES, verdict
 from lyceum_warp.tuning.ranking import Rankings
 from lyceum_warp.tuning.row_file import RowFile, identity
@@ -40,8 +40,6 @@ class Tuning:
     ``refused`` then contains the error. A planner's setting may also get the verdict "ranks badly"."""
     reference: Row
     """Results of a comparison of the unchanged task with itself."""
-    not_tried: list[str]
-    """Settings that were not tried, with reasons."""
     path: Path
     """Path of the results file."""
 
@@ -171,4 +169,4 @@ def _search(
             break
         settings = settings[: settings.index(combination.parts[-1])]
     rows.sort(key=lambda row: -row.get("speedup", 0.0))
-    return Tuning(rows, reference, not_tried(trials.reference), file.path)
+    return Tuning(rows, reference, file.path)
