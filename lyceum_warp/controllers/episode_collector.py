@@ -109,10 +109,6 @@ class EpisodeCollector:
         self._now = now
         self.start = now()
 
-    def restart_clock(self) -> None:
-        """Restart the clock."""
-        self.start = self._now()
-
     def elapsed(self) -> float:
         """Return the seconds on the clock."""
         return self._now() - self.start

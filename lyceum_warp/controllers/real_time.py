@@ -120,7 +120,7 @@ def control_async(
         try:
             planner.publish(0, episode.states[0], episode.obs[0], None)
             planner.wait()
-            episode.restart_clock()
+            episode.start = clock.now()
             wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
             planner.stop()
             planner.check()

@@ -221,10 +221,7 @@ def rank(return_in: wp.array[float], samples: int, rank_out: wp.array[int]):
 
 @wp.kernel(enable_backward=False, module=_TILES)
 def check_weights(
-    return_in: wp.array[float],
-    weight_in: wp.array[float],
-    valid_out: wp.array[bool],
-    problem_inout: wp.array[int],
+    return_in: wp.array[float], weight_in: wp.array[float], valid_out: wp.array[bool], problem_inout: wp.array[int]
 ):
     """Check the weights of each plant's samples; launched with one block for each plant.
 
@@ -254,10 +251,7 @@ def check_weights(
 
 @wp.kernel(enable_backward=False)
 def undo_bad_fit(
-    valid_in: wp.array[bool],
-    before_in: wp.array3d[float],
-    problem_inout: wp.array[int],
-    after_inout: wp.array3d[float],
+    valid_in: wp.array[bool], before_in: wp.array3d[float], problem_inout: wp.array[int], after_inout: wp.array3d[float]
 ):
     """Undo changes that are not finite, and all changes for plants without valid weights.
 

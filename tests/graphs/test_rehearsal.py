@@ -3,7 +3,7 @@ import threading
 import pytest
 import warp as wp
 
-from lyceum_warp.graphs.rehearsal import rehearse
+from lyceum_warp.graphs.compilation import rehearse
 from lyceum_warp.kernels.state import fill_rows64
 
 REPLACED = {

@@ -1,10 +1,11 @@
 """Measure the duration of an iteration's phases, and control torch's threads on the CPU."""
 
 import contextlib
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -19,8 +20,7 @@ class PhaseTimer:
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.cuda = device, device.type == "cuda"
-        self._events: list[torch.cuda.Event] = []
-        self._times: list[float] = []
+        self._marks: list[Any] = []  # times, or CUDA events
         self.mark()
 
     def mark(self) -> None:
@@ -28,17 +28,17 @@ class PhaseTimer:
         if self.cuda:
             event = torch.cuda.Event(enable_timing=True)
             event.record(torch.cuda.current_stream(self.device))
-            self._events.append(event)
+            self._marks.append(event)
         else:
-            self._times.append(time.perf_counter())
+            self._marks.append(time.perf_counter())
 
     def seconds(self) -> list[float]:
         """Return the durations of the phases in seconds, after waiting for the device."""
+        phases = itertools.pairwise(self._marks)
         if not self.cuda:
-            return [end - start for start, end in zip(self._times, self._times[1:], strict=False)]
-        self._events[-1].synchronize()
-        pairs = zip(self._events, self._events[1:], strict=False)
-        return [start.elapsed_time(end) * 1e-3 for start, end in pairs]
+            return [end - start for start, end in phases]
+        self._marks[-1].synchronize()
+        return [start.elapsed_time(end) * 1e-3 for start, end in phases]
 
 
 @contextlib.contextmanager

@@ -182,11 +182,7 @@ class WarpEngine(Engine):
         self.refresh_current(self._everyone)
 
     def _forward(
-        self,
-        parts: Collection[Part] | None,
-        stage: Stage,
-        data: mjw.Data | None = None,
-        model: mjw.Model | None = None,
+        self, parts: Collection[Part] | None, stage: Stage, data: mjw.Data | None = None, model: mjw.Model | None = None
     ) -> None:
         """Run parts of a forward pass in every world of a Data. By default, run all parts up to ``stage``."""
         m, d = self.m if model is None else model, self.d if data is None else data
