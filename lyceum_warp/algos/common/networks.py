@@ -51,9 +51,8 @@ def mlp(
     ``sizes`` includes the input and the output. ``last_scale`` multiplies the last layer's initial weights.
 
     Raises:
-        ValueError: The activation is unknown, or the weights do not fit into memory.
+        ValueError: The activation is unknown.
     """
-    check_memory(sizes)
     check_word("activation", activation, list(ACTIVATIONS))
     check_kind("generator", generator, torch.Generator | None, "as torch.Generator()")
     kind = ACTIVATIONS[activation]

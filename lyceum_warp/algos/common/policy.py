@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, mlp
+from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, check_memory, mlp
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
@@ -59,6 +59,7 @@ class GaussianPolicy(Normalized):
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
+        check_memory([nobs, *layer_sizes(hidden), nact])
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize, "limit": limit}

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, initialize_as_torch, mlp
+from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, check_memory, initialize_as_torch, mlp
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
@@ -62,6 +62,7 @@ class SquashedPolicy(Normalized):
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
         sizes = [nobs, *layer_sizes(hidden), 2 * nact]
+        check_memory(sizes)
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, mlp
+from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, check_memory, mlp
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
@@ -61,6 +61,7 @@ class ValueFunction(Normalized):
     ) -> None:
         nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
         sizes = [nobs + time_orders, *layer_sizes(hidden), 1]
+        check_memory(sizes)
         super().__init__(nobs, normalize, limit)
         scale = finite_number("scale", scale)
         check_kind("group", group, str, "as 'policy'")
