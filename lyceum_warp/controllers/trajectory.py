@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,11 @@ _ARRAYS = {
     "plan_of": (torch.int64, ("steps",)), "plan_steps": (torch.int64, ("plans",)),
     "plan_starts": (torch.float64, ("plans",)), "plan_times": (torch.float64, ("plans",)),
     "plan_failed": (torch.float64, ("plans",)), "plan_effective": (torch.float64, ("plans",)),
+}  # fmt: skip
+_SCALARS: dict[str, Callable[[Any], Any]] = {
+    "timestep": float, "period": float, "wall_seconds": float, "mode": str, "done_reason": int, "task": str,
+    "engine": str, "params": dict, "versions": dict, "seed": lambda seed: seed if seed is None else int(seed),
+    "controller": dict, "state_parts": dict, "obs_parts": dict, "action_names": list, "source": dict,
 }  # fmt: skip
 
 
@@ -161,7 +166,7 @@ class Trajectory:
         ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)
-        info = {"format": FORMAT, **{name: value for name, value in vars(self).items() if name not in _ARRAYS}}
+        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -185,8 +190,9 @@ class Trajectory:
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
                     _check(content)
-                    names = [field.name for field in dataclasses.fields(cls) if field.name not in _ARRAYS]
-                    return cls(**content, **{name: info[name] for name in names})
+                    scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
+                    _check_scalars(scalars, content)
+                    return cls(**content, **scalars)
         except Exception as error:  # numpy and zipfile raise many types of errors
             if isinstance(error, OSError) and error.filename is not None:
                 raise  # the file cannot be opened
@@ -205,6 +211,20 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
             raise ValueError(f"{name} has type {array.dtype} and shape {tuple(array.shape)}")
     if not ((arrays["plan_of"] >= 0) & (arrays["plan_of"] < lengths["plans"])).all():
         raise ValueError(f"plan_of has indices outside the {lengths['plans']} plans")
+
+
+def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor]) -> None:
+    for name, array in (("state_parts", "states"), ("obs_parts", "obs")):
+        for part, place in scalars[name].items():
+            pair = isinstance(place, list) and len(place) == 2 and all(type(column) is int for column in place)
+            if not pair or not 0 <= place[0] <= place[1] <= arrays[array].shape[1]:
+                raise ValueError(f"{name} has {place!r} as the columns of {part!r}")
+    source = scalars["source"]
+    for name, kind in {"task": str | None, "params": list, "options": dict}.items():
+        if name in source and not isinstance(source[name], kind):
+            raise ValueError(f"source has {source[name]!r} as its {name}")
+    if missing := [name for name in source.get("params", ()) if name not in scalars["params"]]:
+        raise ValueError(f"source names the parameter {missing[0]!r}, but params has no such key")
 
 
 def provenance(env: Env) -> dict[str, Any]:

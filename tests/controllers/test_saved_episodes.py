@@ -139,3 +139,9 @@ def test_task_file_that_other_users_can_write_is_not_executed(
     with pytest.raises(ValueError, match="it ran"):
         episode_env(episode, task=f"{file}:PointMass")
     assert ran.exists()
+
+
+def test_task_name_that_is_not_a_string_raises_an_error(episodes: list[lw.Trajectory], tmp_path: Path) -> None:
+    path = dataclasses.replace(episodes[0], source={"task": ["a"]}).save(tmp_path / "episode.npz")
+    with pytest.raises(ValueError, match=r"episode.npz is broken.*source has \['a'\] as its task"):
+        load_episodes(path)
