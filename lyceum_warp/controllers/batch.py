@@ -8,7 +8,7 @@ import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Curriculum, Env, start_episodes
-from lyceum_warp.support.validate import memoryless_action, whole_number
+from lyceum_warp.support.validate import memoryless_action
 
 
 @torch.no_grad()
@@ -24,6 +24,8 @@ def policy_episodes(
 ) -> Iterator[Trajectory]:
     """Run a policy for whole episodes from random initial states, and yield them as trajectories.
 
+    The environment must have a horizon and no automatic resets.
+
     The episodes equal those of ``lw.evaluate`` with the same curriculum, number of worlds and seed (which it derives by
     ``evaluation_seed``). One call of the policy acts in
     all worlds, so the times in a trajectory are those of the whole batch.
@@ -31,11 +33,6 @@ def policy_episodes(
     Yields:
         The first episode of each world, then the second episode of each world, and so on.
     """
-    episodes = whole_number("episodes", episodes, low=1)
-    if env.autoreset:
-        raise ValueError("trajectories need an environment without automatic resets: make(..., autoreset=False)")
-    if env.horizon == 0:
-        raise ValueError(f"an episode of {env.task.name!r} has no time limit: set one, as in make(..., horizon=1000)")
     named = {"name": type(policy).__name__, **(controller or {})}
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)

@@ -16,13 +16,7 @@ import torch
 
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.controller import Controller
-from lyceum_warp.controllers.episode_collector import (
-    EpisodeCollector,
-    OnAbort,
-    OnStep,
-    TimedPlan,
-    begin_episode,
-)
+from lyceum_warp.controllers.episode_collector import EpisodeCollector, OnAbort, OnStep, TimedPlan, begin_episode
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number

@@ -56,10 +56,3 @@ def test_episode_has_the_parameters_of_its_own_world() -> None:
     first, second = policy_episodes(env, lambda obs: torch.zeros(2, 2), 2)
     assert first.params["success_distance"] == pytest.approx([0.1])
     assert second.params["success_distance"] == pytest.approx([0.2])
-
-
-def test_environments_with_autoreset_or_without_horizon_raise_an_error(shared_env: SharedEnv) -> None:
-    with pytest.raises(ValueError, match="without automatic resets"):
-        next(policy_episodes(shared_env("hopper", nworld=3, horizon=60), push, 1))
-    with pytest.raises(ValueError, match="has no time limit"):
-        next(policy_episodes(lw.make("hopper", horizon=0, autoreset=False), push, 1))
