@@ -12,14 +12,14 @@ Critics").
 import copy
 import dataclasses
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from lyceum_warp.algos.common.distributed import Captured, Team, flatten, unflatten
+from lyceum_warp.algos.common.distributed import Captured, GradientStep, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
@@ -536,27 +536,6 @@ class SAC(Learner):
     @property
     def _steps(self) -> "tuple[GradientStep, ...]":
         return self.actor_step, self.critic_step, self.temperature_step
-
-
-class GradientStep:
-    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes."""
-
-    def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
-        self.parameters, self.team = [p for p in parameters if p.requires_grad], team
-        cuda = self.parameters[0].is_cuda
-        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
-
-    def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step, and return the loss and ``numbers``, each summed over all processes."""
-        # backward() accumulates on the CUDA stream of its first call
-        gradients = torch.autograd.grad(loss, self.parameters)
-        details = torch.stack([number.detach().float() for number in (loss, *numbers)])
-        sums = self.team.sum(flatten(part.float() for part in (*gradients, details)))
-        *gradient_sums, details = unflatten(sums, [*self.parameters, details])
-        for parameter, part in zip(self.parameters, gradient_sums, strict=True):
-            parameter.grad = part
-        self.optimizer.step()
-        return details
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.dense import DensePasses
-from lyceum_warp.algos.common.distributed import Captured, Team, flatten, unflatten
+from lyceum_warp.algos.common.distributed import Captured, GradientStep, Team, flatten, unflatten
 from lyceum_warp.algos.common.timing import one_thread
 from lyceum_warp.algos.common.value import BOUND, ValueFunction
 
@@ -27,11 +27,8 @@ class ValueFit:
         self.epochs, self.batch = epochs, batch
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
-        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=self.cuda)
-        # with one tensor, one all-reduce suffices
-        self.gradient = torch.zeros(sum(p.numel() for p in self.parameters), device=self.parameters[0].device)
-        for parameter, part in zip(self.parameters, unflatten(self.gradient, self.parameters), strict=True):
-            parameter.grad = part
+        self.step = GradientStep(self.parameters, rate, team)
+        self.optimizer = self.step.optimizer
         self.captured: CapturedStep | None = None
         self._good = flatten(self.parameters).detach()
 
@@ -101,11 +98,7 @@ class ValueFit:
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor | float) -> None:
         """Make one step of Adam on a weighted sum of squared errors."""
-        loss = ((self.value.network(features) - target).square() * weight).sum()
-        gradients = torch.autograd.grad(loss, self.parameters)
-        torch.cat([gradient.reshape(-1) for gradient in gradients], out=self.gradient)
-        self.team.sum(self.gradient)
-        self.optimizer.step()
+        self.step(((self.value.network(features) - target).square() * weight).sum())
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the optimizer's state on this device."""
@@ -126,7 +119,7 @@ class DenseSteps:
         self.count = int((fit.optimizer.state.get(fit.parameters[0]) or {}).get("step", 0))
         self.parameters = flatten(passes.parameters)
         self.first, self.second = self._moments("exp_avg"), self._moments("exp_avg_sq")
-        self.gradient, self.root = fit.gradient, torch.empty_like(self.parameters)
+        self.gradient, self.root = torch.empty_like(self.parameters), torch.empty_like(self.parameters)
         self.passes = DensePasses(self._shaped(self.parameters), passes.activation)
         self.gradients = self._shaped(self.gradient)
 
