@@ -309,6 +309,7 @@ class SAC(Learner):
         self.actor_step = GradientStep(self.policy.parameters(), config.learning_rate, self.team)
         self.critic_step = GradientStep(self.value.parameters(), config.learning_rate, self.team)
         self.temperature_step = GradientStep([self.log_temperature], config.learning_rate, self.team)
+        self._steps = self.actor_step, self.critic_step, self.temperature_step
         actor, critics = self.policy.shape, self.value.shape
         self.config = dataclasses.replace(
             config, hidden=tuple(actor["hidden"]), activation=actor["activation"], normalize=actor["normalize"],
@@ -532,10 +533,6 @@ class SAC(Learner):
             step.optimizer.load_state_dict(saved)
         self._warms_up = state.get("warms_up", self._warms_up)  # missing in runs of release 0.2.0
         self._learn.forget()  # the graph contains the addresses of Adam's old moments
-
-    @property
-    def _steps(self) -> "tuple[GradientStep, ...]":
-        return self.actor_step, self.critic_step, self.temperature_step
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:

@@ -34,7 +34,10 @@ def check_fields(config: Any, bounds: Mapping[str, Bound]) -> None:
 
 def _checked(name: str, value: Any, kinds: tuple[Any, ...], bound: Bound | None) -> Any:
     if bound is not None:
-        return _number(name, value, bound, whole=int in kinds)
+        low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
+        if int in kinds:
+            return whole_number(name, value, low=int(low), high=int(min(high, 2**31 - 1)))
+        return finite_number(name, value, low=low, high=high)
     if tuple[int, ...] in kinds:
         return tuple(layer_sizes(value, name))
     if bool in kinds:
@@ -45,10 +48,3 @@ def _checked(name: str, value: Any, kinds: tuple[Any, ...], bound: Bound | None)
     if words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type))):
         check_word(name, value, words)
     return value
-
-
-def _number(name: str, value: Any, bound: Bound, *, whole: bool) -> int | float:
-    low, high = bound if isinstance(bound, tuple) else (bound, math.inf)
-    if whole:
-        return whole_number(name, value, low=int(low), high=int(min(high, 2**31 - 1)))
-    return finite_number(name, value, low=low, high=high)

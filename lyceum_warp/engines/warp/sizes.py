@@ -59,7 +59,10 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
         NotImplementedError, ValueError: MuJoCo Warp does not support the model.
     """
     contacts, constraints = _probe_once(_with_friction_losses(model, varied))
-    return contacts, -(-(constraints + _inactive(model) + _limits(model, varied)) // 8) * 8
+    constraints += _inactive(model)
+    if not _LIMITS.isdisjoint(varied):
+        constraints += int(model.jnt_limited.sum() + model.tendon_limited.sum())
+    return contacts, -(-constraints // 8) * 8
 
 
 def warn_of_unknown_sizes(varied: Collection[str], nconmax: int, njmax: int) -> None:
@@ -92,12 +95,6 @@ def _equalities(model: mujoco.MjModel) -> int:
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)
     return int(data.ne)
-
-
-def _limits(model: mujoco.MjModel, varied: Collection[str]) -> int:
-    """Count all limits of joints and tendons if the task randomizes fields that affect limits."""
-    varies = not _LIMITS.isdisjoint(varied)
-    return int(model.jnt_limited.sum() + model.tendon_limited.sum()) if varies else 0
 
 
 def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:

@@ -109,7 +109,8 @@ class WarpEngine(Engine):
         self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
         self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
-        self._partial = self._partial_forward()
+        # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
+        self._partial = self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
         self._settling: PartialForward | None = None
         self.apply_model(self._everyone)
 
@@ -287,10 +288,6 @@ class WarpEngine(Engine):
         """Whether a group of worlds can be stepped separately."""
         # sweep-and-prune, the broadphase of large models, cannot allocate memory within a graph
         return self.partial_refresh and self.m.opt.broadphase == mjw.BroadphaseType.NXN
-
-    def _partial_forward(self) -> PartialForward | None:
-        """Make a forward pass of the restarting worlds only. Return None if it is impossible or saves nothing."""
-        return self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
 
     def _group_of_worlds(self) -> PartialForward:
         size = group_size(self.nworld, self.device)
