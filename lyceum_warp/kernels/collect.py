@@ -10,12 +10,9 @@ _BITS = wp.constant(int(FAULTS).bit_length())
 
 @wp.struct
 class RolloutArrays:
-    """The arrays of a rollout buffer, (steps, nworld) or (steps, nworld, size)."""
+    """The arrays of a rollout buffer with one number per world, (steps, nworld)."""
 
-    obs: wp.array3d[float]
-    action: wp.array3d[float]
     step: wp.array2d[float]
-    final_obs: wp.array3d[float]
     reward: wp.array2d[float]
     eval: wp.array2d[float]
     terminated: wp.array2d[bool]
@@ -26,25 +23,15 @@ class RolloutArrays:
 
 
 @wp.kernel(enable_backward=False)
-def store_inputs(
-    index_in: wp.array[int], obs_in: wp.array2d[float], action_in: wp.array2d[float], step_in: wp.array[int],
-    out: RolloutArrays,
-):  # fmt: skip
-    """Store the observation, the action and the step counter before a step; launched over (nworld, max(nobs, nact))."""
-    w, i = wp.tid()
-    t = index_in[0]
-    if i < obs_in.shape[1]:
-        out.obs[t, w, i] = obs_in[w, i]
-    if i < action_in.shape[1]:
-        out.action[t, w, i] = action_in[w, i]
-    if i == 0:
-        out.step[t, w] = float(step_in[w])
+def store_steps(index_in: wp.array[int], step_in: wp.array[int], step_out: wp.array2d[float]):
+    """Store the step counters before a step; launched over (nworld,)."""
+    w = wp.tid()
+    step_out[index_in[0], w] = float(step_in[w])
 
 
 @wp.kernel(enable_backward=False)
 def store_outputs(
     index_in: wp.array[int],
-    final_obs_in: wp.array2d[float],
     reward_in: wp.array[float],
     eval_in: wp.array[float],
     terminated_in: wp.array[bool],
@@ -56,31 +43,26 @@ def store_outputs(
     fault_inout: wp.array[int],
     out: RolloutArrays,
 ):
-    """Store the results of a step and the episode's return so far, and count faults; launched over (nworld, nobs).
+    """Store the results of a step and the episode's return so far, and count faults; launched over (nworld,).
 
     If ``first_only`` is set, every return after a world's first episode is NaN.
     """
-    w, i = wp.tid()
+    w = wp.tid()
     t = index_in[0]
-    out.final_obs[t, w, i] = final_obs_in[w, i]
-    if i == 0:
-        out.reward[t, w] = reward_in[w]
-        out.eval[t, w] = eval_in[w]
-        fault = done_reason_in[w] & _FAULTS
-        out.terminated[t, w] = terminated_in[w]
-        out.done[t, w] = done_in[w]
-        out.success[t, w] = success_in[w]
-        total = return_inout[w] + reward_in[w]
-        out.episode_return[t, w] = total
-        out.episode_length[t, w] = out.step[t, w] + 1.0
-        if done_in[w]:
-            total = wp.where(first_only, wp.nan, 0.0)
-        return_inout[w] = total
-        if fault != 0:
-            count = int(0)
-            for bit in range(_BITS):
-                count += (fault >> bit) & 1
-            fault_inout[w] = fault_inout[w] + count
+    out.reward[t, w] = reward_in[w]
+    out.eval[t, w] = eval_in[w]
+    out.terminated[t, w] = terminated_in[w]
+    out.done[t, w] = done_in[w]
+    out.success[t, w] = success_in[w]
+    total = return_inout[w] + reward_in[w]
+    out.episode_return[t, w] = total
+    out.episode_length[t, w] = out.step[t, w] + 1.0
+    if done_in[w]:
+        total = wp.where(first_only, wp.nan, 0.0)
+    return_inout[w] = total
+    fault = done_reason_in[w] & _FAULTS
+    for bit in range(_BITS):
+        fault_inout[w] = fault_inout[w] + ((fault >> bit) & 1)
 
 
 @wp.kernel(enable_backward=False)

@@ -86,13 +86,11 @@ class Rollout:
         n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
         numbers = len(collect.RolloutArrays.vars) + 2 * nobs + nact  # type: ignore[attr-defined]
         check_fit(4 * steps * numbers, n, env.device, model=f"{steps} steps")
-        last = {"obs": (nobs,), "final_obs": (nobs,), "action": (nact,)}
         flags = {"terminated", "done", "success"}
         self._arrays = collect.RolloutArrays()
         with wp.ScopedDevice(env.device):
             for name in collect.RolloutArrays.vars:  # type: ignore[attr-defined]
-                shape = (steps, n, *last.get(name, ()))
-                array = wp.zeros(shape, dtype=bool if name in flags else float)
+                array = wp.zeros((steps, n), dtype=bool if name in flags else float)
                 setattr(self._arrays, name, array)
                 setattr(self, name, torch_view(array))
             self._index = wp.zeros(1, dtype=int)
@@ -101,20 +99,20 @@ class Rollout:
         self.running_return, self.faults = torch_view(self._return), torch_view(self._fault)
         self._rows_before: list[_Pair] = []
         self._rows_after: list[_Pair] = []
-        self.obs_groups, self.final_obs_groups = {"policy": self.obs}, {"policy": self.final_obs}
-        for group in dict.fromkeys(groups):
-            if group != "policy":
-                self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
-                self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+        self.action = self._stored(env.action, self._rows_before)
+        self.obs_groups, self.final_obs_groups = {}, {}
+        for group in dict.fromkeys(("policy", *groups)):
+            self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
+            self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+        self.obs, self.final_obs = self.obs_groups["policy"], self.final_obs_groups["policy"]
         self.metrics, self.episode_metrics = {}, {}
         if env.metrics:
             steps_of = self._stored(torch_view(env.worlds.metrics), self._rows_after)
             sums_of = self._stored(env.episode_metric_sums, self._rows_after)
             self.metrics = dict(zip(env.metrics, steps_of.unbind(-1), strict=True))
             self.episode_metrics = dict(zip(env.metrics, sums_of.unbind(-1), strict=True))
-        inputs = (env.obs, env.action, env.episode_step)
-        outputs = (env.final_obs, env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
-        self._inputs, self._outputs = [wp.from_torch(t) for t in inputs], [wp.from_torch(t) for t in outputs]
+        outputs = (env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
+        self._steps, self._outputs = wp.from_torch(env.episode_step), [wp.from_torch(t) for t in outputs]
         graphs = Graphs(env.device, enabled=env.options.graphs)
         self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
@@ -216,15 +214,13 @@ class Rollout:
         return "; ".join(texts)
 
     def _launch_inputs(self) -> None:
-        dim = (self.env.nworld, max(self.env.obs_space.size, self.env.action_space.size))
-        args = [self._index, *self._inputs, self._arrays]
-        wp.launch(collect.store_inputs, dim, args, device=self.env.device)
+        args = [self._index, self._steps, self._arrays.step]
+        wp.launch(collect.store_steps, self.env.nworld, args, device=self.env.device)
         self._launch_rows(self._rows_before)
 
     def _launch_outputs(self) -> None:
-        dim = (self.env.nworld, self.env.obs_space.size)
         args = [self._index, *self._outputs, self._first_only, self._return, self._fault, self._arrays]
-        wp.launch(collect.store_outputs, dim, args, device=self.env.device)
+        wp.launch(collect.store_outputs, self.env.nworld, args, device=self.env.device)
         self._launch_rows(self._rows_after)
         wp.launch(collect.advance_index, 1, [self._index], device=self.env.device)
 
