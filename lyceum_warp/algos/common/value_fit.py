@@ -1,6 +1,7 @@
 """Fit a value function to returns by regression."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -48,17 +49,14 @@ class ValueFit:
             self._keep_if_finite()
             passes = DensePasses.of(self.value.network)
             steps = None if passes is None else DenseSteps(self, passes)
+            learn = self.learn if steps is None else steps.learn
             for _ in range(self.epochs):
                 order = torch.randperm(self.samples, generator=generator, device=features.device)
                 if self.cuda and self.team.captures:
                     self.captured = self.captured or CapturedStep(self, features, target)
                     self.captured(features, target, order)
-                elif steps is not None:
-                    steps(features, target, order)
                 else:
-                    for part in order.split(self.batch):
-                        places, weight = self._local(part)
-                        self.learn(features[places], target[places], weight)
+                    self._run_epoch(features, target, order, learn)
             if steps is not None:
                 steps.store()
             self.team.copy_leader(self.parameters)
@@ -86,15 +84,16 @@ class ValueFit:
         for tensor, part in zip(numbers, unflatten(self._good, numbers), strict=True):
             tensor.copy_(part)
 
-    def _local(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
-        """Get the places and the weights of this process's samples among the samples of a mini-batch."""
-        if self.team.size == 1:
-            return index, 1.0 / len(index)
-        places, local = self.team.locate(index, self.nworld)
-        # on a GPU, selection by a mask would synchronise
-        if self.cuda:
-            return places, local.unsqueeze(-1) / len(index)
-        return places[local], 1.0 / len(index)
+    def _run_epoch(
+        self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor, learn: Callable[..., None]
+    ) -> None:
+        """Learn from this process's samples in each mini-batch of a permutation of all processes' samples."""
+        places, local = self.team.locate(order, self.nworld)
+        sizes = [len(part) for part in order.split(self.batch)]
+        counts = [int(part.sum()) for part in local.split(self.batch)]
+        features, target = features[places[local]], target[places[local]]
+        for x, y, size in zip(features.split(counts), target.split(counts), sizes, strict=True):
+            learn(x, y, 1.0 / size)
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: torch.Tensor | float) -> None:
         """Make one step of Adam on a weighted sum of squared errors."""
@@ -130,15 +129,6 @@ class DenseSteps:
 
     def _shaped(self, vector: torch.Tensor) -> list[torch.Tensor]:
         return unflatten(vector, self.fit.parameters)
-
-    def __call__(self, features: torch.Tensor, target: torch.Tensor, order: torch.Tensor) -> None:
-        """Run an epoch with a permutation of all processes' samples."""
-        places, local = self.team.locate(order, self.fit.nworld)
-        sizes = [len(part) for part in order.split(self.fit.batch)]
-        counts = [int(part.sum()) for part in local.split(self.fit.batch)]
-        features, target = features[places[local]], target[places[local]]
-        for x, y, size in zip(features.split(counts), target.split(counts), sizes, strict=True):
-            self.learn(x, y, 1.0 / size)
 
     def learn(self, features: torch.Tensor, target: torch.Tensor, weight: float) -> None:
         """Make one step of Adam on a weighted sum of squared errors."""
