@@ -68,7 +68,7 @@ class DensePasses:
             and kind in _ACTIVATIONS
             and all(type(layer) is kind and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
             and all(p.device.type == "cpu" and p.dtype == torch.float32 for p in parameters)
-            and not any(module._forward_hooks or module._forward_pre_hooks for module in network.modules())
+            and not any(map(_hooked, network.modules()))
         )
         return DensePasses(parameters, kind) if supported else None
 
@@ -175,3 +175,7 @@ def predict(value: ValueFunction, obs: torch.Tensor, step: torch.Tensor) -> torc
     features = value.features(obs, step)
     output = passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
     return output * value.scale.float() + value.shift.float()
+
+
+def _hooked(module: nn.Module) -> bool:
+    return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))
