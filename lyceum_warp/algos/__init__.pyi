@@ -61,4 +61,4 @@ from lyceum_warp.algos.planning.updates import (
     PlanUpdate as PlanUpdate,
 )
 from lyceum_warp.algos.ppo import PPO as PPO, PPOConfig as PPOConfig
-from lyceum_warp.algos.sac import SAC as SAC, SACConfig as SACConfig
+from lyceum_warp.algos.sac import SAC as SAC, SACConfig as SACConfig, action_bounds as action_bounds

@@ -67,6 +67,7 @@ def policy_episodes(
             steps = int(lengths[world])
             params = {name: [value[world].tolist()] for name, value in env.task.parameters.per_world.items()}
             rewards, evals, success = torch.stack([row[:, world] for row in outcomes[:steps]], 1)
+            unknown = torch.full((steps,), torch.nan, dtype=torch.float64)
             applied_at, policy_times, ends = torch.tensor(times[:steps], dtype=torch.float64).unbind(1)
             yield Trajectory(
                 states=torch.stack([row[world] for row in states[: steps + 1]]).double(),
@@ -75,8 +76,7 @@ def policy_episodes(
                 rewards=rewards, evals=evals, success=success > 0, times=applied_at, ages=policy_times,
                 late=torch.zeros(steps, dtype=torch.bool), plan_of=torch.arange(steps), plan_steps=torch.arange(steps),
                 plan_starts=applied_at - policy_times, plan_times=policy_times,
-                plan_failed=torch.full((steps,), torch.nan, dtype=torch.float64),
-                plan_effective=torch.full((steps,), torch.nan, dtype=torch.float64),
+                plan_failed=unknown, plan_effective=unknown,
                 timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
                 done_reason=int(reasons[world]), seed=seed,
                 controller=named | {"world": env.first_world + world, "episode": number},

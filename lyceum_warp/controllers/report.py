@@ -178,15 +178,11 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         if names := _differing_names([getattr(episode, name) for episode in episodes]):
             raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
+    names = ("task", "engine", "mode", "params", "controller", "versions")
     return ControlReport(
-        task=first.task,
-        engine=first.engine,
-        mode=first.mode,
+        **{name: getattr(first, name) for name in names},
         episodes=len(episodes),
         steps=sum(episode.steps for episode in episodes),
-        params=first.params,
-        controller=first.controller,
-        versions=first.versions,
         **_planning_times(episodes, deadline),
         **_plan_quality(episodes),
         **_step_times(episodes),

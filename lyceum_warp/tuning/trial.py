@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos import ENDLESS_STEPS
+from lyceum_warp.algos import ENDLESS_STEPS, action_bounds
 from lyceum_warp.core import FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.tuning.candidates import Setting
@@ -200,10 +200,9 @@ class Trials:
 
 def random_actions(env: Env, seed: int) -> Iterator[torch.Tensor]:
     """Yield uniform random actions, (nworld, nact). Infinite bounds are replaced by -1 and 1."""
-    device, low, high = env.obs.device, env.action_space.low, env.action_space.high
-    assert low is not None and high is not None
+    device = env.obs.device
     generator = torch.Generator(device).manual_seed(seed)
-    start = torch.as_tensor(np.where(np.isfinite(low), low, -1.0), device=device).float()
-    size = torch.as_tensor(np.where(np.isfinite(high), high, 1.0), device=device).float() - start
+    start, end = torch.tensor(action_bounds(env, limit=1.0), device=device)
+    size = end - start
     while True:
         yield start + size * torch.rand(env.action.shape, generator=generator, device=device)

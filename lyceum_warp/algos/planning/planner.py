@@ -41,14 +41,7 @@ from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.planning.arguments import plain, planner_arguments, plant_seeds
 from lyceum_warp.algos.planning.config import MPPIConfig
 from lyceum_warp.algos.planning.plans import Plans
-from lyceum_warp.algos.planning.updates import (
-    CrossEntropy,
-    EliteWeights,
-    ExponentialWeights,
-    PlanSamples,
-    PlanUpdate,
-    launch_blocks,
-)
+from lyceum_warp.algos.planning.updates import CrossEntropy, PlanSamples, PlanUpdate, SampleWeights, launch_blocks
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core import Done, EnvOptions, Task
 from lyceum_warp.engines.memory import NotEnoughMemoryError
@@ -536,7 +529,7 @@ def _update_of(config: MPPIConfig) -> PlanUpdate:
     if config.update == "cem":
         assert config.elites is not None and config.min_noise is not None
         return CrossEntropy(config.elites, config.min_noise, config.noise_smoothing)
-    return ExponentialWeights(config.temperature) if config.update == "mppi" else EliteWeights(elites=1)
+    return SampleWeights(temperature=config.temperature, elites=0 if config.update == "mppi" else 1)
 
 
 class MPPI(Planner):  # noqa: D101

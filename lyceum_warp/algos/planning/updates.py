@@ -93,60 +93,47 @@ def launch_blocks(kernel: wp.Kernel, blocks: int, args: Sequence[Any]) -> None:
     wp.launch_tiled(kernel, dim=[blocks], inputs=args, block_dim=256, device=args[0].device)
 
 
-class ExponentialWeights(PlanUpdate):
-    """Update plans by MPPI: weight samples by the exponential of their returns.
+class SampleWeights(PlanUpdate):
+    """Update plans by MPPI, or take the mean of the best samples.
 
-    If sample k of the planner (``planner.py``) has the return R_k, its weight is
+    With MPPI, the weight of sample k of the planner (``planner.py``) with the return R_k is
 
         w_k = exp((R_k - max R) / temperature) / sum_j exp((R_j - max R) / temperature),
 
     as in Williams et al., 2017 ("Information theoretic MPC for model-based reinforcement learning"), without a cost on
-    the controls. A failed sample has the weight 0.
-
-    Args:
-        temperature: Temperature of the weights, in units of reward.
-    """
-
-    capturable = True
-
-    def __init__(self, temperature: float) -> None:
-        self.temperature = temperature
-
-    def weigh(self, samples: PlanSamples) -> None:
-        """Weight samples by exp(return / temperature)."""
-        args = [by_sample(samples.returns), None, 0, self.temperature]
-        args += [by_sample(samples.weights), wp.from_torch(samples.summary)]
-        launch_blocks(planning.weigh, len(samples.returns), args)
-
-
-class EliteWeights(PlanUpdate):
-    """Give the best samples equal weights, and all other samples the weight 0.
+    the controls. With ``elites``, this number of best samples have equal weights instead. A failed sample has the
+    weight 0.
 
     With a single elite, this is predictive sampling: the sample with the largest return becomes the new plan. The
     previous plan is one of the samples, so only a better plan can replace it. Predictive sampling was proposed by
     Howell et al., 2022 ("Predictive sampling: real-time behaviour synthesis with MuJoCo"), for plans that are splines
     with a few knots.
+
+    Args:
+        temperature: Temperature of the weights, in units of reward.
+        elites: Number of best samples; 0 for MPPI's weights.
     """
 
     capturable = True
 
-    def __init__(self, elites: int) -> None:
-        self.elites = elites
+    def __init__(self, *, temperature: float = 1.0, elites: int = 0) -> None:
+        self.temperature, self.elites = temperature, elites
 
     def prepare(self, samples: PlanSamples) -> None:
         """Allocate the samples' ranks."""
         self._rank = torch.zeros_like(samples.returns, dtype=torch.int32)
 
     def weigh(self, samples: PlanSamples) -> None:
-        """Give equal weights to the best samples that did not fail."""
+        """Weigh the samples that did not fail."""
         returns, rank = by_sample(samples.returns), by_sample(self._rank)
         plants, count = samples.returns.shape
-        wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
-        args = [returns, rank, self.elites, 1.0, by_sample(samples.weights), wp.from_torch(samples.summary)]
-        launch_blocks(planning.weigh, plants, args)
+        if self.elites:
+            wp.launch(planning.rank, plants * count, [returns, count, rank], device=returns.device)
+        args = [returns, rank, self.elites, self.temperature, by_sample(samples.weights)]
+        launch_blocks(planning.weigh, plants, [*args, wp.from_torch(samples.summary)])
 
 
-class CrossEntropy(EliteWeights):
+class CrossEntropy(SampleWeights):
     """Update plans by the cross-entropy method (CEM): fit a normal distribution to the best samples.
 
     CEM was proposed by Rubinstein (1999, "The cross-entropy method for combinatorial and continuous optimization"). The
@@ -167,7 +154,7 @@ class CrossEntropy(EliteWeights):
     adapts_noise = True
 
     def __init__(self, elites: int, min_noise: float | Sequence[float], smoothing: tuple[float, float, float]) -> None:
-        super().__init__(elites)
+        super().__init__(elites=elites)
         self.min_noise, self.smoothing = min_noise, smoothing
 
     def prepare(self, samples: PlanSamples) -> None:

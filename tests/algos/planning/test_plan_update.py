@@ -6,7 +6,7 @@ import torch
 from rail_task import Picky
 
 import lyceum_warp as lw
-from lyceum_warp.algos.planning.updates import CrossEntropy, ExponentialWeights, spread
+from lyceum_warp.algos.planning.updates import CrossEntropy, SampleWeights, spread
 
 POINT: dict[str, Any] = dict(task="point_mass", horizon=6, samples=12, noise=1.0, seed=3)
 
@@ -126,8 +126,8 @@ def test_invalid_weights_raise_an_error_and_keep_the_plan(how: str, reason: str,
 
 
 def test_invalid_weights_of_an_update_in_warp_raise_an_error() -> None:
-    plan = lw.Planner(update=ExponentialWeights(temperature=math.nan), **POINT)
-    with pytest.raises(ValueError, match="^weigh of ExponentialWeights .* sample 0 is nan"):
+    plan = lw.Planner(update=SampleWeights(temperature=math.nan), **POINT)
+    with pytest.raises(ValueError, match="^weigh of SampleWeights .* sample 0 is nan"):
         plan(plan.state_of())
     assert not plan.actions.any()
 
@@ -183,7 +183,7 @@ def test_user_written_update_keeps_the_plan_if_all_samples_fail() -> None:
 def test_planners_with_the_same_update_object_do_not_share_buffers() -> None:
     update = CrossEntropy(3, 0.05, (1.0, 0.0, 0.0))
     compare(*(lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2)))
-    assert vars(update).keys() == {"elites", "min_noise", "smoothing"}
+    assert vars(update).keys() == {"temperature", "elites", "min_noise", "smoothing"}
 
 
 def test_planner_settings_contain_the_attributes_of_a_user_written_update() -> None:
