@@ -178,9 +178,9 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         if names := _differing_names([getattr(episode, name) for episode in episodes]):
             raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
-    names = ("task", "engine", "mode", "params", "controller", "versions")
+    common = ("task", "engine", "mode", "params", "controller", "versions")
     return ControlReport(
-        **{name: getattr(first, name) for name in names},
+        **{name: getattr(first, name) for name in common},
         episodes=len(episodes),
         steps=sum(episode.steps for episode in episodes),
         **_planning_times(episodes, deadline),
