@@ -188,7 +188,7 @@ def test_training_from_another_run_starts_with_its_policy(
     assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
     capsys.readouterr()
     for options, words in [
-        (["hopper"], ["made for 6 observations", "'hopper' has 11"]),
+        (["hopper"], ["takes 6 observations", "'hopper' has 11"]),
         (["--hidden", "9"], ["have hidden (8,), not (9,)", "omit --hidden"]),
         (["--value-group", "critic"], ["have value_group policy, not critic", "omit --value-group"]),
         (["--algorithm", "sac"], [f"{six} was trained by npg", "omit --algorithm sac"]),
