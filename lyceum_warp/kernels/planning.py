@@ -325,3 +325,22 @@ def average(
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     if lane == 0:
         plan_out[t, p, i] = wp.where(valid_in[p], total, nominal_in[t, p, i])
+
+
+def value_kernel(value: wp.Function) -> wp.Kernel:
+    """Make a kernel that calls a value function, ``value(obs: Row[float]) -> float``, for each sample.
+
+    Raises:
+        ValueError: The function does not take exactly one argument of type ``Row[float]``.
+    """
+    types = list(value.input_types.values())
+    if len(types) != 1 or getattr(types[0], "ndim", 0) != 1 or types[0].dtype is not wp.float32:
+        raise ValueError("a value function in Warp must be written as value(obs: Row[float]) -> float")
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def values(obs_in: wp.array2d[float], value_out: wp.array[float]):
+        """Evaluate the final observations of the worlds; launched over (nworld,)."""
+        k = wp.tid()
+        value_out[k] = value(obs_in[k])
+
+    return values

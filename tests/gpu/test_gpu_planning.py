@@ -8,6 +8,7 @@ from test_gpu import CUDA, nothing_waits
 from varied_task import Varied
 
 import lyceum_warp as lw
+from lyceum_warp import Row
 
 pytestmark = pytest.mark.gpu
 
@@ -19,11 +20,17 @@ UPDATES: dict[str, dict[str, Any]] = {
 }
 
 
+@wp.func
+def first_squared(obs: Row[float]) -> float:
+    return 3.0 * obs[0] * obs[0]
+
+
 PLANNERS: dict[str, dict[str, Any]] = UPDATES | {
     "mppi": {},
     "mppi in three iterations": dict(iterations=3),
     "cem in two iterations": dict(update="cem", elites=20, iterations=2),
-    "a value": dict(value=lambda obs: 3.0 * obs[:, 0] ** 2),
+    "a value in Warp": dict(value=first_squared),
+    "a value in torch": dict(value=lambda obs: 3.0 * obs[:, 0] ** 2),
 }
 
 
@@ -164,6 +171,17 @@ def test_plans_in_several_models_are_equal_on_gpu_and_cpu(risk: Any) -> None:
     torch.testing.assert_close(gpu.model_fields["body_mass"].cpu(), cpu.model_fields["body_mass"])
     torch.testing.assert_close(gpu(gpu.state_of()).cpu(), cpu(cpu.state_of()), rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(gpu.model_returns.cpu(), cpu.model_returns, rtol=1e-3, atol=1e-3)
+
+
+def test_value_functions_in_torch_and_in_warp_agree() -> None:
+    warp, tensor = (
+        lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
+        for value in (first_squared, PLANNERS["a value in torch"]["value"])
+    )
+    state = warp.state_of(mocap_pos=[0.1, 0.1, 0.2])
+    for _ in range(3):
+        torch.testing.assert_close(warp(state), tensor(state), rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(warp.returns, tensor.returns, rtol=1e-4, atol=1e-4)
 
 
 def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:

@@ -4,7 +4,7 @@ import torch
 import warp as wp
 
 import lyceum_warp as lw
-from lyceum_warp import MPPI
+from lyceum_warp import MPPI, Row
 from lyceum_warp.kernels import planning, random
 
 
@@ -78,3 +78,19 @@ def test_plan_with_high_temperature_is_the_mean_of_all_samples(temperature: floa
     plan(lw.make("reach", seed=0).get_state()[0])
     torch.testing.assert_close(plan.actions, plan.sampled.mean(1))
     assert plan.summary["effective_samples"] == pytest.approx(plan.samples)
+
+
+@wp.func
+def value_of_two(obs: Row[float], step: float) -> float:
+    return obs[0] + step
+
+
+@wp.func
+def value_of_whole_numbers(obs: Row[int]) -> float:
+    return float(obs[0])
+
+
+@pytest.mark.parametrize("value", [value_of_two, value_of_whole_numbers], ids=["two arguments", "int"])
+def test_warp_value_function_with_wrong_arguments_raises_an_error(value: wp.Function) -> None:
+    with pytest.raises(ValueError, match=r"must be written as value\(obs: Row\[float\]\) -> float"):
+        planning.value_kernel(value)

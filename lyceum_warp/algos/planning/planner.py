@@ -58,7 +58,7 @@ _MODELS = 0x6D6F64656C73  # seed for drawing models, in addition to the planner'
 _DRAWING = ("startup", "initialize", "randomize")
 """Task functions that can randomize a planner's model fields."""
 
-Value: TypeAlias = ValueFunction | Callable[[torch.Tensor], torch.Tensor]
+Value: TypeAlias = ValueFunction | wp.Function | Callable[[torch.Tensor], torch.Tensor]
 
 
 @document_attributes
@@ -85,9 +85,10 @@ class Planner:
     Args:
         task: Name of a task, path of a task file, or a task class.
         config: Settings that replace the task's settings.
-        value: Terminal value that is added to each sample's return: a ``ValueFunction``, or a function from (nworld,
-            nobs) observations to (nworld,) values. If a value is given, the parameters in ``planning`` do not apply,
-            because the value function was fitted to the task's own rewards.
+        value: Terminal value that is added to each sample's return: a ``ValueFunction``; a function from (nworld, nobs)
+            observations to (nworld,) values; or a Warp function of one observation, ``value(obs: Row[float]) ->
+            float``. On the Warp engine, a Warp function becomes part of the graph. If a value is given, the parameters
+            in ``planning`` do not apply, because the value function was fitted to the task's own rewards.
         seed: Seed of the noise. With several plants, ``seed`` is the seed of the first plant, or a list with one seed
             per plant.
         plants: Number of plants to plan for.
@@ -213,11 +214,13 @@ class Planner:
 
     def _take_value(self, value: Value | None) -> None:
         self.value, group = value, "policy"
+        self._value_in_torch = value is not None and not isinstance(value, wp.Function)
+        self._value_kernel = planning.value_kernel(value) if isinstance(value, wp.Function) else None
         if isinstance(value, ValueFunction):
             check_value(value, self.env)
             self.value, group = moved(value, self.env), value.group
         self._value_obs = self._loop.final_obs_groups[group]
-        if value is not None:
+        if self._value_in_torch:
             try:
                 self._torch_values()
             # for example missing weights, another input size, or a critic that also takes actions
@@ -375,7 +378,7 @@ class Planner:
         """Return the calls of one iteration. If ``first`` is set, they also shift the plan in time."""
         perturb = Phase("perturb", partial(self._plans.perturb, self._keys, first=first))
         parts: list[Phase | Callable[[], None]] = [perturb, *self._loop.phases]
-        if self.value is not None:
+        if self._value_in_torch:
             parts.append(self._evaluate)
         weigh: Any = self._weigh_in_torch
         fit: Any = self._fit
@@ -391,6 +394,9 @@ class Planner:
 
     def _add_up(self) -> None:
         config, device = self.config, self.env.device
+        if self._value_kernel is not None:
+            values = [wp.from_torch(self._value_obs), self._terminal]
+            wp.launch(self._value_kernel, self.env.nworld, values, device=device)
         returns = [*self._rewards, self._terminal, config.discount, config.termination == "stop", self._world_return]
         wp.launch(planning.add_up, self.env.nworld, returns, device=device)
         if config.models > 1:

@@ -284,19 +284,26 @@ def test_shift_by_the_largest_number_of_steps_gives_a_constant_plan(knots: int |
     assert (plan.nominal == plan.nominal[0]).all()
 
 
+@wp.func
+def place_in_warp(obs: Row[float]) -> float:
+    return -2.0 * wp.abs(obs[0] - obs[4]) - 0.1 * obs[2] * obs[3]
+
+
 @pytest.mark.quick("mujoco")
 @pytest.mark.parametrize("engine", ENGINES)
-def test_value_function_may_return_a_column(engine: str) -> None:
+def test_equal_value_functions_in_torch_and_warp_give_equal_plans(engine: str) -> None:
     settings = POINT | dict(engine=engine, noise=0.5, discount=0.9, iterations=2)
-    in_torch, column, without = (
-        MPPI(value=value, **settings) for value in (place, lambda obs: place(obs)[:, None], None)
+    in_torch, column, in_warp, without = (
+        MPPI(value=value, **settings) for value in (place, lambda obs: place(obs)[:, None], place_in_warp, None)
     )
     plant = lw.make("point_mass", seed=2, engine=engine)
     for _ in range(4):
         state = plant.get_state()[0]
         plant.step(in_torch(state)[None])
-        column(state), without(state)
+        column(state), in_warp(state), without(state)
         assert torch.equal(column.actions, in_torch.actions)
+        for name in BUFFERS:
+            torch.testing.assert_close(getattr(in_warp, name), getattr(in_torch, name), rtol=1e-5, atol=1e-5)
         assert not torch.allclose(without.returns, in_torch.returns, atol=0.01)
 
 

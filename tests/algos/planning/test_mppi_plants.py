@@ -2,14 +2,17 @@ from typing import Any
 
 import pytest
 import torch
+import warp as wp
 from form_tasks import Pushed
 from varied_task import Varied
 
 import lyceum_warp as lw
+from lyceum_warp import Row
 
 
-def first_squared(obs: torch.Tensor) -> torch.Tensor:
-    return 3.0 * obs[:, 0] * obs[:, 0]
+@wp.func
+def first_squared(obs: Row[float]) -> float:
+    return 3.0 * obs[0] * obs[0]
 
 
 def fitted_value() -> lw.ValueFunction:
