@@ -130,13 +130,9 @@ def perturb(
         if pushes or values:
             raise ValueError("a playback cannot be perturbed: select another mode")
         return
-    stage.dragging = pushes
     if values:
         stage.live.write(**values)
-    if pushes:
-        stage.live.push(forces)
-    elif stage.live.pushed == stage.live.world:
-        stage.live.end_push()
+    stage.live.force = forces if pushes else None
 
 
 def drive(stage: Stage, velocity: Velocity | None) -> None:
@@ -167,7 +163,5 @@ def close(stage: Stage) -> None:
     stage.closed = True
 
 
-DURING_STEPS = {drive, perturb, set_ghosts, set_video, take_picture}
-"""Commands that do not stop a plant that runs in real time."""
 BETWEEN_CALLS = {set_mode, set_number}
 """Commands that wait until no controller is being called."""

@@ -1,10 +1,10 @@
 """Call policies, which act in all worlds, and controllers of one world, such as planners."""
 
 import dataclasses
-import threading
 import time
 from collections.abc import Mapping
-from typing import Any
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from typing import Any, NamedTuple
 
 import torch
 
@@ -15,6 +15,8 @@ from lyceum_warp.support.validate import described, memoryless_action
 
 MOST_SAMPLES = 24
 """Maximum number of samples whose paths the viewer shows."""
+
+_WARM_UP = 3  # the first calls may capture CUDA graphs, so nothing else runs meanwhile
 
 
 class ControllerError(Exception):
@@ -68,81 +70,116 @@ class PolicyControl:
 
 
 class WorldControl:
-    """Calls a controller of one world."""
+    """Calls a controller of one world in a thread, as ``lw.control_async`` does.
 
-    def __init__(self, name: str, controller: Any) -> None:
+    The controller plans from the newest measured state, at most once per state. Steps are counted from the beginning of
+    the session.
+    """
+
+    def __init__(self, name: str, controller: Any, env: Env) -> None:
         self.name, self.seconds = name, float("nan")
         self.controller = controller
         self.plans = hasattr(controller, "actions")
-        self._busy = threading.Lock()
-        self._run = self.calls = 0
+        self._checked = CheckedController(controller, env)
+        self._thread = ThreadPoolExecutor(1, "lyceum_warp planner")
+        self._call: Future[Plan] | None = None
+        self._plan: Plan | None = None
+        self._state: tuple[int, torch.Tensor, torch.Tensor] | None = None
+        self._calls = self._planned = self._resets = 0
         self._reset_due = self._copy_due = False
-        self._plan: PlanView | None = None
-        self.hidden: slice | None = None
-        """The columns of the state that hold the user's push force. Controllers see zeros in these columns."""
-
-    def new_run(self) -> "ControlRun":
-        """Return the controller for a new control loop. Calls from earlier control loops then fail."""
-        self._run += 1
-        return ControlRun(self, self._run)
+        self._view: PlanView | None = None
 
     @property
     def busy(self) -> bool:
         """Whether a call of the controller is running."""
-        return self._busy.locked()
+        return self._call is not None and not self._call.done()
 
     def reset(self) -> None:
-        """Reset the controller before its next call."""
-        self._reset_due = True
+        """Drop the plan, and reset the controller before its next call."""
+        self._reset_due, self._plan, self._state = True, None, None
+        self._resets += 1
 
-    def call(self, run: int, state: torch.Tensor, obs: torch.Tensor, **options: Any) -> torch.Tensor:
-        """Call the controller.
+    def action(self, step: int, state: torch.Tensor, obs: torch.Tensor, *, wait: bool) -> torch.Tensor | None:
+        """Measure the state before a step, and return the action that the newest plan has for this step.
+
+        Args:
+            step: The number of earlier steps.
+            state: The state, (state_space.size,).
+            obs: The observation, (nobs,).
+            wait: Whether to wait for a plan from this state.
+
+        Returns:
+            The action, (nact,), or None before the first plan.
 
         Raises:
-            ControllerError: The controller raised an exception, or a newer control loop has begun.
+            ControllerError: The controller raised an exception, or its actions are invalid.
         """
-        with self._busy:  # a call from an interrupted control loop may still be running
-            if run != self._run:
-                raise ControllerError(self.name, RuntimeError("its control loop has ended"))
-            if (hidden := self.hidden) is not None:
-                state = state.clone()
-                state[..., hidden] = 0.0
-            due, self._reset_due = self._reset_due, False
-            try:
-                if due and callable(reset := getattr(self.controller, "reset", None)):
-                    reset(None)
-                start = time.perf_counter()
-                action = self.controller(state, obs, **options)
-            except Exception as error:
-                raise ControllerError(self.name, error) from error
-            self.calls += 1
-            self.seconds = time.perf_counter() - start
-            if self._copy_due:
-                self._copy_due = False
-                self._plan = plan_view(self.controller, state)
-        return action
+        self._state = step, state, obs
+        self._follow(wait=wait)
+        return None if self._plan is None else self._checked.action(self._plan.actions, step - self._plan.step)
+
+    def rest(self, seconds: float) -> None:
+        """Wait. When a call ends, begin the next one."""
+        if self._call is None:
+            time.sleep(seconds)
+        else:
+            wait([self._call], seconds)
+            self._follow(wait=False)
 
     def look(self) -> PlanView | None:
         """Return the plan that was copied since the last call, and request a copy of the next plan."""
-        plan, self._plan = self._plan, None
+        view, self._view = self._view, None
         self._copy_due = True
-        return plan
+        return view
+
+    def close(self) -> None:
+        """End the thread after a call in progress."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+
+    def _follow(self, *, wait: bool) -> None:
+        wait = wait or self._calls < _WARM_UP
+        if self.busy and not wait:
+            return
+        self._take()
+        if self._state is not None and (wait or self._plan is None or self._plan.step < self._state[0]):
+            self._call = self._thread.submit(self._work, *self._state, self._resets)
+            if wait:
+                self._take()
+
+    def _take(self) -> None:
+        """Wait for a call in progress, and take its plan, unless the controller was reset meanwhile."""
+        if self._call is not None:
+            call, self._call = self._call, None
+            plan = call.result()
+            if plan.resets == self._resets:
+                self._plan = plan
+
+    @torch.no_grad()
+    def _work(self, step: int, state: torch.Tensor, obs: torch.Tensor, resets: int) -> "Plan":
+        reset, self._reset_due = self._reset_due, False
+        try:
+            if reset:
+                self._checked.reset(None)
+                self._planned = step
+            start = time.perf_counter()
+            actions = self._checked(state, obs, self._checked.passed(self._planned, step), step)
+        except Exception as error:
+            raise ControllerError(self.name, error) from error
+        self._planned = step
+        self._calls += 1
+        self.seconds = time.perf_counter() - start
+        if self._copy_due:
+            self._copy_due = False
+            self._view = plan_view(self.controller, state)
+        return Plan(actions, step, resets)
 
 
-class ControlRun:
-    """Wraps a controller for one control loop, with the same attributes and signature."""
+class Plan(NamedTuple):
+    """A plan with the number of steps, and of resets of its controller, before its initial state."""
 
-    def __init__(self, control: WorldControl, number: int) -> None:
-        self._control, self._number = control, number
-        self.__name__ = getattr(control.controller, "__name__", type(control.controller).__name__)
-        self.__wrapped__ = control.controller  # inspect.signature returns the signature of __wrapped__
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._control.controller, name)
-
-    def __call__(self, state: torch.Tensor, obs: torch.Tensor, **options: Any) -> torch.Tensor:
-        """See ``WorldControl.call``."""
-        return self._control.call(self._number, state, obs, **options)
+    actions: torch.Tensor
+    step: int
+    resets: int
 
 
 def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
@@ -177,10 +214,9 @@ def controls(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
             controls[name] = PolicyControl(name, controller, env)
             continue
         try:
-            CheckedController(controller, env)
+            controls[name] = WorldControl(name, controller, env)
         except ValueError as error:
             raise ValueError(f"the controller {name!r} does not fit: {error}") from error
-        controls[name] = WorldControl(name, controller)
     return controls
 
 

@@ -4,7 +4,7 @@ On a GPU, a step does not wait for the device. Only a frame waits for it.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from lyceum_warp.env import Env
 HISTORY_BYTES = 240 * 2**20
 """Memory for the history of all worlds, in bytes."""
 PLANT_HISTORY_BYTES = 16 * 2**20
-"""Memory for the history of a plant (see ``plant.py``), in bytes."""
+"""Memory for the history of a plant (see ``stage.py``), in bytes."""
 HISTORY_STEPS = 2000
 """Maximum number of steps in the history."""
 
@@ -34,7 +34,6 @@ class Past:
         self.length = length if length > 1 else 0
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)
-        self.pushed: list[int | None] = [None] * self.length
         self.now = self.newest = self.oldest = 0
 
     @property
@@ -48,14 +47,13 @@ class Past:
         """The number of undone steps that can be redone."""
         return self.newest - self.now
 
-    def put(self, state: torch.Tensor, returns: torch.Tensor, pushed: int | None) -> None:
+    def put(self, state: torch.Tensor, returns: torch.Tensor) -> None:
         """Store the present state."""
         if not self.length:
             return
         index = self.now % self.length
         self.states[index].copy_(state)
         self.returns[index].copy_(returns)
-        self.pushed[index] = pushed
         self.oldest = max(self.oldest, self.now - self.length + 1)
 
     def drop_ahead(self) -> None:
@@ -89,7 +87,9 @@ class Live:
         self.env, self.past = env, Past(env, limit)
         self.steps = self._reported = 0  # number of steps so far, and number of steps before the last frame
         self.world = 0
-        self.pushed: int | None = None
+        self.force: np.ndarray | None = None
+        """A push of the displayed world: forces (N) and torques (Nm) on its bodies in world coordinates, (nbody, 6).
+        It acts only during steps, so the states of the history and of controllers do not contain it."""
         device, n = env.obs.device, env.nworld
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
@@ -117,43 +117,23 @@ class Live:
 
     # steps
 
-    def step(self, act: Callable[[], None]) -> None:
-        """Make a step, or redo an undone step.
-
-        Args:
-            act: Writes the actions of all worlds into ``env.action``. Redone steps do not call this function.
-        """
+    def step(self) -> None:
+        """Make a step with the actions in ``env.action``, or redo an undone step."""
         if self.past.ahead:
             self._move(1)
             return
-        act()
-        self._before_step()
-        self._keep(self.env.get_state(out=self._state))
-        self.env.step()
-        self._after_step()
-
-    def expect_steps(self) -> None:
-        """Prepare for steps that a control loop makes on ``env``. Call ``stepped`` after each of them."""
-        self.past.drop_ahead()
-        self.env.get_state(out=self._state)
-        self._before_step()
-
-    def stepped(self) -> None:
-        """Update the history and the statistics after a step that a control loop made."""
-        self._keep(self._state)
-        self._after_step()
-        self.env.get_state(out=self._state)
-        self._before_step()
-
-    def _before_step(self) -> None:
-        self._length.copy_(self.env.episode_step)
-        self._over.copy_(self.env.done)
-
-    def _keep(self, state: torch.Tensor) -> None:
-        past = self.past
-        past.put(state, self.returns, self.pushed)
+        env, past = self.env, self.past
+        self._length.copy_(env.episode_step)
+        self._over.copy_(env.done)
+        past.put(env.get_state(out=self._state), self.returns)
         past.now += 1
         past.newest = past.now
+        if (force := self.force) is not None:
+            self.write(xfrc_applied=force)
+        env.step()
+        self._after_step()
+        if force is not None:
+            self.write(xfrc_applied=np.zeros_like(force))
 
     def _after_step(self) -> None:
         env = self.env
@@ -191,7 +171,7 @@ class Live:
         """Undo steps of all worlds, and return how many steps were undone."""
         past = self.past
         if not past.ahead and past.behind:  # the current state is not in the history yet
-            past.put(self.env.get_state(out=self._state), self.returns, self.pushed)
+            past.put(self.env.get_state(out=self._state), self.returns)
         steps = min(steps, past.behind)
         if steps > 0:
             self._move(-steps)
@@ -208,7 +188,6 @@ class Live:
         index = past.now % past.length
         self.env.set_state(past.states[index], check=False)
         self.returns.copy_(past.returns[index])
-        self.pushed = past.pushed[index]
         if steps < 0:
             self._points = 0
 
@@ -223,8 +202,6 @@ class Live:
         else:
             self.env.reset(mask=mask)
         self.returns.masked_fill_(mask, 0.0)
-        if self.pushed == self.world:
-            self.pushed = None
 
     def set_row(self, state: torch.Tensor, *, new_episode: bool = False) -> None:
         """Set the state of the displayed world.
@@ -235,28 +212,9 @@ class Live:
         """
         states = self.env.get_state()
         states[self.world].copy_(state)
-        self._restore(states, self.world)
+        self._restore(states)
         if new_episode:
             self.returns[self.world] = 0.0
-
-    def push(self, forces: np.ndarray) -> None:
-        """Push bodies of the displayed world, until ``end_push``.
-
-        Args:
-            forces: Forces (N) and torques (Nm) in world coordinates, (nbody, 6).
-        """
-        if self.pushed != self.world:
-            self.end_push()
-        self.write(xfrc_applied=forces)
-        self.pushed = self.world
-
-    def end_push(self) -> None:
-        """Clear the force of a push."""
-        if (world := self.pushed) is not None:
-            self.pushed = None
-            states = self.env.get_state()
-            states[world, self.env.state_space.parts["xfrc_applied"]] = 0.0
-            self._restore(states, world)
 
     def write(self, **parts: np.ndarray) -> None:
         """Change parts of the displayed world's state by their names in ``env.state_space``."""
@@ -264,11 +222,11 @@ class Live:
         for name, value in parts.items():
             flat = torch.as_tensor(np.ascontiguousarray(value).ravel(), dtype=torch.float64)
             states[self.world, self.env.state_space.parts[name]] = flat.to(states.device)
-        self._restore(states, self.world)
+        self._restore(states)
 
-    def _restore(self, states: torch.Tensor, world: int) -> None:
+    def _restore(self, states: torch.Tensor) -> None:
         self.past.drop_ahead()
-        self.env.set_state(states, self._number == world, check=False)
+        self.env.set_state(states, self._number == self.world, check=False)
 
     # worlds to show
 

@@ -11,16 +11,15 @@ import numpy as np
 import torch
 
 from lyceum_warp.algos import Planner
-from lyceum_warp.controllers import control
+from lyceum_warp.engines import options_for_plant
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
-from lyceum_warp.viewer.session.drivers import Control, ControllerError, PolicyControl, WorldControl, controls
+from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
-from lyceum_warp.viewer.session.live import Live
+from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
 from lyceum_warp.viewer.session.live_settings import planner_numbers, rebuilt_planner, task_numbers
-from lyceum_warp.viewer.session.plant import make_plant
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
@@ -51,13 +50,12 @@ class Stage:
         if seed is not None:
             env.rand_reset(whole_number("seed", seed, low=0))
         self.main = Live(env)
-        planned = any(isinstance(each, WorldControl) for each in self.controllers.values())
-        self._plant = make_plant(self.main) if planned else None
+        self._plant = make_plant(self.main) if self.world_controls else None
         self._threads: dict[str, TraceThread] = {}
         self.mode: Mode = "passive"
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
-        self.dragging = self.closed = False
+        self.closed = False
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -84,41 +82,63 @@ class Stage:
         """The controller in use."""
         return self.controllers[self.controller] if self.mode == "controller" and self.controller else None
 
+    @property
+    def world_controls(self) -> list[WorldControl]:
+        """The controllers of one world."""
+        return [each for each in self.controllers.values() if isinstance(each, WorldControl)]
+
+    @property
+    def busy(self) -> bool:
+        """Whether a controller is being called."""
+        return any(each.busy for each in self.world_controls)
+
+    def rest(self, seconds: float) -> None:
+        """Wait, and meanwhile let the controller plan."""
+        if isinstance(self.control, WorldControl):
+            self.control.rest(seconds)
+        else:
+            time.sleep(seconds)
+
     def close(self) -> None:
         """End the threads."""
+        for each in self.world_controls:
+            each.close()
         while self._threads:
             self._threads.popitem()[1].close()
 
     # steps
 
-    def advance(self, steps: int = 1) -> None:
-        """Step the worlds or the playback without waiting for real time."""
+    def advance(self, steps: int = 1, *, wait: bool = True) -> bool:
+        """Step the worlds or the playback. Return whether all steps were made.
+
+        With ``wait``, each step of the plant waits for its plan. Otherwise, the plant waits only for the first plan
+        after a reset: until then, no step is made.
+        """
         for _ in range(steps):
-            self.steps += 1
             if self.mode == "playback":
                 self.seek_episode(self.playback.next_step)
-                continue
-            if isinstance(self.control, WorldControl) and not self.live.past.ahead:
-                self._step_plant(self.control)
+            elif self.live.past.ahead or self._act(wait=wait):
+                self.live.step()
             else:
-                self.live.step(self.act)
-            self.end_old_push()
+                return False
+            self.steps += 1
+        return True
 
-    def act(self) -> None:
-        """Write the actions of all worlds."""
-        if isinstance(self.control, PolicyControl):
-            self.control.act()
+    def _act(self, *, wait: bool) -> bool:
+        """Write the actions of all worlds, or return False if the plant has no plan yet."""
+        current = self.control
+        if isinstance(current, WorldControl):
+            self.begin_due_episode()
+            env = self.live.env
+            action = current.action(self.live.steps, env.get_state()[0], env.obs[0].clone(), wait=wait)
+            if action is None:
+                return False
+            env.action[0] = action
+        elif current is not None:
+            current.act()
         else:
             self.live.env.action.zero_()
-
-    def _step_plant(self, current: WorldControl) -> None:
-        self.begin_due_episode()
-        self.live.expect_steps()
-        try:
-            control(self.live.env, current.new_run(), steps=1, reset=False)
-        except ValueError as error:  # from invalid actions
-            raise ControllerError(current.name, error) from error
-        self.live.stepped()
+        return True
 
     def begin_due_episode(self) -> None:
         """Start a new episode of the plant and its controller if the last episode has ended."""
@@ -148,16 +168,6 @@ class Stage:
         self.playback.seek(step)
         self.frames.add_point(self.playback)
 
-    def end_old_push(self) -> None:
-        """End a push that a restored state contains, unless the user still pushes."""
-        live = self.live
-        if live.pushed is not None and not self.dragging and not live.past.ahead:
-            live.end_push()
-        pushed = self.env.state_space.parts["xfrc_applied"] if live.pushed is not None else None
-        for each in self.controllers.values():
-            if isinstance(each, WorldControl):
-                each.hidden = pushed
-
     # which worlds
 
     def select(self, mode: Mode, controller: str | None) -> None:
@@ -166,7 +176,6 @@ class Stage:
         self.mode, self.controller = mode, controller
         if self.live is not before:
             self._transfer(before, self.live)
-            before.end_push()
         for thread in self._threads.values():
             thread.forget()
         if choice != (mode, controller):
@@ -182,12 +191,14 @@ class Stage:
 
     def set_number(self, owner: str, name: str, value: float) -> None:
         """Change a setting of the planner in use, or a task parameter in all worlds."""
-        planners = [each for each in self.controllers.values() if isinstance(each, WorldControl)]
+        planners = self.world_controls
         if owner == "planner":
-            if not isinstance(self.control, WorldControl):  # the mode may have changed since the command
+            if not isinstance(current := self.control, WorldControl):  # the mode may have changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
-            planners = [self.control]
-            self.control.controller = rebuilt_planner(self.control.controller, name, value)
+            planners = [current]
+            rebuilt = rebuilt_planner(current.controller, name, value)
+            self.controllers[current.name] = WorldControl(current.name, rebuilt, self.env)
+            current.close()
         else:
             plans = [each.controller.env for each in planners if isinstance(each.controller, Planner)]
             for env in {id(env): env for env in (self.env, self.live.env, *plans)}.values():
@@ -200,11 +211,10 @@ class Stage:
     def show_world(self, world: int) -> None:
         """Show another world. First clear the user's push and command in the displayed world."""
         before = self.live
-        before.end_push()
+        before.force = None
         if self.driving.velocity is not None:
             self.driving.velocity = None
             self.driving.apply(before)
-        self.dragging = False
         if before is not self.main:
             self._transfer(before, self.main)
         self.main.world = world
@@ -220,8 +230,7 @@ class Stage:
 
     def _transfer(self, before: Live, after: Live) -> None:
         self.go_on_from(before.env.get_state()[before.world], after)
-        if before.pushed == before.world:
-            after.pushed = after.world
+        after.force, before.force = before.force, None
         after.returns[after.world] = before.returns[before.world].item()
 
     # frames
@@ -235,7 +244,6 @@ class Stage:
             velocity, command, live = self.driving.velocity, frame.status.command, self.live
             if velocity and command and not live.past.ahead and not np.allclose(command, velocity, atol=1e-6):
                 self.driving.apply(live)  # a reset or a change of world has replaced the user's command
-                live.expect_steps()
         if news:
             files = tuple(str(file.absolute()) for file in self.videos.files)
             self.videos.files.clear()
@@ -269,3 +277,16 @@ class Stage:
             planner=planner_numbers(getattr(self.control, "controller", None)), params=task_numbers(self.env),
             plan_ms=1000 * self.control.seconds if self.control else math.nan, **fields,
         )  # fmt: skip
+
+
+def make_plant(main: Live) -> Live:
+    """Make the plant: a single world on the CPU, where steps do not wait for a planner's GPU."""
+    env, plant = main.env, main
+    if env.nworld > 1 or env.autoreset or env.device.is_cuda:
+        options = options_for_plant(env.options.engine, env.device)
+        if options.get("engine", env.engine.name) == "mujoco":
+            options["nthread"] = 1
+        plant = Live(env.replicate(nworld=1, autoreset=False, **options), limit=PLANT_HISTORY_BYTES)
+        main.warm_up()
+    plant.warm_up()
+    return plant

@@ -42,11 +42,11 @@ def test_trace_point_may_be_a_site_a_body_or_the_choice_of_the_task() -> None:
 def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
     plant = lw.make("reach", autoreset=False, fields=["site_xpos"])
     mppi = lw.MPPI("reach", samples=6, horizon=5)
-    control = WorldControl("mppi", mppi)
+    control = WorldControl("mppi", mppi, plant)
     assert control.look() is None
     plant.rand_reset(3)
     start = plant.get_state()
-    control.new_run()(start[0], plant.obs[0])
+    control.action(0, start[0], plant.obs[0], wait=True)
     view = control.look()
     assert view is not None
     best = int(mppi.returns.argmax())
