@@ -45,7 +45,6 @@ def check_spaces(ctx: Context) -> None:
 def check_addresses(ctx: Context) -> None:
     """Buffers keep their addresses through steps, resets and ``set_state``."""
     env = ctx.a
-    ctx.restart()
     names = (*OUTCOMES, "action", "time")
     before = {name: (id(getattr(env, name)), getattr(env, name).data_ptr()) for name in names}
     fields = {name: array.ptr for name, array in env.engine.arrays.items()}
@@ -65,7 +64,6 @@ def check_addresses(ctx: Context) -> None:
 def check_getters(ctx: Context) -> None:
     """A getter ``get_x`` returns a copy of ``env.x``, and ``get_x(out=)`` writes the same values."""
     env = ctx.a
-    ctx.restart()
     for action in ctx.actions(3):
         env.step(action)
     for name in ("obs", "reward", "eval", "terminated", "action", "state"):

@@ -25,6 +25,7 @@ SHORT = 8
 class Context:
     """Two environments with the same options, and methods that compare their values.
 
+    Before each check, both environments are in the same random initial states.
     A method's error names the rule that the task breaks.
     """
 

@@ -28,7 +28,6 @@ def check_truncation(ctx: Context) -> None:
     """
     a, b, horizon = ctx.a, ctx.b, 4
     with ctx.changed(a, horizon=horizon, autoreset=True), ctx.changed(b, horizon=horizon, autoreset=False):
-        ctx.restart()
         steps = torch.zeros_like(a.done_reason)
         alive = torch.ones_like(a.done)
         for action in ctx.actions(2 * horizon + 1):
@@ -60,7 +59,6 @@ def check_no_autoreset(ctx: Context) -> None:
     """Without automatic resets, a finished world keeps stepping with ``done`` set, and ``final_obs`` equals ``obs``."""
     env, horizon = ctx.a, 3
     with ctx.changed(env, horizon=horizon, autoreset=False):
-        ctx.restart()
         ended = torch.zeros_like(env.done)
         for i, action in enumerate(ctx.actions(3 * horizon), 1):
             env.step(action)
@@ -80,7 +78,6 @@ def check_graphs(ctx: Context) -> None:
     """Results are equal bit for bit with and without graphs."""
     a, b, n = ctx.a, ctx.b, 20
     with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
-        ctx.restart()
         actions = ctx.actions(n)
         ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "without graphs")
         for _ in range(3):
@@ -103,7 +100,6 @@ def _memory(device: wp.Device) -> dict[str, int]:
 def check_memory(ctx: Context) -> None:
     """Steps, resets, ``get_state`` and ``set_state`` leak no memory."""
     env = ctx.a
-    ctx.restart()
     actions, state = ctx.actions(32), env.get_state()
     mask = ctx.mask()
 

@@ -72,7 +72,6 @@ def check_bad_warmstart(ctx: Context) -> None:
     a, b, bad = ctx.a, ctx.b, 0
     if "qacc_warmstart" not in a.state_space.parts:
         return
-    ctx.restart()
     diverges = False
     state = a.get_state()
     state[bad, a.state_space.parts["qacc_warmstart"]] = np.nan

@@ -13,7 +13,6 @@ def check_noise(ctx: Context) -> None:
     env = ctx.a
     if not env.task.noisy_groups:
         return
-    ctx.restart()
     env.step(ctx.actions(1)[0])
     state = env.get_state()
     ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
@@ -40,7 +39,6 @@ def check_metrics(ctx: Context) -> None:
     if not a.metrics:
         return
     with ctx.changed(a, b, horizon=horizon, autoreset=True):
-        ctx.restart()
         sums = {name: torch.zeros_like(values) for name, values in a.metrics.items()}
         for i, action in enumerate(ctx.actions(2 * horizon + 1)):
             if i == horizon + 1:
@@ -72,7 +70,6 @@ def check_success_steps(ctx: Context) -> None:
         return
     column = a.state_space.parts["success_steps"]
     with ctx.changed(a, b, horizon=0, autoreset=False):
-        ctx.restart()
         state = a.get_state()
         state[:, column] = torch.arange(a.nworld, dtype=state.dtype, device=state.device)[:, None] % needed
         a.set_state(state)
@@ -107,7 +104,6 @@ def check_events(ctx: Context) -> None:
     if a.task.functions["event"] is None:
         return
     with ctx.changed(a, b, horizon=5):
-        ctx.restart()
         for i, action in enumerate(ctx.actions(2 * SHORT)):
             b.set_state(a.get_state())
             b.action.copy_(action)
@@ -143,7 +139,6 @@ def check_substep(ctx: Context) -> None:
     if substep is None:
         return
     with ctx.changed(a, b, horizon=0, autoreset=False):
-        ctx.restart()
         memory = memory_columns(a.task, a.state_space)
 
         def start(state: torch.Tensor, action: torch.Tensor) -> None:
@@ -175,7 +170,6 @@ def check_lasting_memory(ctx: Context) -> None:
     a, b = ctx.a, ctx.b
     if (columns := memory_columns(a.task, a.state_space).get("lasting_memory")) is None:
         return
-    ctx.restart()
     state = a.get_state()
     state[:, columns] = 3.25
     writes = a.task.writes

@@ -23,7 +23,9 @@ def converged(ctx: Context) -> Context:
     """Let the solver of ``ctx.a`` converge, because engines that stop it early differ from ``mj_step``."""
     if ctx.a.task.model.opt.iterations >= 20:
         return ctx
-    return dataclasses.replace(ctx, a=ctx.make(solver={"iterations": 20, "ls_iterations": 50}))
+    ctx = dataclasses.replace(ctx, a=ctx.make(solver={"iterations": 20, "ls_iterations": 50}))
+    ctx.restart()
+    return ctx
 
 
 def predicted(
@@ -88,7 +90,6 @@ def check_inputs(ctx: Context) -> None:
     env, b = ctx.a, ctx.b
     parts, nstep = env.state_space.parts, env.task.frame_skip
     with ctx.changed(env, autoreset=False, horizon=0):
-        ctx.restart()
         for i, action in enumerate(ctx.actions(SHORT)):
             before = env.get_state()
             b.set_state(before)
@@ -135,7 +136,6 @@ def check_dynamics(ctx: Context) -> None:
         for name in varied:
             ctx.equal(state[:, parts[name]].float(), rows(env, name), f"{name} in the state {when}")
 
-    ctx.restart()
     first = a.get_state()
     compare(a, first, "after rand_reset")
     with ctx.changed(a, b, autoreset=False, horizon=0):
@@ -184,7 +184,6 @@ def check_settle(ctx: Context) -> None:
         return
     ctx = converged(ctx)
     a, b = ctx.a, ctx.b
-    ctx.restart()
     b.worlds.set_mask(None)
     for phase in b.worlds.reset_phases(randomly=True):
         if phase.name != "settle":

@@ -16,7 +16,6 @@ def check_round_trip(ctx: Context) -> None:
     With a mask, ``get_state`` writes only the rows of selected worlds.
     """
     env = ctx.a
-    ctx.restart()
     ctx.run(env, ctx.actions(5))
     state = env.get_state()
     ctx.run(env, ctx.actions(SHORT, 1))
@@ -33,7 +32,6 @@ def check_restoring(ctx: Context) -> None:
     """Steps after ``set_state`` repeat the original steps, even through automatic resets and in another environment."""
     a, b = ctx.a, ctx.b
     with ctx.changed(a, b, horizon=6):
-        ctx.restart()
         ctx.run(a, ctx.actions(7))
         state, actions = a.get_state(), ctx.actions(2 * SHORT, 1)
         first = ctx.run(a, actions)
@@ -48,7 +46,6 @@ def check_restoring(ctx: Context) -> None:
 def check_masked_restoring(ctx: Context) -> None:
     """With a mask, ``set_state`` does not change other worlds."""
     a, b = ctx.a, ctx.b
-    ctx.restart()
     mask = ctx.mask()
     state, early, late = a.get_state(), ctx.actions(SHORT), ctx.actions(SHORT, 1)
     first = ctx.run(a, early)
@@ -70,7 +67,6 @@ def check_set_state_shows(ctx: Context) -> None:
     a, b = ctx.a, ctx.b
     has_evaluate = a.task.functions["evaluate"] is not None
     with ctx.changed(a, b, autoreset=False, horizon=0):
-        ctx.restart()
         ended = torch.zeros_like(a.done)
         for action in ctx.actions(10):
             a.step(action)
@@ -97,7 +93,6 @@ def check_purity(ctx: Context) -> None:
     env = ctx.a
     has_evaluate = env.task.functions["evaluate"] is not None
     with ctx.changed(env, autoreset=False, horizon=0):
-        ctx.restart()
         actions = ctx.actions(6)
         states = [env.get_state()]
         live = ctx.run(env, actions)
@@ -124,7 +119,6 @@ def check_purity(ctx: Context) -> None:
 
 def check_determinism(ctx: Context) -> None:
     """Two environments with the same options and actions stay equal bit for bit through all resets."""
-    ctx.restart()
     for i, action in enumerate(ctx.actions(ctx.steps)):
         ctx.a.step(action)
         ctx.b.step(action)
@@ -229,7 +223,6 @@ def check_world_count(ctx: Context) -> None:
     n = ctx.a.nworld
     doubled = {name: np.concatenate([v, v]) for name, v in ctx.a.task.parameters.per_world.items()}
     more = ctx.make(nworld=2 * n, seed=ctx.seed, **doubled)
-    ctx.restart()
     ctx.equal(more.get_state()[:n], ctx.a.get_state(), f"the states of {n} of {2 * n} worlds")
     ctx.equal(more.obs[:n], ctx.a.obs, f"the observations of {n} of {2 * n} worlds")
 
@@ -266,7 +259,6 @@ def check_rejection(ctx: Context) -> None:
         reset(mask)
 
     with ctx.changed(a, graphs=False):
-        ctx.restart()
         for i in range(6):
             state = a.get_state()
             count.zero_()
