@@ -1,4 +1,4 @@
-"""Check spaces, buffers and their getters."""
+"""Check spaces, buffers and the time."""
 
 import torch
 
@@ -59,31 +59,6 @@ def check_addresses(ctx: Context) -> None:
         ctx.that(getattr(env, name).data_ptr() == before[name][1], f"env.{name} has moved")
     for name, pointer in fields.items():
         ctx.that(env.engine.arrays[name].ptr == pointer, f"the field {name} has moved")
-
-
-def check_getters(ctx: Context) -> None:
-    """A getter ``get_x`` returns a copy of ``env.x``, and ``get_x(out=)`` writes the same values."""
-    env = ctx.a
-    for action in ctx.actions(3):
-        env.step(action)
-    for name in ("obs", "reward", "eval", "terminated", "action", "state"):
-        getter = getattr(env, f"get_{name}")
-        value = getter()
-        out = torch.zeros_like(value) if value.dtype == torch.bool else torch.full_like(value, 7)
-        returned = getter(out=out)
-        ctx.that(returned is out, f"get_{name}(out=) does not return out")
-        ctx.equal(out, value, f"get_{name}(out=)")
-        if name != "state":
-            ctx.equal(value, getattr(env, name), f"get_{name}()")
-            ctx.that(value.data_ptr() != getattr(env, name).data_ptr(), f"get_{name}() is not a copy")
-    state = env.get_state()
-    for name in ("obs", "eval", "terminated"):
-        getter = getattr(env, f"get_{name}")
-        out = torch.zeros_like(getter())
-        ctx.equal(getter(state, out=out), getter(state), f"get_{name}(state, out=)")
-    action = ctx.actions(1, 1)[0]
-    env.set_action(action)
-    ctx.equal(env.action, action, "the action after set_action")
 
 
 def check_time(ctx: Context) -> None:

@@ -158,6 +158,20 @@ def test_set_params_with_an_option_raises_an_error_that_suggests_replicate() -> 
         lw.make("hopper").set_params(nworld=3)
 
 
+@pytest.mark.parametrize("name", ["obs", "reward", "eval", "terminated", "action"])
+def test_getter_copies_a_buffer_or_writes_into_out(name: str) -> None:
+    env = lw.make("hopper", nworld=2, seed=0)
+    env.step(torch.ones(2, 3))
+    getter, buffer = getattr(env, f"get_{name}"), getattr(env, name)
+    value, out = getter(), ~buffer if buffer.dtype == torch.bool else buffer + 1
+    assert torch.equal(value, buffer) and value.data_ptr() != buffer.data_ptr()
+    assert getter(out=out) is out and torch.equal(out, buffer)
+    if name in ("obs", "eval", "terminated"):
+        assert torch.equal(getter(env.get_state(), out=torch.zeros_like(out)), buffer)
+    env.set_action(torch.zeros(2, 3))
+    assert not env.action.any()
+
+
 def test_get_state_with_a_mask_but_without_out_raises_an_error() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(ValueError, match="pass the tensor as out="):

@@ -17,7 +17,7 @@ EVERY_RULE = {
 OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
 """On the C engine, the other tasks pass these checks. Two slow checks, which hardly depend on the task, are missing."""
 OF_THE_STATE = (
-    buffers.check_addresses, buffers.check_getters, state.check_restoring, state.check_purity, state.check_determinism,
+    buffers.check_addresses, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
 """On the Warp engine, the other tasks pass only these checks, because this engine is slow on a CPU."""

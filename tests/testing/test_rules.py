@@ -10,7 +10,6 @@ from form_tasks import Gifted, Weighed
 from full_task import Full, Settled
 
 import lyceum_warp as lw
-import lyceum_warp.env.env
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.env import Worlds
 from lyceum_warp.env.arrays import WorldArrays
@@ -118,7 +117,6 @@ Break = tuple[str, Any, str, Callable[[Function], Function]]
 BREAKS: list[Break] = [
     ("spaces", WorldArrays, "__init__", then(lambda worlds: worlds.obs_spaces.update(policy=worlds.action_space))),
     ("addresses", lw.Env, "step", then(lambda env: env.__dict__.update(obs=env.obs.clone()))),
-    ("getters", lyceum_warp.env.env, "_copied", lambda function: lambda values, out: values),
     ("time", lw.Env, "__init__", then(lambda env: setattr(env, "timestep", 1.5 * env.timestep))),
     ("round_trip", Worlds, "unpack_state", nothing),
     ("restoring", MujocoEngine, "_set_integration", nothing),
