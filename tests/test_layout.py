@@ -147,7 +147,7 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
     faces = {"lyceum_warp.support", "lyceum_warp.support.faces"}
     messages = {"lyceum_warp.viewer.commands", "lyceum_warp.viewer.protocol"}
-    assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *faces, *window}
+    assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *rendering, *faces, *window}
 
 
 def test_viewer_session_imports_nothing_from_the_window() -> None:

@@ -13,7 +13,11 @@ from lyceum_warp.viz.policy_videos import (
     one_line as one_line,
     policy_video as policy_video,
 )
-from lyceum_warp.viz.render import Shot as Shot
+from lyceum_warp.viz.render import (
+    Shot as Shot,
+    change_model as change_model,
+    owner_of as owner_of,
+)
 from lyceum_warp.viz.style import (
     ACCENT as ACCENT,
     LINE as LINE,

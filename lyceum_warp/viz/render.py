@@ -101,9 +101,14 @@ class Painter:
 def change_model(mujoco: Any, model: Any, rows: dict[str, Any]) -> None:
     """Set fields of a model by name, and recompute derived constants, such as the poses of cameras."""
     for name, row in rows.items():
-        owner = model if hasattr(model, name) else model.opt
+        owner = owner_of(model, name)
         setattr(owner, name, np.reshape(row, np.shape(getattr(owner, name))))
     mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def owner_of(model: Any, name: str) -> Any:
+    """Return the object that has a field of a model: the model or its options."""
+    return model if hasattr(model, name) else model.opt
 
 
 def main(folder: str) -> int:

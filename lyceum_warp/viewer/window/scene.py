@@ -2,7 +2,7 @@
 
 import copy
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -10,6 +10,7 @@ import numpy as np
 
 from lyceum_warp.viewer.protocol import BEST_COLOUR, TRACE_COLOUR, Arrow, Frame
 from lyceum_warp.viewer.window.studio import ux
+from lyceum_warp.viz import change_model, owner_of
 
 LINE_WIDTH = 3.0  # pixels
 SHRUNK = 0.98
@@ -126,13 +127,13 @@ class ModelValues:
     """Holds a copy of the model with the values of one world."""
 
     def __init__(self, nominal: mujoco.MjModel) -> None:
-        self._values: Mapping[str, np.ndarray] = {}
+        self._values: dict[str, np.ndarray] = {}
         self.model = copy.deepcopy(nominal)
 
-    def set(self, values: Mapping[str, np.ndarray]) -> tuple[bool, bool]:
+    def set(self, values: dict[str, np.ndarray]) -> tuple[bool, bool]:
         """Set a world's values. Return whether any value has changed, and whether the change is visible."""
         model = self.model
-        changed = [name for name, value in values.items() if not _equal(value, getattr(_owner(model, name), name))]
+        changed = [name for name, value in values.items() if not _equal(value, getattr(owner_of(model, name), name))]
         if changed:
             self._values = values
             self.copy_to(self.model)
@@ -140,19 +141,12 @@ class ModelValues:
 
     def copy_to(self, model: mujoco.MjModel) -> None:
         """Set the values in another copy of the model, and recompute its constants."""
-        for name, values in self._values.items():
-            owner = _owner(model, name)
-            setattr(owner, name, values.reshape(np.shape(getattr(owner, name))))
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        change_model(mujoco, model, self._values)
 
 
 def _equal(first: np.ndarray, second: Any) -> bool:
     """Compare in single precision, because MuJoCo Warp rounds the model's values."""
     return np.array_equal(first.astype(np.float32), np.ravel(second).astype(np.float32))
-
-
-def _owner(model: mujoco.MjModel, name: str) -> Any:
-    return model if hasattr(model, name) else model.opt
 
 
 # cameras
