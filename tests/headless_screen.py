@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from mujoco.studio import launch_thread, messages, ux, viewer_protocol
 
-from lyceum_warp.viewer.protocol import Frame, Opened, Scene, Status
+from lyceum_warp.viewer.protocol import Frame, Scene, Status
 from lyceum_warp.viewer.session.frames import model_bytes
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.studio import imgui, implot
@@ -76,6 +76,8 @@ class HeadlessViewer(viewer_protocol.Viewer):
 class Bench:
     """The viewer's panel without a window. ``sent`` contains the messages of the panel."""
 
+    instructions = ("viewer: http://here",)
+
     def __init__(self, model: mujoco.MjModel, scene: Scene) -> None:
         self.model, self.data = model, mujoco.MjData(model)
         mujoco.mj_forward(model, self.data)
@@ -90,9 +92,8 @@ class Bench:
         self.sent: list[Any] = []
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
-        self.panel = Panel(
-            scene, model, self.sent.append, self.take, self, Opened(("viewer: http://here",)), lambda file: None
-        )
+        self.send, self.offer = self.sent.append, lambda file: None
+        self.panel = Panel(scene, model, self, self, self)
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()
         self.viewer = HeadlessViewer(config, here, model=model, plugins=[self.panel])

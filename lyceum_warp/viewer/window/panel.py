@@ -1,17 +1,17 @@
 """Connect studio with the session: show frames, and send the user's commands."""
 
 import time
-from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
-from lyceum_warp.viewer.commands import Command
 from lyceum_warp.viewer.protocol import Frame, Opened, Scene
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.actions import Actions
+from lyceum_warp.viewer.window.connection import SessionConnection
 from lyceum_warp.viewer.window.mouse import Mouse
 from lyceum_warp.viewer.window.scene import ExtraGeoms, ModelValues, ViewCameras
+from lyceum_warp.viewer.window.server import PageServer
 from lyceum_warp.viewer.window.studio import inputs, ux
 from lyceum_warp.viewer.window.windows import Windows
 
@@ -23,20 +23,13 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
     """A plugin of studio that shows frames and sends commands."""
 
     def __init__(
-        self,
-        scene: Scene,
-        model: mujoco.MjModel,
-        send: Callable[[Command | Opened], None],
-        newest: Callable[[], Frame | None],
-        screen: studio.Screen,
-        opened: Opened,
-        offer: Callable[[str], object],
+        self, scene: Scene, model: mujoco.MjModel, session: SessionConnection, screen: studio.Screen, server: PageServer
     ) -> None:
-        self.actions = Actions(scene, send)
-        self.mouse = Mouse(send)
+        self.actions = Actions(scene, session.send)
+        self.mouse = Mouse(session.send)
         self.values = ModelValues(model)
         self.windows = Windows(self.actions)
-        self._send, self._newest, self._screen, self._opened, self._offer = send, newest, screen, opened, offer
+        self._session, self._screen, self._server = session, screen, server
         self._geoms = ExtraGeoms(model, studio.MAX_GEOMS)
         self._swapped = -SWAP_TIME
         self._model_due = False
@@ -49,13 +42,12 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         ux.setup_theme(ux.GuiTheme.LIGHT)
         self.actions.viewer, self.actions.cameras = self.viewer, ViewCameras(self.viewer, self.values)
         self.actions.cameras.reset()
-        self._send(self._opened)
+        self._session.send(Opened(tuple(self._server.instructions)))
 
     @studio.handler
     def on_update(self, event: studio.Update) -> None:
         """Show the newest frame, and handle keys and the mouse."""
-        frame = self._newest()
-        if frame is not None:
+        if (frame := self._session.take()) is not None:
             self.take(frame)
         if self.actions.frame is None:
             return
@@ -82,7 +74,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         if frame.points is not None:
             self.windows.curves.add(frame.points)
         for file in frame.files:
-            self._offer(file)
+            self._server.offer(file)
         if frame.messages:
             self.actions.say(*frame.messages)
         # if the state is not finite, keep the previous pose; the session reports the fault
