@@ -200,16 +200,10 @@ class Windows:
             imgui.PopItemWidth()
 
     def _push(self) -> None:
-        viewer, paused = self._actions.viewer, self._actions.status.paused
+        viewer = self._actions.viewer
         body = viewer.perturb.select
-        name = viewer.model.body(body).name if body > 0 else ""
-        imgui.SeparatorText(f"push {name or 'a body'}")
-        act = "place or turn" if paused else "push or twist"
-        imgui.TextWrapped(
-            f"Ctrl + drag with the right or left button: {act} it"
-            if body > 0
-            else "double-click it, then Ctrl + drag with the right button"
-        )
+        imgui.SeparatorText(f"push {viewer.model.body(body).name if body > 0 else 'a body'}")
+        imgui.TextWrapped("double-click it, then Ctrl + drag with the right button")
 
     def _metrics(self) -> None:
         if (values := self._last_values()[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
