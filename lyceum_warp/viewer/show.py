@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from lyceum_warp.env import Env
-from lyceum_warp.viewer.protocol import Scene
 from lyceum_warp.viewer.session.clock import Session, Watcher
 from lyceum_warp.viewer.session.window_process import NoWindowError, Window
 
@@ -63,7 +62,8 @@ def view(
     """
     session = Session(env, controllers, episodes=episodes, seed=seed, paused=paused, watchers=watchers)
     try:
-        window = opened(session.stage.scene, host=host, port=port)
+        window = Window(session.stage.scene, host=host, port=port)
+        print(*window.instructions, sep="\n", flush=True)
         if block is False or (block is None and in_notebook()):
             return BackgroundView(session, window)
         session.run(window)
@@ -124,11 +124,3 @@ def in_notebook() -> bool:
     """Whether this program is the kernel of a notebook."""
     shell = sys.modules.get("IPython")
     return shell is not None and getattr(shell.get_ipython(), "kernel", None) is not None
-
-
-def opened(scene: Scene, **place: Any) -> Window:
-    """Open a window, and print the address of its page."""
-    window = Window(scene, **place)
-    for line in window.instructions:
-        print(line, flush=True)
-    return window

@@ -79,10 +79,7 @@ class FrameMaker:
             text=(("return", f"{rows.episode_return:.6g}"),), command=self._driving.command(state),
             seekable=(max(0, step - past.behind), step + past.ahead),
         )  # fmt: skip
-        return Frame(
-            self._physics(state), self._model_fields(state), complete, tuple(ghosts),
-            None if traces is None else traces.paths, self._driving.arrows(state),
-        )  # fmt: skip
+        return self._frame(state, complete, ghosts, None if traces is None else traces.paths)
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; for ``status``, see ``of_worlds``."""
@@ -102,10 +99,14 @@ class FrameMaker:
             world=0, step=playback.step, steps=episode.steps, time=playback.step * self._env.timestep,
             text=tuple(text), seekable=(0, episode.steps),
         )  # fmt: skip
-        return Frame(
-            self._physics(state), self._model_fields(state), complete, tuple(ghosts),
-            arrows=self._driving.arrows(state),
-        )  # fmt: skip
+        return self._frame(state, complete, ghosts)
+
+    def _frame(
+        self, state: np.ndarray, status: Status, ghosts: Sequence[Ghost], paths: np.ndarray | None = None
+    ) -> Frame:
+        parts = self._env.state_space.parts
+        fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
+        return Frame(self._physics(state), fields, status, tuple(ghosts), paths, self._driving.arrows(state))
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
         """Report faults and the end of an episode. ``plant_of`` is the world that a plant copies."""
@@ -142,10 +143,6 @@ class FrameMaker:
 
     def _physics(self, state: np.ndarray) -> np.ndarray:
         return state[: self._env.engine.integration_size]
-
-    def _model_fields(self, state: np.ndarray) -> dict[str, np.ndarray]:
-        parts = self._env.state_space.parts
-        return {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
 
 
 def _following(index: int, number: int, count: int) -> list[int]:

@@ -128,8 +128,9 @@ class Stage:
         """Write the actions of all worlds, or return False if the plant has no plan yet."""
         current = self.control
         if isinstance(current, WorldControl):
-            self.begin_due_episode()
             env = self.live.env
+            if env.done.item():
+                self.reset(random=True)
             action = current.action(self.live.steps, env.get_state()[0], env.obs[0].clone(), wait=wait)
             if action is None:
                 return False
@@ -139,11 +140,6 @@ class Stage:
         else:
             self.live.env.action.zero_()
         return True
-
-    def begin_due_episode(self) -> None:
-        """Start a new episode of the plant and its controller if the last episode has ended."""
-        if self.live.env.done.item():
-            self.reset(random=True)
 
     def reset(self, *, random: bool) -> None:
         """Start a new episode of the displayed world and its controller."""
