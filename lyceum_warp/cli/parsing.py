@@ -16,13 +16,7 @@ import tyro
 from lyceum_warp.support.suggestions import closest
 
 _ERRORS = (
-    (r"Error parsing (\S+): no type matching INT .* from \[(.*?)\]", "{0} takes a whole number, not {1}"),
-    (r"Error parsing (\S+): no type matching FLOAT .* from \[(.*?)\]", "{0} takes a number, not {1}"),
-    (
-        r"Error parsing (\S+): no type matching \S*\[\w+ .* from \[(.*?)\]",
-        "{0} takes numbers separated by spaces, not {1}",
-    ),
-    (r"Error parsing (\S+): no type matching \{(.*?)\} .* from \[(.*?)\]", "{0} takes {1}, not {2}"),
+    (r"Error parsing (\S+): no type matching \{?(.*?)\}? could .* from \[(.*?)\]", "{0} takes {1}, not {2}"),
     (r"Missing value for argument '(\S+)'", "{0} needs a value"),
     (r"Missing from .*?: (\S+)", "{0} is missing"),
     (r"invalid choice '(\S*)' for argument '(\S+)'. Expected one of \((.*)\)", "{1} takes {2}, not '{0}'"),
