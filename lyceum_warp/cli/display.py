@@ -2,6 +2,7 @@
 
 import math
 import sys
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -87,15 +88,11 @@ class Display(Callback):
         success = f"success {row['success']:.0%}" if "success" in row else ""
         bad = [counted(number, what) for column, what in _COUNTED.items() if (number := row.get(column))]
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
+        text = " ".join(filter(None, [result, *bad, mean, success, rate]))
         if self.console.is_terminal:
-            most = [result, mean, success, *bad, rate.replace(" samples", "")]
-            for parts in (most, most[:-1], [result, success, *bad], [result, *bad], [result]):
-                text = " ".join(filter(None, parts))
-                if len(text) <= self.console.width - _BAR_WIDTH:
-                    break
+            text = textwrap.shorten(text, self.console.width - _BAR_WIDTH, placeholder="…")
             self.progress.update(self.bar, completed=it.iteration, text=text)
         else:
-            text = " ".join(filter(None, [result, mean, success, *bad, rate]))
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
 

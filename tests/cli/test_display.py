@@ -60,8 +60,10 @@ def test_iteration_line_omits_unknown_numbers(npg: lw.NPG, first: lw.Iteration) 
     assert line(npg, first, **common) == "iteration    1/10  return 3072 (mean policy 3117) 29.4k samples/s\n"
     assert "(mean policy 3117) success 25% 29.4k" in line(npg, first, **common, success=0.25)
     assert "success" not in line(npg, first, **common, success=math.nan)
-    assert "(mean policy 3117) 1 fault 1,200 outliers 29.4k" in line(npg, first, **common, faults=1, outliers=1200)
-    assert "(mean policy 3117) 2 skipped updates 29.4k" in line(npg, first, **common, skipped_updates=2)
+    assert "return 3072 1 fault 1,200 outliers (mean policy 3117) 29.4k" in line(
+        npg, first, **common, faults=1, outliers=1200
+    )
+    assert "return 3072 2 skipped updates (mean policy 3117) 29.4k" in line(npg, first, **common, skipped_updates=2)
 
 
 @pytest.mark.parametrize("changes", [{}, {"success": 0.25}, {"success": 1.0, "faults": 12_345, "outliers": 12_345}])
