@@ -42,21 +42,25 @@ class Renderer:
 
     Args:
         model: The model.
+        out: The file that ``finish`` writes: a video (mp4) or, without ``fps``, the last picture (png).
         camera: The attributes of the ``mujoco.MjvCamera``.
         size: The width and the height in pixels, both even.
         fps: The frames per second of a video. None renders pictures.
         background: Whether the subprocess has a low priority.
     """
 
-    product = "the picture"
-
     def __init__(
-        self, model: mujoco.MjModel, *, camera: dict[str, Any], size: tuple[int, int], fps: float | None = None,
-        background: bool = False,
+        self, model: mujoco.MjModel, out: str | Path | None = None, *, camera: dict[str, Any], size: tuple[int, int],
+        fps: float | None = None, background: bool = False,
     ) -> None:  # fmt: skip
-        self._model = model
+        self._model, self._out = model, Path(out or "")
+        self.product = "the picture" if fps is None else "the video"
         if len(size) != 2 or any(not isinstance(n, int | np.integer) or n < 2 or n % 2 for n in size):
             raise ValueError(f"size must be two even numbers, the width and the height in pixels, not {size}")
+        if fps is not None and (self._out.suffix.lower() != ".mp4" or self._out.is_dir()):
+            raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
+        if out is not None:
+            check_video()
         self.size = int(size[0]), int(size[1])
         self._job = {"size": self.size, "fps": fps, "camera": camera, "background": background}
         self._resources = contextlib.ExitStack()
@@ -64,7 +68,7 @@ class Renderer:
         self._log: IO[str]
         self._process: subprocess.Popen[bytes] | None = None
         self._lock = threading.Lock()  # other threads may call `abandon`
-        self._abandoned = self._rendered = False
+        self.abandoned = self._rendered = False
 
     def __enter__(self) -> Self:
         failures: list[str] = []
@@ -105,9 +109,27 @@ class Renderer:
         The rendering thread then gets a ``NoVideoError``.
         """
         with self._lock:
-            self._abandoned = True
+            self.abandoned = True
             if self._process is not None:
                 _kill(self._process)
+
+    def finish(self) -> Path:
+        """Complete the video or the picture, and move it to its path."""
+        if not self._rendered:
+            raise NoVideoError(f"{self.product} {self._out} has no frame: nothing is written")
+        self._send(None)
+        code, reason = self._end()
+        if code:
+            raise NoVideoError(f"{self.product} could not be written ({reason})")
+        self._out.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(self._out) as temporary:
+            if self._job["fps"] is None:
+                import imageio.v2 as imageio
+
+                imageio.imwrite(temporary, self.picture(), format="png")
+            else:
+                shutil.copyfile(self._folder / VIDEO, temporary)
+        return self._out
 
     def _start(self, backend: str) -> None:
         environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
@@ -121,7 +143,7 @@ class Renderer:
         # -P: modules beside render.py must not shadow packages
         command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), str(self._folder)]
         with self._lock:
-            if self._abandoned:
+            if self.abandoned:
                 raise NoVideoError(f"{self.product} was cancelled")
             self._process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log,
@@ -170,40 +192,6 @@ class Renderer:
                 _kill(process)  # no effect on a process that has ended
                 process.wait()
                 process.stdout.close()
-
-
-class FileRenderer(Renderer):
-    """A subprocess that renders shots into a video (mp4) or, without ``fps``, one shot into a picture (png)."""
-
-    def __init__(
-        self, model: mujoco.MjModel, out: str | Path, *, camera: dict[str, Any], size: tuple[int, int],
-        fps: float | None, background: bool = False,
-    ) -> None:  # fmt: skip
-        self.out = Path(out)
-        if fps is not None:
-            self.product = "the video"
-        super().__init__(model, camera=camera, size=size, fps=fps, background=background)
-        if fps is not None and (self.out.suffix.lower() != ".mp4" or self.out.is_dir()):
-            raise ValueError(f"a video is an mp4 file: give a file's name that ends in .mp4, not {str(out)!r}")
-        check_video()
-
-    def finish(self) -> Path:
-        """Complete the video or the picture, and move it to its path."""
-        if not self._rendered:
-            raise NoVideoError(f"{self.product} {self.out} has no frame: nothing is written")
-        self._send(None)
-        code, reason = self._end()
-        if code:
-            raise NoVideoError(f"{self.product} could not be written ({reason})")
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(self.out) as temporary:
-            if self._job["fps"] is None:
-                import imageio.v2 as imageio
-
-                imageio.imwrite(temporary, self.picture(), format="png")
-            else:
-                shutil.copyfile(self._folder / VIDEO, temporary)
-        return self.out
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:

@@ -17,7 +17,7 @@ from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.extra import NoVideoError
 from lyceum_warp.viz.render import Shot
-from lyceum_warp.viz.renderer import FileRenderer, check_video
+from lyceum_warp.viz.renderer import Renderer, check_video
 
 __all__ = ["NoVideoError", "Progress", "Recorder", "check_video", "write_video"]
 
@@ -67,7 +67,7 @@ def write_video(
     rows = states[::stride].cpu()
     view = camera_values(env.model, camera)
     with (
-        FileRenderer(env.model, out, camera=view, size=size, fps=rate / stride) as renderer,
+        Renderer(env.model, out, camera=view, size=size, fps=rate / stride) as renderer,
         LongWork("rendering the video", "frames") if progress is None else contextlib.nullcontext(progress) as report,
     ):
         for i, shot in enumerate(shots(env, rows)):
@@ -115,11 +115,10 @@ class Recorder:
         """The number of frames so far, including dropped ones."""
         self.dropped = 0
         """The number of frames that repeat an earlier picture, because the queue was full."""
-        self._renderer = FileRenderer(model, out, camera=camera, size=size, fps=fps, background=True)
+        self._renderer = Renderer(model, out, camera=camera, size=size, fps=fps, background=True)
         self._most = most_waiting
         self._shots: SimpleQueue[Shot | None] = SimpleQueue()
         self._newest: Shot
-        self._cancelled = False
         self._error: NoVideoError | OSError | None = None
         # Thread.join of Python 3.11 would mark the thread as stopped if a signal interrupts the call
         self._done = threading.Event()
@@ -159,7 +158,6 @@ class Recorder:
     def cancel(self) -> None:
         """Cancel the video, and write no file. A complete video is kept."""
         if not self.finished:
-            self._cancelled = True
             self.end()
             self._renderer.abandon()
             self._done.wait(_KILLED)
@@ -172,7 +170,7 @@ class Recorder:
                     renderer.render(shot)
                 renderer.finish()
         except (NoVideoError, OSError) as error:
-            self._error = NoVideoError(f"{product} {self.out} was cancelled") if self._cancelled else error
+            self._error = NoVideoError(f"{product} {self.out} was cancelled") if self._renderer.abandoned else error
         except Exception as error:  # a thread has no caller that could catch the error
             self._error = NoVideoError(f"{product} could not be written ({' '.join(str(error).split())})")
         finally:

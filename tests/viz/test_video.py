@@ -183,8 +183,8 @@ def test_cancelled_or_empty_video_does_not_replace_the_old_file(model: mujoco.Mj
 def test_killed_program_leaves_no_video_file(tmp_path: Path) -> None:
     program = """
 import sys, time, mujoco
-from lyceum_warp.viz.renderer import FileRenderer
-with FileRenderer(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={}, size=(96, 64), fps=30):
+from lyceum_warp.viz.renderer import Renderer
+with Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={}, size=(96, 64), fps=30):
     print("ready", flush=True)
     time.sleep(60)
 """

@@ -60,14 +60,14 @@ def taker(shared_env: SharedEnv, tmp_path: Path) -> Iterator[VideoTaker]:
 
 
 def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> None:
-    rendered, render = threading.Event(), renderer.FileRenderer.render
+    rendered, render = threading.Event(), renderer.Renderer.render
 
-    def slow(self: renderer.FileRenderer, shot: Any) -> None:
+    def slow(self: renderer.Renderer, shot: Any) -> None:
         render(self, shot)
         rendered.set()
         time.sleep(0.5)
 
-    monkeypatch.setattr(renderer.FileRenderer, "render", slow)
+    monkeypatch.setattr(renderer.Renderer, "render", slow)
     monkeypatch.setattr(videos, "FPS", 5)  # without a GPU, rendering is slow, so the video must omit some poses
     try:
         taker.begin(CAMERA)
