@@ -10,24 +10,6 @@ from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
 
 
-def check_round_trip(ctx: Context) -> None:
-    """``get_state()`` returns the state given to ``set_state``.
-
-    With a mask, ``get_state`` writes only the rows of selected worlds.
-    """
-    env = ctx.a
-    ctx.run(env, ctx.actions(5))
-    state = env.get_state()
-    ctx.run(env, ctx.actions(SHORT, 1))
-    env.set_state(state)
-    ctx.equal(env.get_state(), state, "the state after set_state (world, column)")
-    out, mask = torch.full_like(state, -7.0), ctx.mask()
-    env.get_state(out=out, mask=mask)
-    ctx.equal(out[mask], state[mask], "the rows of masked worlds")
-    ctx.that((out[~mask] == -7.0).all(), "rows of worlds outside the mask were written")
-    ctx.equal(env.get_state(out=out), state, "the state after set_state, with out= (world, column)")
-
-
 def check_restoring(ctx: Context) -> None:
     """Steps after ``set_state`` repeat the original steps, even through automatic resets and in another environment."""
     a, b = ctx.a, ctx.b

@@ -172,6 +172,14 @@ def test_getter_copies_a_buffer_or_writes_into_out(name: str) -> None:
     assert not env.action.any()
 
 
+def test_get_state_with_a_mask_writes_only_the_rows_of_these_worlds() -> None:
+    env = lw.make("hopper", nworld=3, seed=0)
+    state, mask = env.get_state(), torch.tensor([True, False, True])
+    out = torch.full_like(state, -7.0)
+    assert env.get_state(out=out, mask=mask) is out
+    assert torch.equal(out, torch.where(mask[:, None], state, -7.0))
+
+
 def test_get_state_with_a_mask_but_without_out_raises_an_error() -> None:
     env = lw.make("hopper", nworld=2)
     with pytest.raises(ValueError, match="pass the tensor as out="):
