@@ -8,6 +8,7 @@ from lyceum_warp.algos.common.evaluation import (
     evaluate as evaluate,
     evaluation_seed as evaluation_seed,
     evaluation_worlds as evaluation_worlds,
+    first_actions as first_actions,
 )
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (

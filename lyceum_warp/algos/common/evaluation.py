@@ -138,7 +138,7 @@ def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.
     count, total = torch.zeros_like(worlds), torch.zeros_like(env.reward)
     for t in range(1, each * env.horizon + 1):
         length = env.episode_step + 1.0
-        env.action.copy_(_first_actions(act, env) if t == 1 else act(env.obs))
+        env.action.copy_(first_actions(act, env) if t == 1 else act(env.obs))
         env.step()
         total += env.reward
         ends = (env.success.float(), env.terminated.float())
@@ -154,7 +154,8 @@ def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.
                 return
 
 
-def _first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
+def first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
+    """Call a policy, and check its actions and that it has no memory."""
     try:
         action = memoryless_action(act, env.obs)
     except RuntimeError as error:

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lyceum_warp.algos import Planner, Policy, acting, moved
+from lyceum_warp.algos import Planner, Policy, acting, first_actions, moved
 from lyceum_warp.controllers import CheckedController, accepts, signature_of
 from lyceum_warp.env import Env
-from lyceum_warp.support.validate import described, memoryless_action
 
 MOST_SAMPLES = 24
 """Maximum number of samples whose paths the viewer shows."""
@@ -44,20 +43,10 @@ class PolicyControl:
 
     def __init__(self, name: str, policy: Policy, env: Env) -> None:
         self.name, self.seconds = name, float("nan")
-        self._policy, self._env = acting(_on_device(policy, env)), env
-        try:
-            with torch.no_grad():
-                action = memoryless_action(self._policy, env.obs)
-        except Exception as error:
-            raise ValueError(
-                f"{ControllerError(name, error)}: it was called with the observations of {env.task.name!r}, "
-                f"{described(env.obs)}"
-            ) from error
-        if not isinstance(action, torch.Tensor) or action.shape != env.action.shape:
-            raise ValueError(
-                f"the controller {name!r} must return actions of shape {tuple(env.action.shape)} for "
-                f"{env.task.name!r}, not {described(action)}"
-            )
+        policy = moved(policy, env) if isinstance(policy, torch.nn.Module) else policy
+        self._policy, self._env = acting(policy), env
+        with torch.no_grad():
+            first_actions(self._policy, env)
 
     def act(self) -> None:
         """Write the actions of all worlds."""
@@ -210,13 +199,12 @@ def controls(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
     for name, controller in controllers.items():
         if not isinstance(name, str) or not name:
             raise ValueError(f"controllers must have names, as controllers={{'policy': policy}}, not {name!r}")
-        if _is_policy(controller):
-            controls[name] = PolicyControl(name, controller, env)
-            continue
+        kind = PolicyControl if _is_policy(controller) else WorldControl
         try:
-            controls[name] = WorldControl(name, controller, env)
-        except ValueError as error:
-            raise ValueError(f"the controller {name!r} does not fit: {error}") from error
+            controls[name] = kind(name, controller, env)
+        except Exception as error:
+            text = f"the controller {name!r} does not fit the task {env.task.name!r}: {type(error).__name__}: {error}"
+            raise ValueError(text) from error
     return controls
 
 
@@ -225,9 +213,3 @@ def _is_policy(controller: Any) -> bool:
     if (signature := signature_of(function)) is None:
         return False
     return not accepts(signature, 2) or (isinstance(function, torch.nn.Module) and accepts(signature, 1))
-
-
-def _on_device(policy: Any, env: Env) -> Any:
-    if isinstance(policy, torch.nn.Module) and any(p.device != env.obs.device for p in policy.parameters()):
-        return moved(policy, env)
-    return policy
