@@ -13,9 +13,8 @@ from lyceum_warp.viz.style import ACCENT, LINE, finish_axes, new_figure, save_pn
 def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
     """Plot episodes of a controller as PNG.
 
-    The left side shows reward and evaluation metric against simulated time. Two plots on the right side show planning
-    times and ages of actions against wall time. A histogram below them shows the planning times. Dashed lines show the
-    deadline.
+    The left side shows reward and evaluation metric against simulated time. The right side shows planning times and
+    ages of actions against wall time. Dashed lines show the deadline.
 
     Args:
         episodes: Episodes of the same task, at least one. The first one's control period is the deadline.
@@ -25,17 +24,10 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
         ImportError: matplotlib is not installed.
     """
     figure = new_figure("a controller's episodes", 10.0, 6.5)
-    from matplotlib.ticker import LogFormatter
-
-    grid = figure.add_gridspec(6, 2)
-    reward, evaluation = (figure.add_subplot(grid[rows, 0]) for rows in (slice(0, 3), slice(3, 6)))
-    planning, age, histogram = (figure.add_subplot(grid[rows, 1]) for rows in (slice(0, 2), slice(2, 4), slice(4, 6)))
+    (reward, planning), (evaluation, age) = figure.subplots(2, 2)
     _plot_outcomes(reward, evaluation, episodes)
     _plot_times(planning, age, episodes)
-    _plot_histogram(histogram, episodes)
-    histogram.xaxis.set_major_formatter(LogFormatter())  # plain numbers instead of powers of ten
-    histogram.xaxis.set_minor_formatter(LogFormatter())
-    finish_axes((reward, evaluation, planning, age, histogram))
+    finish_axes((reward, evaluation, planning, age))
     first = episodes[0]
     figure.suptitle(f"{first.task}, {first.engine}, {first.mode}", x=0.01, ha="left")
     return save_png(figure, out)
@@ -81,16 +73,3 @@ def _plot_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None
     planning.sharex(age)
     for axes in (planning, age):
         axes.set_ylim(bottom=0)
-
-
-def _plot_histogram(axes: Any, episodes: Sequence[Trajectory]) -> None:
-    times = 1000 * np.concatenate([episode.plan_times[1:].numpy() for episode in episodes])
-    times = times[times > 0]
-    if len(times):
-        low, high = times.min(), times.max()
-        bins = np.geomspace(low / 1.05, high * 1.05, 41)
-        axes.hist(times, bins=bins, color=LINE, log=True)
-    axes.axvline(1000 * episodes[0].period, color=ACCENT, linestyle="--", linewidth=1)
-    axes.set_xscale("log")
-    axes.set_xlabel("planning time (ms)")
-    axes.set_ylabel("plans")
