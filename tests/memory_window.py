@@ -15,6 +15,7 @@ class MemoryWindow:
     ``script`` receives a frame and its number, and returns commands. A return value of None closes the window.
     """
 
+    instructions: tuple[str, ...] = ()
     wants_frame = True
     error: str | None = None
 

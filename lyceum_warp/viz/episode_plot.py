@@ -24,7 +24,7 @@ def control_plot(episodes: Sequence[Trajectory], out: str | Path) -> Path:
         ImportError: matplotlib is not installed.
     """
     figure = new_figure("a controller's episodes", 10.0, 6.5)
-    (reward, planning), (evaluation, age) = figure.subplots(2, 2)
+    (reward, planning), (evaluation, age) = figure.subplots(2, 2, sharex="col")
     _plot_outcomes(reward, evaluation, episodes)
     _plot_times(planning, age, episodes)
     finish_axes((reward, evaluation, planning, age))
@@ -46,8 +46,6 @@ def _plot_outcomes(reward: Any, evaluation: Any, episodes: Sequence[Trajectory])
         if episode.succeeded:
             evaluation.plot(seconds[-1], episode.evals[-1], color=ACCENT, marker="o", markersize=4, linestyle="")
     reward.set_ylabel("reward")
-    reward.tick_params(labelbottom=False)
-    reward.sharex(evaluation)
     evaluation.set_ylabel("evaluation metric")
     evaluation.set_xlabel("simulated time (s)")
     if any(episode.succeeded for episode in episodes):
@@ -69,7 +67,5 @@ def _plot_times(planning: Any, age: Any, episodes: Sequence[Trajectory]) -> None
     planning.set_ylabel("planning (ms)")
     age.set_ylabel("age of action (ms)")
     age.set_xlabel("wall clock (s)")
-    planning.tick_params(labelbottom=False)
-    planning.sharex(age)
     for axes in (planning, age):
         axes.set_ylim(bottom=0)

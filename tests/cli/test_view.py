@@ -35,7 +35,7 @@ class Opened:
 @pytest.fixture
 def opened(monkeypatch: pytest.MonkeyPatch) -> Opened:
     collected = Opened()
-    monkeypatch.setattr(views, "opened", collected)
+    monkeypatch.setattr(views, "Window", collected)
     return collected
 
 
@@ -107,6 +107,6 @@ def test_ctrl_c_closes_the_window(monkeypatch: pytest.MonkeyPatch) -> None:
         return []
 
     monkeypatch.setattr(MemoryWindow, "close", lambda window: closed.append(True))
-    monkeypatch.setattr(views, "opened", lambda *words, **options: MemoryWindow(after))
+    monkeypatch.setattr(views, "Window", lambda *words, **options: MemoryWindow(after))
     assert interrupted(["view", "point_mass"]) == 130
     assert closed == [True]

@@ -32,7 +32,6 @@ class Windows:
         self._plotted = set(self._scene.curves[:FEW_CURVES])
         self._plot = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
         self._next_plot = 0.0
-        self._folded = False
         self._size = (0.0, 0.0)
 
     def build(self) -> None:
@@ -59,19 +58,15 @@ class Windows:
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
             return
-        if first:
-            title = f"{title}{': double-click to unfold' if self._folded else ''}###panel"
         imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
         imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
         unfolded, still_open = imgui.Begin(title, True)
         if unfolded:
             content()
-        if first:
-            self._folded = not unfolded
-            if not still_open:  # studio adds a close button in every window
-                imgui.SetWindowCollapsed(True)
+        if first and not still_open:  # studio adds a close button in every window
+            imgui.SetWindowCollapsed(True)
         imgui.End()
-        if not first and not still_open:
+        if not still_open:
             self._actions.windows.discard(title)
 
     def _session(self) -> None:
