@@ -15,10 +15,9 @@ from lyceum_warp.viz import change_model, owner_of
 LINE_WIDTH = 3.0  # pixels
 SHRUNK = 0.98
 ARROW_WIDTH, SHORTEST_ARROW = 0.015, 0.01  # m
-MAX_LINES = 160
-"""All traces together have at most this many lines. Each line costs about 600 bytes, 60 times a second."""
-FEWEST_SEGMENTS = 4
-"""Each trace has at least this many lines. If necessary, some traces are left out."""
+BEST_LINES, TRACE_LINES = 40, 5
+"""Maximum number of lines in the best trace, and in each other trace. Each line costs about 600 bytes, 60 times a
+second."""
 VISIBLE = (
     "geom_size", "geom_pos", "geom_quat", "geom_rgba", "geom_matid", "geom_dataid", "geom_group", "site_", "body_pos",
     "body_quat", "jnt_pos", "jnt_axis", "qpos0", "mat_", "tendon_rgba", "tendon_width", "cam_", "light_", "hfield_",
@@ -31,7 +30,7 @@ VISIBLE = (
 
 
 class ExtraGeoms:
-    """Makes the geoms of ghosts and traces, up to a limit: first the best trace, then ghosts, then other traces."""
+    """Makes the geoms of ghosts and traces. Ghosts beyond a limit are left out."""
 
     def __init__(self, model: mujoco.MjModel, limit: int) -> None:
         self.model, self.limit = model, limit
@@ -48,12 +47,10 @@ class ExtraGeoms:
             groups: Whether each group of geoms is visible, (6,).
         """
         self._options.geomgroup = groups
-        paths = [] if frame.traces is None else list(frame.traces)
-        lines = _lines(paths[:1], BEST_COLOUR, min(self.limit, MAX_LINES))
-        lines += _arrows(frame.arrows)
-        bodies = self._ghosts(frame, self.limit - len(lines))
-        left = min(self.limit - len(bodies), MAX_LINES) - len(lines)
-        return [*bodies, *lines, *_lines(paths[1:], TRACE_COLOUR, left)]
+        lines = _arrows(frame.arrows)
+        for i, path in enumerate(() if frame.traces is None else frame.traces):
+            lines += _lines(path, TRACE_COLOUR, TRACE_LINES) if i else _lines(path, BEST_COLOUR, BEST_LINES)
+        return [*self._ghosts(frame, self.limit - len(lines)), *lines]
 
     def _ghosts(self, frame: Frame, limit: int) -> list[mujoco.MjvGeom]:
         data, scene, geoms = self._data, self._scene, []
@@ -87,19 +84,15 @@ class ExtraGeoms:
         mujoco.mj_kinematics(self.model, self._data)
 
 
-def _lines(paths: Sequence[np.ndarray], colour: Sequence[float], limit: int) -> list[mujoco.MjvGeom]:
-    """Make the lines of paths, at most ``limit`` lines. Drop points first, then whole paths."""
-    if not paths:
-        return []
-    segments = min(len(paths[0]) - 1, max(limit // len(paths), FEWEST_SEGMENTS))
-    paths = paths[: max(limit, 0) // max(segments, 1)]
+def _lines(path: np.ndarray, colour: Sequence[float], most: int) -> list[mujoco.MjvGeom]:
+    """Make the lines of a path, with fewer points if there would be more than ``most`` lines."""
+    last = len(path) - 1
+    points = path[np.linspace(0, last, min(last, most) + 1).round().astype(int)]
     lines = []
-    for path in paths:
-        points = path[np.linspace(0, len(path) - 1, segments + 1).round().astype(int)]
-        for start, end in itertools.pairwise(points):
-            line = _connector(mujoco.mjtGeom.mjGEOM_LINE, colour, LINE_WIDTH, start, end)
-            line.emission = 1.0  # make the lines visible without light
-            lines.append(line)
+    for start, end in itertools.pairwise(points):
+        line = _connector(mujoco.mjtGeom.mjGEOM_LINE, colour, LINE_WIDTH, start, end)
+        line.emission = 1.0  # make the lines visible without light
+        lines.append(line)
     return lines
 
 
