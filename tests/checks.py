@@ -51,3 +51,16 @@ def ks_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     order = np.argsort(np.concatenate([a, b]), axis=0)
     ranks = np.cumsum(np.where(order < len(a), 1.0 / len(a), -1.0 / len(b)), axis=0)
     return np.abs(ranks).max(axis=0)
+
+
+def check_same_distribution(a: np.ndarray, b: np.ndarray) -> None:
+    """Compare the distributions of two samples (n, k) and (m, k) for each column and each pair of columns.
+
+    If the distributions are equal, fewer than one in 1,000 columns exceeds these thresholds.
+    """
+    fixed = np.ptp(a, axis=0) < 1e-6
+    np.testing.assert_allclose(b[:, fixed], np.tile(a[0, fixed], (len(b), 1)), atol=1e-5)
+    a, b, unit = a[:, ~fixed], b[:, ~fixed], np.sqrt(1 / len(a) + 1 / len(b))
+    assert (ks_distance(a, b) < 2.2 * unit).all()
+    correlations = [np.atleast_2d(np.corrcoef(sample.T)) for sample in (a, b)]
+    assert np.abs(correlations[0] - correlations[1]).max(initial=0.0) < 5.5 * unit

@@ -5,7 +5,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import MPPI, Row
-from lyceum_warp.kernels import planning, random
+from lyceum_warp.kernels import planning
 
 
 @pytest.fixture(scope="module")
@@ -35,24 +35,6 @@ def test_noise_is_standard_normal_and_independent(many: MPPI) -> None:
         for one, other in ((0, 0), (0, 1), (0, 2), (2, 0)):
             product = (draws[one][lag:] * draws[other][:-lag]).mean()
             assert abs(product) < 5 / np.sqrt(16 * (4000 - lag)), f"samples {lag} apart are correlated"
-
-
-def test_random_keys_of_samples_and_plants_are_distinct() -> None:
-    n = 256
-    found, plants = [], []
-    mask, episode = wp.full(n, True, dtype=bool, device="cpu"), wp.zeros(n, dtype=int, device="cpu")
-    for seed in range(8):
-        keys = wp.zeros(n, dtype=wp.uint32, device="cpu")
-        seeds = wp.array([seed], dtype=int, device="cpu")
-        wp.launch(random.seed_worlds, n, [mask, seeds, 0, keys, episode], device="cpu")
-        plants.append(keys.numpy().copy())
-        for count in range(8):
-            counts = wp.array([count], dtype=int, device="cpu")
-            wp.launch(planning.draw_keys, n, [seeds, counts, keys], device="cpu")
-            found.append(keys.numpy().copy())
-    keys = np.concatenate(found)
-    assert len(np.unique(keys)) == len(keys)
-    assert not np.isin(keys, np.concatenate(plants)).any()
 
 
 def test_noise_of_a_sample_does_not_depend_on_the_number_of_samples() -> None:

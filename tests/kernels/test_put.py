@@ -1,4 +1,3 @@
-import mujoco
 import numpy as np
 import pytest
 import warp as wp
@@ -73,27 +72,3 @@ def test_sum_of_squares_accepts_numbers_and_vectors(rows: dict[str, np.ndarray],
     wp.launch(sum_rows, 1, [struct, out], device="cpu")
     parts = [rows["numbers"], rows["numbers"][1:3], rows["vectors"], rows["spatial"][1]]
     np.testing.assert_allclose(out.numpy(), [np.square(part).sum() for part in parts], rtol=1e-6)
-
-
-@wp.kernel
-def stand_up(yaw: wp.array[float], qpos: wp.array2d[float], after: wp.array[int]):
-    i = wp.tid()
-    after[i] = lw.put_upright(qpos[i], 1, wp.vec3(0.1, -0.2, 0.3), yaw[i])
-
-
-def test_upright_free_body_is_rotated_about_the_vertical() -> None:
-    spec = mujoco.MjSpec.from_string(
-        "<mujoco><worldbody><body><joint type='slide'/><geom size='.1'/></body>"
-        "<body name='free'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-    )
-    model = spec.compile()
-    data, yaw = mujoco.MjData(model), np.linspace(-3.0, 3.0, 7, dtype=np.float32)
-    qpos, after = wp.full((7, 8), 0.5, dtype=float, device="cpu"), wp.zeros(7, dtype=int, device="cpu")
-    wp.launch(stand_up, 7, [wp.array(yaw, dtype=float, device="cpu"), qpos, after], device="cpu")
-    assert (after.numpy() == 8).all() and (qpos.numpy()[:, 0] == 0.5).all()
-    for row, angle in zip(qpos.numpy(), yaw, strict=True):
-        data.qpos[:] = row
-        mujoco.mj_kinematics(model, data)
-        np.testing.assert_allclose(data.body("free").xpos, (0.1, -0.2, 0.3), atol=1e-7)
-        wanted = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-        np.testing.assert_allclose(data.body("free").xmat.reshape(3, 3), wanted, atol=1e-6)

@@ -1,11 +1,9 @@
-import itertools
-
 import numpy as np
 import pytest
 import warp as wp
 from checks import check_normal, check_uniform
 
-from lyceum_warp.kernels.random import normal, seed_worlds, stream, uniform, world_key
+from lyceum_warp.kernels.random import normal, stream, uniform, world_key
 
 
 @wp.kernel(enable_backward=False)
@@ -56,12 +54,6 @@ def test_random_vector_equals_its_elements_drawn_one_by_one() -> None:
     np.testing.assert_array_equal(ends[::2], ends[1::2])
 
 
-def test_different_counters_give_different_random_numbers() -> None:
-    counters = np.array(list(itertools.product(range(6), range(6), range(6), range(6))))
-    found = draws(counters)
-    assert len(np.unique(found[:, 0])) > 0.999 * len(counters)
-
-
 @pytest.mark.parametrize("counter", ["seed", "world", "episode", "step"])
 def test_random_numbers_of_consecutive_counters_are_independent(counter: str) -> None:
     counters = np.zeros((4000, 4), dtype=int)
@@ -70,18 +62,3 @@ def test_random_numbers_of_consecutive_counters_are_independent(counter: str) ->
     check_uniform(values[:, :2])
     check_normal(values[:, 2:])
     check_uniform(np.stack([values[:-1, 0], values[1:, 0]], axis=1))
-
-
-def test_seed_of_a_world_depends_on_its_index_plus_an_offset() -> None:
-    mask = wp.array([True, False, True], dtype=bool, device="cpu")
-    seed = wp.array([5], dtype=int, device="cpu")
-    keys, episodes = [], []
-    for first in (0, 2):
-        key = wp.zeros(3, dtype=wp.uint32, device="cpu")
-        episode = wp.full(3, 7, dtype=int, device="cpu")
-        wp.launch(seed_worlds, 3, [mask, seed, first, key, episode], device="cpu")
-        keys.append(key.numpy())
-        episodes.append(episode.numpy().tolist())
-    assert episodes == [[-1, 7, -1]] * 2
-    assert keys[0][1] == 0
-    assert keys[0][2] == keys[1][0] != keys[0][0]

@@ -208,13 +208,6 @@ def judge(env: lw.Env, before: Outcome, action: torch.Tensor, after: Outcome) ->
     return result
 
 
-@quick
-def test_observation_and_action_spaces_are_the_same_on_both_engines(engines: Engines) -> None:
-    assert engines.c.state_space == engines.warp.state_space
-    assert engines.c.obs_space == engines.warp.obs_space
-    assert engines.c.timestep == engines.warp.timestep
-
-
 def disturbed(fields: Outcome, rng: torch.Generator) -> Outcome:
     noise = {name: torch.randn(2, *value.shape, generator=rng) for name, value in fields.items()}
     return {k: v * (1.0 + 0.1 * noise[k][0]) + 0.1 * noise[k][1] for k, v in fields.items()}

@@ -69,3 +69,10 @@ def test_resets_randomize_within_the_ranges_of_the_parameters(shared_env: Shared
         assert moved == pytest.approx([0.0, 0.1, 0.2])
         assert place["qpos"][30:33] == pytest.approx([0.1, 0.2, 0.0])
         assert env.obs[1, 36:39].tolist() == pytest.approx([0.1, 0.1, -0.165], abs=1e-6)
+
+
+def test_a_smaller_target_range_of_the_pen_gives_smaller_angles() -> None:
+    env = lw.make("adroit_pen", engine="mujoco", nworld=200, target_range=np.linspace(0.01, 0.4, 200), seed=2)
+    upright = env.obs[:, 38].numpy()  # the cosine of the tilt is the product of the cosines of two angles
+    assert (upright >= np.cos(np.linspace(0.01, 0.4, 200)) ** 2 - 1e-6).all()
+    assert 0.7 < upright.min() < 0.95

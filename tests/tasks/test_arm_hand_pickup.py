@@ -91,21 +91,3 @@ def test_task_succeeds_after_a_fifth_of_a_second_at_the_goal(shared_env: SharedE
         env.set_state(state)
         env.step(torch.zeros(2, 9))
     assert env.success.tolist() == [True, False]
-
-
-def test_scripted_hand_picks_up_the_ball_and_holds_it_at_the_goal(shared_env: SharedEnv) -> None:
-    model = shared_env("arm_hand_pickup").model
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    palm, low, high = model.site("hand/pinchsite").id, np.array([0, 0, 0.03]), GOAL + np.array([0, 0, 0.01])
-    for place, fingers, steps in ((low, 0.0, 500), (low, 1.0, 300), (GOAL - (0, 0.1, 0.3), 1.0, 300), (high, 1.0, 900)):
-        for _ in range(steps):
-            position, rotation = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-            mujoco.mj_jacSite(model, data, position, rotation, palm)
-            lead = np.concatenate([4.0 * (place - data.site_xpos[palm]), np.zeros(3)])
-            jacobian = np.concatenate([position[:, :6], 0.2 * rotation[:, :6]])
-            data.ctrl[:6] = np.linalg.lstsq(jacobian, lead, rcond=0.05)[0]
-            data.ctrl[6:] = fingers
-            mujoco.mj_step(model, data)
-    assert np.linalg.norm(data.body("table/ball").xpos - GOAL) < 0.05

@@ -1,11 +1,9 @@
-import mujoco
 import numpy as np
 import pytest
 import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.binding import find_task, task_spec
 from lyceum_warp.tasks.balance.humanoid_balance import JOINTS
 
 
@@ -64,31 +62,6 @@ def test_robot_stands_with_a_planner_and_falls_without_one(shared_env: SharedEnv
     height = planned.states[:, planned.state_parts["qpos"][0] + 2]
     assert planned.steps == 120 and height.min() > least
     assert fallen.steps < 120
-
-
-def test_upper_body_of_the_g1_is_rigid_in_the_pose_of_the_keyframe(shared_env: SharedEnv) -> None:
-    env, full = shared_env("g1_stand", nworld=1), task_spec(find_task("g1_velocity")).compile()
-    data = {}
-    for model, qpos in ((env.model, env.field("qpos")[0].numpy()), (full, full.key("knees_bent").qpos)):
-        data[model] = mujoco.MjData(model)
-        data[model].qpos[:] = qpos
-        data[model].qpos[:7] = 0.0, 0.0, 0.8, 1.0, 0.0, 0.0, 0.0
-        mujoco.mj_kinematics(model, data[model])
-        mujoco.mj_comPos(model, data[model])
-    hands = [data[model].geom("left_hand_collision").xpos for model in data]
-    assert env.model.nv == 18 and np.allclose(*hands, atol=0.02)
-    assert np.allclose(*(one.subtree_com[0] for one in data.values()), atol=0.01)
-
-
-def test_g1_without_visual_geoms_moves_in_the_same_way(shared_env: SharedEnv) -> None:
-    env, bare = (shared_env("g1_stand", nworld=2, autoreset=False, discardvisual=value) for value in (False, True))
-    assert (env.model.ngeom, bare.model.ngeom) == (48, 3)
-    state = env.get_state()
-    for each in (env, bare):
-        each.set_state(state)
-        for k in range(5):
-            each.step(torch.full((2, 12), 0.1 * k))
-    assert torch.equal(env.get_state(), bare.get_state()) and torch.equal(env.reward, bare.reward)
 
 
 def test_g1_walk_lifts_the_feet_in_turn_without_actions(shared_env: SharedEnv) -> None:

@@ -100,24 +100,6 @@ def test_commands_have_the_distribution_of_mjlab() -> None:
     assert np.abs(np.corrcoef(flags.T) - np.eye(3)).max() < 5.5 / np.sqrt(4000)
 
 
-def test_commands_change_when_their_timers_expire(shared_env: SharedEnv) -> None:
-    nworld = 24
-    env = shared_env("go1_velocity", nworld=nworld, autoreset=False, **NOISELESS, push_seconds=NEVER)
-    action = torch.zeros(nworld, 12)
-    changes, before = 0, state_parts(env)
-    for _ in range(300):
-        env.step(action)
-        now = state_parts(env)
-        timer, last = now["command_timer"][:, 0], before["command_timer"][:, 0]
-        due = last - DT <= 1e-9
-        for name in ("drawn_velocity", "heading_target"):
-            assert torch.equal((now[name] != before[name]).any(dim=1), due)
-        torch.testing.assert_close(timer[~due], last[~due] - DT, atol=1e-6, rtol=0)
-        assert (timer[due] >= 3).all() and (timer[due] <= 8).all()
-        changes, before = changes + int(due.sum()), now
-    assert 0.3 * nworld < changes < 0.9 * nworld  # the steps take 6 s, and commands change every 3 to 8 s
-
-
 def test_curriculum_widens_the_command_ranges_at_each_stage() -> None:
     env = lw.make("go1_velocity", nworld=1000, **NOISELESS)
     for steps, low, high, yaw in ((119_998, -1, 1, 0.5), (119_999, -1.5, 2, 0.7), (239_999, -2, 3, 0.7)):

@@ -21,14 +21,6 @@ ARM = {  # ranges in rad and peak torques in N m, from Barrett D1001, tables 5 a
 }
 FINGERS = {"j00": 180, "j10": 180, "j01": 140, "j11": 140, "j21": 140, "j02": 48, "j12": 48, "j22": 48}  # degrees
 
-# Denavit-Hartenberg parameters a in m, alpha in rad and d in m, from Barrett D1001, table 5; the palm is the tool
-CHAIN = ((0, -np.pi / 2, 0), (0, np.pi / 2, 0), (0.045, -np.pi / 2, 0.55), (-0.045, np.pi / 2, 0),
-         (0, -np.pi / 2, 0.3), (0, np.pi / 2, 0), (0, 0, 0.072 + 0.095))  # fmt: skip
-
-
-def turn(angle: float) -> np.ndarray:
-    return np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-
 
 @pytest.mark.parametrize("side", SIDES)
 def test_model_has_the_published_mass_limits_and_torques(shared_env: SharedEnv, side: str) -> None:
@@ -43,25 +35,6 @@ def test_model_has_the_published_mass_limits_and_torques(shared_env: SharedEnv, 
     for name, degrees in FINGERS.items():
         np.testing.assert_allclose(model.joint(f"{side}/{name}").range, (0, np.deg2rad(degrees)), err_msg=name)
     assert model.jnt_limited.all() and model.actuator_ctrllimited.all()
-
-
-def test_palms_have_the_positions_of_the_published_kinematics(shared_env: SharedEnv) -> None:
-    model = shared_env("herb_reach").model
-    data, rng = mujoco.MjData(model), np.random.default_rng(0)
-    for _ in range(20):
-        data.qpos[:] = rng.uniform(*model.jnt_range.T)
-        mujoco.mj_kinematics(model, data)
-        for side, angles in zip(SIDES, (data.qpos[:7], data.qpos[15:22]), strict=True):
-            base, start = data.body(f"{side}/wam_base"), model.body(f"{side}/wam1")
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = base.xmat.reshape(3, 3), base.xpos + base.xmat.reshape(3, 3) @ start.pos
-            for (a, alpha, d), theta in zip(CHAIN, angles, strict=True):
-                c, s = np.cos(theta), np.sin(theta)
-                link = np.eye(4)
-                link[:3, :3] = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ turn(alpha)
-                link[:3, 3] = a * c, a * s, d
-                pose = pose @ link
-            np.testing.assert_allclose(data.site(f"{side}/palm").xpos, pose[:3, 3], atol=1e-9)
 
 
 def test_arms_do_not_move_without_torque(shared_env: SharedEnv) -> None:
@@ -155,35 +128,6 @@ def test_random_resets_keep_targets_and_arms_in_their_ranges() -> None:
     env.reset()
     np.testing.assert_allclose(positions(env)[0], np.tile(home, (2000, 1)), atol=1e-6)
     np.testing.assert_allclose(targets(env)[0], [[0.8, 0.35, 1.0], [0.8, -0.35, 1.0]], atol=1e-6)
-
-
-def test_both_hands_can_reach_their_targets_at_the_same_time(shared_env: SharedEnv) -> None:
-    env = shared_env("herb_reach", nworld=16)
-    model, rng = env.model, np.random.default_rng(0)
-    corners = np.stack(np.meshgrid([0.6, 0.95], [0.1, 0.6], [0.7, 1.3]), axis=-1).reshape(-1, 1, 3)
-    goals = np.concatenate([corners * np.array([[[1, 1, 1], [1, -1, 1]]]), targets(env)])
-    for goal in goals:
-        starts = [model.key("home").qpos + (i > 0) * 0.3 * i * rng.normal(size=30) for i in range(20)]
-        assert any(reachable(model, goal, start) for start in starts), goal
-
-
-def reachable(model: mujoco.MjModel, goals: np.ndarray, start: np.ndarray) -> bool:
-    data, jacobian = mujoco.MjData(model), np.zeros((3, 30))
-    arms = np.r_[0:7, 15:22]
-    data.qpos[arms] = start[arms]
-    low, high = model.jnt_range.T
-    for _ in range(300):
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        errors = [goal - data.site(f"{side}/palm").xpos for side, goal in zip(SIDES, goals, strict=True)]
-        if np.linalg.norm(errors, axis=1).max() < 1e-3:
-            mujoco.mj_forward(model, data)
-            return data.ncon == 0
-        for side, error in zip(SIDES, errors, strict=True):
-            mujoco.mj_jacSite(model, data, jacobian, None, data.site(f"{side}/palm").id)
-            data.qpos += 0.5 * jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 1e-3 * np.eye(3), error)
-        data.qpos[:] = np.clip(data.qpos, low, high)
-    return False
 
 
 def test_task_succeeds_after_ten_steps_with_both_hands_at_their_targets() -> None:

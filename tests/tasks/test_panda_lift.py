@@ -1,6 +1,5 @@
 """Test panda_lift, and the reward terms of aloha_lift."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -27,14 +26,6 @@ def test_robot_is_a_panda_with_the_published_hand(shared_env: SharedEnv) -> None
     for i, name in enumerate(ARM):
         np.testing.assert_allclose(model.actuator_actrange[i], model.joint(name).range)
     np.testing.assert_allclose(model.actuator_forcerange[:7, 1], [87, 87, 87, 87, 12, 12, 12])
-
-
-def test_only_simple_shapes_collide(shared_env: SharedEnv) -> None:
-    model = shared_env("panda_lift").model
-    solid = (model.geom_contype | model.geom_conaffinity) > 0
-    shapes = [mujoco.mjtGeom(kind) for kind in np.unique(model.geom_type[solid])]
-    assert shapes == [mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_BOX]
-    assert (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any(), "meshes are drawn"
 
 
 def test_arm_without_actions_stands_still(shared_env: SharedEnv) -> None:
