@@ -230,11 +230,7 @@ def test_many_consecutive_non_finite_updates_end_a_run(env: lw.Env, tmp_path: Pa
     with pytest.raises(FloatingPointError) as raised:
         lw.train(npg, tmp_path / "run", 20)
     message = str(raised.value)
-    assert message.startswith(
-        "the step of the policy and the fit of the value function in iteration 10 are not finite, as in the 9 "
-        "iterations before; all these updates were skipped: make delta, value_rate, or the rewards and observations "
-        "smaller (the largest reward is "
-    )
+    assert message.startswith("the step of the policy and the fit of the value function in iteration 10 are not finite")
     assert "; the largest observation is 1e+30 in 'velocity' in step 1 of world 1)" in message
     assert raised.value.__notes__[0].startswith(f"the run in {tmp_path / 'run'} is saved up to iteration ")
     assert torch.equal(mean_actions(lw.load(tmp_path / "run")), before)
@@ -253,19 +249,13 @@ def test_value_function_is_restored_after_a_non_finite_update(env: lw.Env) -> No
     assert next(npg).skipped_updates == 0
 
 
-def on_gpu(**changes: object) -> lw.NPG:
-    """Run two iterations of NPG on Hopper on a GPU, to compile all kernels and capture all graphs."""
-    env = lw.make("hopper", nworld=64, device="cuda")
-    config = lw.NPGConfig(samples=64 * 16, rollout="segments", mean_every=0, value_batch=100, **changes)
-    npg = lw.NPG(env, config=config, seed=1)
-    for _ in range(2):
-        next(npg)
-    return npg
-
-
 @pytest.mark.gpu
 def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    npg = on_gpu(normalize=True, min_restarts=2.0)
+    env = lw.make("hopper", nworld=64, device="cuda")
+    options = {"rollout": "segments", "mean_every": 0, "value_batch": 100, "normalize": True, "min_restarts": 2.0}
+    npg = lw.NPG(env, config=lw.NPGConfig(samples=64 * 16, **options), seed=1)
+    for _ in range(2):  # compile all kernels and capture all graphs
+        next(npg)
     copies = []
 
     def tolist(tensor: torch.Tensor) -> list[list[float]]:
@@ -282,18 +272,6 @@ def test_gpu_iteration_synchronizes_once(monkeypatch: pytest.MonkeyPatch) -> Non
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert len(copies) == 1 and math.isfinite(it.kl)
-
-
-@pytest.mark.gpu
-def test_gpu_learner_continues_after_loading_a_state() -> None:
-    npg = on_gpu()
-    saved = npg.state_dict()
-    first = next(npg)
-    npg.load_state_dict(saved)
-    again = next(npg)
-    assert again.kl == pytest.approx(first.kl, rel=1e-2)
-    assert again.value_error == pytest.approx(first.value_error, rel=1e-2)
-    assert again.gradient_norm == pytest.approx(first.gradient_norm, rel=1e-2)
 
 
 def test_optimized_iterations_equal_iterations_with_autograd(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common.dense import DensePasses, dense_policy, predict
+from lyceum_warp.algos.common.dense import DensePasses, dense_policy
 from lyceum_warp.algos.natural_gradient import FisherProduct, score_gradient
 
 
@@ -41,20 +41,6 @@ def test_hand_written_derivatives_equal_those_of_autograd(activation: str, hidde
         plain, written = (FisherProduct(one, obs, 0.1, weight=weight.abs()) for one in (policy, dense))
         for direction in (vector, vector.flip(0)):
             torch.testing.assert_close(plain(direction), written(direction), rtol=1e-4, atol=1e-5)
-
-
-def test_samples_and_predictions_equal_those_of_torch_modules() -> None:
-    policy, generator = policy_of("tanh"), torch.Generator().manual_seed(0)
-    dense = dense_policy(policy)
-    obs, noise = torch.randn(6, 5, generator=generator), torch.randn(6, 2, generator=generator)
-    torch.testing.assert_close(
-        dense.sample(obs, noise, out=torch.empty(6, 2)), policy.sample(obs, noise, out=torch.empty(6, 2))
-    )
-    value = perturbed(lw.ValueFunction(5, (7, 3), time_orders=2, normalize=True))
-    value.observe(obs)
-    steps, obs = torch.arange(12.0).view(4, 3), torch.randn(4, 3, 5, generator=generator)
-    # returns of about 200 have large rounding errors in float32
-    torch.testing.assert_close(predict(value, obs, steps), value(obs, steps).detach(), rtol=1e-5, atol=1e-4)
 
 
 class Own(nn.Sequential):

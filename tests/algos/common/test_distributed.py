@@ -1,5 +1,4 @@
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -102,38 +101,6 @@ def test_two_processes_make_the_same_update_as_one_process(
     for run in (one, two):
         assert cli.main(["train", "--resume", str(run), "--iterations", "2", *QUIET]) == 0
     assert_equal_runs(two, one, tolerance=5.0 * tolerance)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-@pytest.mark.parametrize("algorithm", ["npg", "ppo", "sac"])
-def test_two_gpu_processes_make_the_same_update_as_one_process(algorithm: str, tmp_path: Path) -> None:
-    two, one = tmp_path / "two", tmp_path / "one"
-    options = {"npg": OPTIONS, "ppo": PPO, "sac": SAC}[algorithm]
-    arguments = ["train", "hopper", *options, *QUIET, "--device", "cuda", "--iterations", "1", "--out"]
-    assert cli.main([*arguments, str(one)]) == 0
-    [(code, _, error)] = ended([torchrun(*arguments, str(two), options=["--standalone", "--nproc-per-node=2"])])
-    assert code == 0, error
-    assert_equal_runs(two, one, tolerance=1e-3 if algorithm == "npg" else 5e-3)
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
-def test_two_gpu_processes_end_when_torchrun_is_interrupted(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    arguments = ["train", "hopper", *OPTIONS, *QUIET, "--device", "cuda", "--iterations", "100000", "--out", str(run)]
-    process = torchrun(*arguments, options=["--standalone", "--nproc-per-node=2"])
-    assert process.stdout is not None
-    output = ""
-    for line in process.stdout:
-        output += line
-        if "iteration    2/" in line:
-            process.send_signal(signal.SIGTERM)
-            break
-    rest, error = process.communicate(timeout=25)  # after 30 s, torchrun would kill the processes
-    rows = metrics(run)
-    assert f"interrupted by SIGTERM after {len(rows)} of 100000 iterations" in output + rest, (output, rest, error)
-    assert Run.open(run).read()["iteration"] == len(rows) >= 2
 
 
 INTERRUPTED = """

@@ -347,17 +347,6 @@ def test_invalid_value_function_raises_an_error_when_the_planner_is_made(value: 
         MPPI("point_mass", horizon=3, samples=7, value=value)
 
 
-def test_reach_succeeds() -> None:
-    plan, plant = MPPI("reach"), lw.make("reach", autoreset=False)
-    rewards, distances = [], []
-    while not plant.success.any() and len(rewards) < 75:
-        plant.step(plan(plant.get_state()[0])[None])
-        rewards.append(plant.reward.item())
-        distances.append(plant.eval.item())
-    assert plant.success.item(), f"{distances[-1]:.3f} m after {len(distances)} steps"
-    assert np.mean(distances[-10:]) < 0.05 and sum(rewards) > -250
-
-
 def test_random_events_differ_between_samples_and_iterations() -> None:
     drawn: list[torch.Tensor] = []
 

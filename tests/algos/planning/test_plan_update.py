@@ -173,23 +173,10 @@ def test_deviation_that_is_not_finite_raises_an_error_and_is_not_used() -> None:
     assert plan.adapted_noise is not None and (plan.adapted_noise == 1.0).all()
 
 
-def test_user_written_update_keeps_the_plan_if_all_samples_fail() -> None:
-    plan = lw.Planner(update=EliteMean(3), value=lambda obs: torch.full((len(obs),), torch.nan), **POINT)
-    plan.actions.fill_(0.25)
-    plan(plan.state_of(), shift=0)
-    assert (plan.actions == 0.25).all() and plan.summary["failed_samples"] == 12
-
-
 def test_planners_with_the_same_update_object_do_not_share_buffers() -> None:
     update = CrossEntropy(3, 0.05, (1.0, 0.0, 0.0))
     compare(*(lw.Planner(update=update, smoothing=(1, 0, 0), **POINT) for _ in range(2)))
     assert vars(update).keys() == {"temperature", "elites", "min_noise", "smoothing"}
-
-
-def test_planner_settings_contain_the_attributes_of_a_user_written_update() -> None:
-    plan = lw.Planner(update=EliteMean(3), **POINT)
-    assert plan.settings["update"] == "EliteMean(elites=3)"
-    assert plan.config.update is not None and type(plan).__name__ == "Planner"
 
 
 class Returning(EliteMean):
