@@ -1,7 +1,4 @@
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +7,6 @@ import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PROGRAM = ROOT / "bench" / "compare.py"
 
 
 def copied(folder: Path, changes: dict[str, tuple[str, str]]) -> Path:
@@ -84,19 +80,3 @@ def test_names_in_only_one_checkout_are_reported_as_added_or_removed() -> None:
     assert [(each.name, each.text) for each in changes] == [
         ("u/gone", "removed: float64 (1,)"), ("u/new", "added: float64 (1,)"),
     ]  # fmt: skip
-
-
-@pytest.mark.long
-def test_comparison_of_a_revision_with_itself_finds_no_difference(tmp_path: Path) -> None:
-    if not (ROOT / ".git").exists():
-        pytest.skip("needs the repository")
-    options = ["--tasks", "point_mass", "--iterations", "4", "--steps", "4"]
-    process = subprocess.run(
-        [sys.executable, PROGRAM, "HEAD", "HEAD", *options], capture_output=True, text=True, env=environment(tmp_path)
-    )
-    assert process.returncode == 0, process.stdout + process.stderr
-    assert not any(tmp_path.iterdir())
-
-
-def environment(folder: Path) -> dict[str, str]:
-    return os.environ | {"TMPDIR": str(folder)}

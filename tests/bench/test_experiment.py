@@ -1,16 +1,12 @@
 import dataclasses
 import json
-import os
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import experiment
-import plot
 import pytest
-import tables
-import venvs
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,14 +44,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Any:
         cells = [[name, experiment.median_and_range(values)] for name, values in ratios.items()]
         return [experiment.Table("Hopping", ["", "ratio"], cells)]
 
-    def figure(rows: list[Any]) -> Any:
-        from lyceum_warp.viz import new_figure
-
-        plot = new_figure("a toy", 2, 2)
-        plot.subplots().plot([row.result["rate"] for row in rows])
-        return plot
-
-    definition = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, "C engine", figure)
+    definition = experiment.Experiment("toy", "A toy.", cases, lambda case: 60.0, measure, tables, "C engine")
     monkeypatch.setattr(experiment, "NAMES", ("toy",))
     monkeypatch.setitem(sys.modules, "toy", SimpleNamespace(EXPERIMENT=definition))
     return SimpleNamespace(measured=measured, main=lambda *words: experiment.main(definition, [*map(str, words)]))
@@ -134,91 +123,3 @@ def test_invalid_options_are_named_in_one_line(
     assert experiment.main(experiment.load(name), options) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"{name}: ") and value in error and error.count("\n") == 1
-
-
-def test_figures_and_tables_are_made_from_stored_results(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    toy.main("--out", tmp_path / "toy.jsonl")
-    toy.measured.clear()
-    assert plot.main(experiment.Stored(("toy",), tmp_path)) == 0
-    pictures = {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
-    assert len(pictures) == 1
-    for _ in range(2):
-        assert plot.main(experiment.Stored(("toy",), tmp_path)) == tables.main(experiment.Stored((), tmp_path)) == 0
-        text = (tmp_path / "toy.md").read_text()
-        assert text.startswith("# toy\n") and text.count("| ours | 1.50 (1.50 to 1.50) |") == 1
-    assert pictures == {path.name: path.read_bytes() for path in tmp_path.glob("toy-*.png")}
-    assert not toy.measured
-    with pytest.raises(FileNotFoundError, match="run an experiment first"):
-        plot.main(experiment.Stored((), tmp_path / "empty"))
-
-
-@pytest.mark.long
-def test_other_library_runs_in_a_separate_virtual_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(venvs, "FOLDER", tmp_path)
-    monkeypatch.setenv("LYCEUM_WARP_PEERS", str(tmp_path / "cache"))
-    (tmp_path / "echo").mkdir()
-    (tmp_path / "echo" / "requirements.txt").write_text("")
-    worker = tmp_path / "worker.py"
-    worker.write_text(
-        "import json, sys\nprint('noise')\nprint(json.dumps({'prefix': sys.prefix} | json.load(sys.stdin)))\n"
-    )
-    python = venvs.python_of("echo")
-    answer = venvs.run(python, worker, samples=3)
-    assert answer["samples"] == 3 and Path(answer["prefix"]).parent == tmp_path / "cache"
-    venvs._made.cache_clear()
-    assert venvs.python_of("echo") == python
-    assert capsys.readouterr().out.count("making a virtual environment for echo") == 1
-    worker.write_text("import a_missing_package")
-    with pytest.raises(experiment.Skipped, match="a_missing_package"):
-        venvs.run(python, worker)
-    (tmp_path / "lost").mkdir()
-    (tmp_path / "lost" / "requirements.txt").write_text(f"{tmp_path}/no_package.whl\n")
-    with pytest.raises(experiment.Skipped, match="lost.*no_package"):
-        venvs.python_of("lost")
-
-
-TOY = """
-import dataclasses
-import os
-
-
-@dataclasses.dataclass(frozen=True)
-class Case:
-    number: int
-
-
-def measure(case, options):
-    if case.number == 2:
-        raise RuntimeError("it broke")
-    return {"cores": sorted(os.sched_getaffinity(0)), "process": os.getpid()}
-"""
-
-
-@pytest.mark.long
-def test_cases_run_in_subprocesses_on_separate_cores(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "parallel_toy.py").write_text(TOY)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    import parallel_toy
-
-    definition = experiment.Experiment(
-        "toy",
-        "A toy.",
-        cases=lambda options: [parallel_toy.Case(i) for i in range(3)],
-        estimate=lambda case: 60.0,
-        measure=parallel_toy.measure,
-        tables=lambda rows: [],
-        conditions="C engine",
-        parallel=True,
-    )
-    out, before = tmp_path / "toy.jsonl", os.sched_getaffinity(0)
-    assert experiment.main(definition, ["--out", str(out), "--threads", "1", "--jobs", "2"]) == 1
-    assert "RuntimeError: it broke" in capsys.readouterr().err and os.sched_getaffinity(0) == before
-    results = [row.result for row in experiment.read(out)]
-    assert len(results) == 2 and len({result["process"] for result in results} | {os.getpid()}) == 3
-    assert all(len(result["cores"]) == 1 for result in results)

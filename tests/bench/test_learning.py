@@ -1,9 +1,14 @@
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import experiment
+import gate
 import learning
 import pytest
+import torch
+
+import lyceum_warp as lw
 
 
 @pytest.mark.parametrize("algorithm", ["npg", "ppo"])
@@ -21,19 +26,28 @@ def test_learning_run_ends_at_its_target(
     assert f"| hopper | {algorithm.upper()} | 8 | 0 | 0 |" in capsys.readouterr().out
 
 
-def test_standing_robot_has_tracking_errors(monkeypatch: pytest.MonkeyPatch) -> None:
-    import lyceum_warp as lw
-
-    monkeypatch.setattr(learning, "WALKED", (8, 50))
-    env = lw.make("go1_velocity", nworld=2)
-    policy = lw.GaussianPolicy(env.obs_space.size, env.action_space.size)
-    case = learning.Case("go1_velocity", "ppo", 0, 8, 80.0, 1.0, "cpu")
-    errors = learning.walk(case, policy)
-    assert 0.1 < errors["velocity_error"] < 2.0 and errors["falls_per_world_second"] >= 0.0
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    config = lw.PPOConfig(hidden=(4,), value_hidden=(4,), num_steps=4, mean_every=0)
+    learner = lw.PPO(lw.make("go1_velocity", nworld=2), config=config)
+    return lw.train(learner, tmp_path_factory.mktemp("gate") / "run", 1).folder
 
 
-def test_learning_figure_is_drawn_from_stored_results(tmp_path: Path) -> None:
-    rows = experiment.read(experiment.RESULTS / "learning.jsonl")
-    walkers = [row for row in rows if row.case["task"] == "go1_velocity"]
-    learning.figure(walkers).savefig(tmp_path / "learning.png")
-    assert learning.figure([row for row in rows if row not in walkers]) is None
+def test_experiment_gate_evaluates_each_policy_only_once(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--short", "--policy", str(run), "--out", str(tmp_path / "gate.jsonl")]
+    assert experiment.main(gate.EXPERIMENT, arguments) == 0
+    out = capsys.readouterr().out
+    assert "| mean velocity error, m/s | " in out and "does not pass" in out and "| falls with pushes |" in out
+    assert experiment.main(gate.EXPERIMENT, arguments) == 0
+    assert "1 of 1 cases are stored" in capsys.readouterr().out
+
+
+def test_velocity_error_of_a_standing_robot_equals_its_command(run: Path) -> None:
+    env = gate.worlds(run, 2, gate.Options(), **gate.calm(gate.worlds(run, 1, gate.Options())))
+    stand = SimpleNamespace(act=lambda obs: torch.zeros(2, 12))
+    played = gate.play(env, stand, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], 50, gate.home(env, lw.Curriculum()))
+    torch.testing.assert_close(played.velocity_error[30:].mean(0), torch.tensor([1.0, 0.0]), atol=0.05, rtol=0.0)
+    torch.testing.assert_close(played.yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.05, rtol=0.0)
+    assert not played.fell.any()
