@@ -49,27 +49,6 @@ def test_pgs_solver_is_replaced_by_newton() -> None:
     assert compile_model(ball('solver="CG"'), (), PHYSICS).opt.solver == mujoco.mjtSolver.mjSOL_CG
 
 
-def test_disabling_sleep_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level("INFO"):
-        model = compile_model(ball('timestep="0.002"><flag sleep="enable"/></option><option'), (), PHYSICS)
-    assert not model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP
-    assert "ball asks for sleep, which is not part of MuJoCo's state" in caplog.text
-
-
-PAIRS = """<mujoco model="pairs"><worldbody>
-  <geom name="floor" type="plane" size="1 1 1" contype="0" conaffinity="0"/>
-  <body><freejoint/><geom name="ball" size=".1" contype="0" conaffinity="0"/></body></worldbody>
-  <contact><pair geom1="floor" geom2="ball" friction="2"/><pair geom1="ball" geom2="floor"/></contact></mujoco>"""
-
-
-def test_contact_pair_that_is_listed_twice_creates_one_contact(caplog: pytest.LogCaptureFixture) -> None:
-    assert mujoco.MjModel.from_xml_string(PAIRS).npair == 2
-    with caplog.at_level("INFO"):
-        model = compile_model(mujoco.MjSpec.from_string(PAIRS), (), PHYSICS)
-    assert model.npair == 1 and model.pair_friction[0, 0] == 2.0
-    assert "pairs lists a pair of ball and floor twice" in caplog.text
-
-
 def test_energy_is_computed_only_if_the_task_reads_it() -> None:
     assert compile_model(ball(), ["energy"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY
     assert not compile_model(ball(), ["qpos"], PHYSICS).opt.enableflags & mujoco.mjtEnableBit.mjENBL_ENERGY

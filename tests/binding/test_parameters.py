@@ -211,15 +211,6 @@ def test_array_with_elements_of_another_kind_raises_an_error(
         parameters(model, Named, joints=joints)
 
 
-def test_array_parameter_accepts_each_kind_of_element(model: mujoco.MjModel) -> None:
-    kinds = {
-        "sites": "site_xpos", "bodies": "xpos", "geoms": "geom_xpos", "joints": "xanchor", "qposes": "qpos",
-        "dofs": "qvel", "actuators": "actuator_force", "sensors": "sensordata",
-    }  # fmt: skip
-    for kind, field in kinds.items():
-        assert [(element.field, element.name) for element in getattr(lw, kind)("a")] == [(field, "a")]
-
-
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_functions_read_new_arrays_after_graphs_are_captured(engine: str) -> None:
     env = lw.make(Follow, engine=engine, nworld=2)

@@ -1,12 +1,11 @@
 import sys
 from typing import Any
 
-import pytest
 import warp as wp
 
 from lyceum_warp import Row
 from lyceum_warp.binding import written_fields
-from lyceum_warp.binding.writes import check_writes, trace
+from lyceum_warp.binding.writes import trace
 
 
 @wp.struct
@@ -217,81 +216,3 @@ def made_with(row_name: str, helper: Any) -> Any:
 def test_functions_in_closures_are_analysed() -> None:
     assert written_fields(made_with("qvel", fill)) == {"memory", "qvel"}
     assert written_fields(made_with("other", fill_any)) == {"memory", "qpos"}
-
-
-RIGHTS = {
-    "observe": {"s": (), "p": (), "obs": None},
-    "control": {"s": ("mocap_pos", "mocap_quat"), "action": (), "p": (), "ctrl": None},
-    "reward": {"s0": (), "action": (), "s1": (), "p": ()},
-    "advance": {"s0": (), "action": (), "s1": ("memory",), "p": (), "rng": None},
-    "initialize": {"s": ("qpos", "qvel", "mocap_pos", "memory"), "p": ()},
-}
-
-
-@wp.func
-def bad_action(world: World, given: Row[float], q: Params, out: Row[float]):
-    given[0] = 1.0
-
-
-@wp.func
-def bad_reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    fill(s1.memory, 1.0)
-    return 1.0
-
-
-@wp.func
-def bad_advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    s1.memory[0] = 0.0
-    s0.memory[0] = 1.0
-
-
-@wp.func
-def writes_derived(s: World, p: Params):
-    s.xpos[0] = wp.vec3()
-
-
-@wp.func
-def table_row(s: World, p: Params):
-    row = p.table[1]
-    row[0] = 1.0
-
-
-@wp.func
-def to_native(s: World, p: Params):
-    poke(s.qpos)
-
-
-REFUSED = {
-    "an action": (
-        "control", bad_action,
-        r"control of the task 'mine' writes given \(test_writes\.py, line \d+\): control may write ctrl, mocap_pos, "
-        "mocap_quat",
-    ),
-    "memory in reward": (
-        "reward", bad_reward,
-        r"reward of the task 'mine' writes s1\.memory in fill \(test_writes\.py, line \d+\): reward may write nothing, "
-        "and memory is written by advance or initialize",
-    ),
-    "memory of the state before": (
-        "advance", bad_advance,
-        r"advance of the task 'mine' writes s0\.memory \(.*\): advance may write memory of s1 only",
-    ),
-    "a derived field": (
-        "initialize", writes_derived,
-        r"initialize of the task 'mine' writes s\.xpos \(.*\): initialize may write qpos, qvel, mocap_pos, memory, and "
-        "no function may write xpos",
-    ),
-    "a table": ("initialize", table_row, r"writes p\.table \(.*\): parameters are changed with env\.set_params"),
-    "a native function": (
-        "observe", to_native,
-        r"observe of the task 'mine' uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(test_writes\.py, line \d+\), and "
-        "may write it there: read and write its elements directly",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("name", "function", "message"), REFUSED.values(), ids=REFUSED)
-def test_forbidden_write_in_a_task_raises_a_one_line_error(name: str, function: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
-        check_writes("mine", name, function, RIGHTS)
-    assert "\n" not in str(caught.value)

@@ -121,9 +121,3 @@ def test_default_of_a_parameter_may_be_a_named_element(element: Element, place: 
 def test_an_unknown_element_is_refused(name: str, element: str, message: str, model: mujoco.MjModel) -> None:
     with pytest.raises(ValueError, match=message):
         elements(model, name, element)
-
-
-def test_only_controls_are_written_by_default(model: mujoco.MjModel) -> None:
-    assert describe(model, "ctrl").written
-    assert describe(model, "xfrc_applied", written=True).written
-    assert not describe(model, "xfrc_applied").written

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from lyceum_warp.core import gymnasium_model, vec10
-from lyceum_warp.core.model_fields import Constants, ModelField, describe_model_field
+from lyceum_warp.core.model_fields import Constants, describe_model_field
 
 ANT = gymnasium_model("ant.xml").spec().compile()
 
@@ -24,23 +24,6 @@ def test_model_field_has_the_type_of_its_elements(name: str, shape: tuple[int, .
     field = describe_model_field(ANT, name)
     assert (field.shape, field.dtype, field.size) == (shape, dtype, size)
     assert field.value(ANT).size == size
-
-
-def fields_of(model: mujoco.MjModel) -> list[ModelField]:
-    found = []
-    for name in (*dir(model), *dir(model.opt)):
-        try:
-            found.append(describe_model_field(model, name))
-        except ValueError:
-            continue
-    return found
-
-
-def test_constants_are_derived_from_the_fields_that_mujoco_reads() -> None:
-    read: frozenset[str] = frozenset(mujoco.MjModel._setconst_inputs)
-    fields = [field for field in fields_of(ANT) if not field.option]
-    assert len(fields) > 50
-    assert {field.name for field in fields if field.constants} == {field.name for field in fields} & read
 
 
 def test_error_of_an_unknown_model_field_suggests_similar_names() -> None:

@@ -1,10 +1,7 @@
 import mujoco
 import numpy as np
-import torch
 
-from lyceum_warp.core import COUNTERS, Space
-from lyceum_warp.core.fields import describe
-from lyceum_warp.core.spaces import action_space, control_ranges, control_scale, state_space
+from lyceum_warp.core.spaces import action_space, control_ranges, control_scale
 
 XML = """
 <mujoco>
@@ -24,14 +21,6 @@ LIMITED = 'ctrlrange="0 1" ctrllimited="true"'
 
 def model(second: str = LIMITED) -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(XML.format(second))
-
-
-def test_parts_of_a_space_are_consecutive_views_of_a_vector() -> None:
-    space, values = Space.of({"position": 2, "velocity": 3}), torch.arange(10.0).view(2, 5)
-    assert space.parts == {"position": slice(0, 2), "velocity": slice(2, 5)}
-    assert (space.size, space.shape) == (5, (5,))
-    space.split(values)["velocity"].zero_()
-    assert values.tolist() == [[0.0, 1.0, 0.0, 0.0, 0.0], [5.0, 6.0, 0.0, 0.0, 0.0]]
 
 
 def test_actions_have_the_names_and_ranges_of_the_actuators() -> None:
@@ -83,17 +72,3 @@ def test_actions_of_a_task_have_bounds_only_with_an_action_range() -> None:
     np.testing.assert_array_equal([space.low, space.high], [[-2.0] * 3, [2.0] * 3])
     free = action_space(model(), None, {"speed": 1})
     np.testing.assert_array_equal([free.low, free.high], [[-np.inf], [np.inf]])
-
-
-def test_state_adds_snapshots_and_counters_and_memory_to_the_integration_state() -> None:
-    compiled = model()
-    space = state_space(compiled, [describe(compiled, "qacc")], [], {"memory": 4})
-    assert space.dtype == torch.float64
-    sizes = {name: part.stop - part.start for name, part in space.parts.items()}
-    assert {name: sizes[name] for name in ("time", "qpos", "qvel", "ctrl", "mocap_pos", "userdata", "qacc")} == {
-        "time": 1, "qpos": 2, "qvel": 2, "ctrl": 2, "mocap_pos": 3, "userdata": 2, "qacc": 2
-    }  # fmt: skip
-    assert list(space.parts)[-6:] == ["qacc", *COUNTERS, "memory"]
-    integration = mujoco.mj_stateSize(compiled, mujoco.mjtState.mjSTATE_INTEGRATION.value)
-    assert space.parts["qacc"].start == integration
-    assert space.size == integration + 2 + len(COUNTERS) + 4

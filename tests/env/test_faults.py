@@ -135,21 +135,6 @@ def test_faults_print_and_log_nothing_over_150_steps(
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_invalid_warm_start_is_cleared_at_the_end_of_its_episode(engine: str) -> None:
-    env, clean = (hopper(engine) for _ in range(2))
-    for each in (env, clean):
-        lay_down(each, BAD)
-    state = env.get_state()
-    state[BAD, env.state_space.parts["qacc_warmstart"]] = np.nan
-    env.set_state(state, check=False)
-    assert step_both(env, clean, 1) == Done.NAN
-    for _ in range(5):
-        env.step()
-        assert torch.isfinite(env.get_state()).all()
-    assert env.fault_counts["nan"] == 1 and not env.done.any()
-
-
-@pytest.mark.parametrize("engine", ENGINES)
 def test_without_automatic_resets_only_a_fault_restarts_a_world(engine: str) -> None:
     env = lw.make("hopper", engine=engine, nworld=N, autoreset=False, horizon=3)
     for _ in range(5):

@@ -89,13 +89,6 @@ def remember_draws(s0: Arm, action: Row[float], s1: Arm, p: ArmParams, rng: Row[
 
 
 @wp.func
-def remember_once(s: Arm, p: ArmParams, rng: Row[wp.uint32]):
-    for i in range(2):
-        s.kept[i] = lw.normal(rng)
-        s.qfrc_applied[i] = lw.normal(rng)
-
-
-@wp.func
 def servo(s: Arm, action: Row[float], p: ArmParams, ctrl: Row[float]):
     for i in range(2):
         ctrl[i] = p.gain * action[i] - 0.3 * s.qvel[i] - s.qpos[i]
@@ -110,15 +103,6 @@ class Forgetful(lw.Task):
     World = Arm
     Params = ArmParams
     observe, reward, terminated, advance = observe_arm, reward_of_arm, swung_out, remember_draws
-
-
-class Keepsake(lw.Task):
-    """Memory and forces are written only at a reset."""
-
-    model, frame_skip, obs = Forgetful.model, 3, Forgetful.obs
-    World = Arm
-    Params = ArmParams
-    observe, reward, randomize = observe_arm, reward_of_arm, remember_once
 
 
 class Servo(Forgetful):
@@ -208,7 +192,7 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.quick(
-    "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "keepsake-mujoco", "control_worlds-mujoco", "memory-warp",
+    "worlds-mujoco", "one_substep-mujoco", "rk4-mujoco", "control_worlds-mujoco", "memory-warp",
 )  # fmt: skip
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(
@@ -218,11 +202,10 @@ def native_calls(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         (Forgetful, True, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "cost": np.array([0.0, 1.0, 2.0, 3.0])}),
         (Forgetful, True, {"frame_skip": 1}),
         (Forgetful, False, {"model": under_rk4(), "frame_skip": 2}),
-        (Keepsake, True, {}),
         (Servo, False, {}),
         (Servo, False, {"gain": np.array([0.0, 0.5, 1.0, 2.0]), "model": under_rk4(), "frame_skip": 2}),
     ],
-    ids="memory worlds one_substep rk4 keepsake control control_worlds".split(),
+    ids="memory worlds one_substep rk4 control control_worlds".split(),
 )
 def test_rollout_of_every_kind_of_task_equals_steps(
     task: type[lw.Task], native: bool, options: dict[str, Any], engine: str, native_calls: list[int]
@@ -230,17 +213,6 @@ def test_rollout_of_every_kind_of_task_equals_steps(
     loop = rollouts(task, 6, engine=engine, **options)
     check_against_stepping(loop, lw.make(task, engine=engine, nworld=4, autoreset=False, **options))
     assert len(native_calls) == (3 if native and engine == "mujoco" else 0)
-
-
-@pytest.mark.quick("mujoco")
-@pytest.mark.parametrize("engine", ENGINES)
-def test_parameters_may_change_between_rollouts(engine: str) -> None:
-    loop, env = rollouts(Forgetful, 3, engine=engine), lw.make(Forgetful, engine=engine, nworld=4, autoreset=False)
-    check_against_stepping(loop, env)
-    for params in ({"cost": 5.0}, {"gain": np.array([1.0, 2.0, 3.0, 4.0]), "bound": -1.0}):
-        loop.env.set_params(**params)
-        env.set_params(**params)
-        check_against_stepping(loop, env)
 
 
 @pytest.mark.quick("Forgetful-mujoco", "Servo-warp")
