@@ -3,8 +3,7 @@
 import functools
 import itertools
 import random
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Mapping
 
 import mujoco
 
@@ -167,21 +166,6 @@ REFUSED: list[tuple[Mapping[str, tuple[str, ...]], str]] = [
 ]  # fmt: skip
 """Combinations of levels that MuJoCo or MuJoCo Warp rejects, and the error of each combination."""
 
-UNKNOWN = {
-    "MuJoCo Warp refuses them": (
-        "mjTRN_SO3", "mjDYN_PID", "mjGAIN_PID", "mjGAIN_SO3", "mjBIAS_SO3", "mjEQ_FLEXVERT", "mjSENS_PLUGIN",
-        "mjENBL_OVERRIDE", "mjENBL_FWDINV", "mjENBL_DIAGEXACT", "mjENBL_IPC", "mjENBL_SPECULATIVE",
-        "mjDSBL_MIDPHASE", "mjDSBL_AUTORESET",
-    ),
-    "compile_model replaces them or turns them off": ("mjSOL_PGS", "mjENBL_SLEEP"),
-    "they stand for others, for nothing or for a count": (
-        "mjJAC_AUTO", "mjWRAP_NONE", "mjTRN_UNDEFINED", "mjNDISABLE", "mjEQ_DISTANCE",
-    ),
-    "a callback computes it, and tasks have none": ("mjSENS_USER",),
-    "it belongs to the acceleration stage and changes nothing else": ("mjSENS_TACTILE",),
-}  # fmt: skip
-"""Reasons, and the enum members that no model uses for this reason."""
-
 
 def xml(case: Case, sensors: str | None = None) -> str:
     delay = "" if case["delay"] == "none" else f'delay=".005" nsample="4" interp="{case["delay"]}"'
@@ -265,77 +249,24 @@ def model_of(case: Case) -> mujoco.MjModel:
 
 
 def is_refused(case: Case) -> bool:
-    return any(all(case.get(name) in levels for name, levels in match.items()) for match, _ in REFUSED)
-
-
-TRIES = 20
-"""Number of random completions of a combination before it counts as refused. A completion can end in a conflict."""
+    return any(all(case[name] in levels for name, levels in match.items()) for match, _ in REFUSED)
 
 
 @functools.cache
 def covering(strength: int, seed: int = 0) -> tuple[Case, ...]:
-    """Choose cases by a greedy search.
-
-    With ``strength=2``, a case exists for every allowed pair of levels from two factors.
-    """
+    """Choose cases that together contain every allowed combination of levels from ``strength`` factors."""
     rng = random.Random(seed)
-    missing: dict[tuple[tuple[str, str], ...], None] = {}
-    for chosen in itertools.combinations(FACTORS, strength):
-        for levels in itertools.product(*(FACTORS[name] for name in chosen)):
-            missing[tuple(zip(chosen, levels, strict=True))] = None
-    cases = []
+    drawn = [{name: rng.choice(levels) for name, levels in FACTORS.items()} for _ in range(2000)]
+    pool = [(case, set(itertools.combinations(case.items(), strength))) for case in drawn if not is_refused(case)]
+    missing, cases = set().union(*(parts for _, parts in pool)), []
     while missing:
-        first = next(iter(missing))
-        tries = (_completed(dict(first), rng, missing, strength) for _ in range(TRIES))
-        if (case := next(filter(None, tries), None)) is None:
-            del missing[first]  # every case with this combination is refused
-            continue
-        for part in itertools.combinations(((name, case[name]) for name in FACTORS), strength):
-            missing.pop(part, None)
+        first = min(missing)
+        entries = (entry for entry in pool if first in entry[1])
+        case, parts = max(entries, key=lambda entry: len(entry[1] & missing))
+        missing -= parts
         cases.append(case)
     return tuple(cases)
 
 
-def _completed(case: Case, rng: random.Random, missing: Mapping[Any, None], strength: int) -> Case | None:
-    """Choose a level for each remaining factor, so that the case contains many missing combinations."""
-    rest = [name for name in FACTORS if name not in case]
-    rng.shuffle(rest)
-    for name in rest:
-        levels = [level for level in FACTORS[name] if not is_refused(case | {name: level})]
-        if not levels:
-            return None
-        rng.shuffle(levels)
-
-        def gain(level: str, name: str = name, case: Case = case) -> int:
-            chosen = [(n, level if n == name else case[n]) for n in FACTORS if n == name or n in case]
-            return sum(part in missing for part in itertools.combinations(chosen, strength) if (name, level) in part)
-
-        case = case | {name: max(levels, key=gain)}
-    return case
-
-
 def title(case: Case) -> str:
     return ", ".join(f"{name}={level}" for name, level in case.items() if level != PLAIN[name]) or "plain"
-
-
-def _bits(enum: Any, flags: int) -> list[int]:
-    return [bit.value for bit in enum.__members__.values() if bit.value.bit_count() == 1 and flags & bit.value]
-
-
-Reader = Callable[[mujoco.MjModel], Any]
-ENUMS: dict[str, Reader] = {
-    "mjtTrn": lambda m: m.actuator_trntype,
-    "mjtDyn": lambda m: m.actuator_dyntype,
-    "mjtGain": lambda m: m.actuator_gaintype,
-    "mjtBias": lambda m: m.actuator_biastype,
-    "mjtEq": lambda m: m.eq_type,
-    "mjtSensor": lambda m: m.sensor_type,
-    "mjtJoint": lambda m: m.jnt_type,
-    "mjtWrap": lambda m: m.wrap_type,
-    "mjtIntegrator": lambda m: [m.opt.integrator],
-    "mjtCone": lambda m: [m.opt.cone],
-    "mjtSolver": lambda m: [m.opt.solver],
-    "mjtJacobian": lambda m: [m.opt.jacobian],
-    "mjtEnableBit": lambda m: _bits(mujoco.mjtEnableBit, m.opt.enableflags),
-    "mjtDisableBit": lambda m: _bits(mujoco.mjtDisableBit, m.opt.disableflags),
-}

@@ -1,8 +1,6 @@
 import contextlib
 import copy
 import dataclasses
-import itertools
-import types
 from typing import Any
 
 import mujoco
@@ -14,10 +12,9 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.core.fields import describe
-from lyceum_warp.engines import memory
-from lyceum_warp.engines.deterministic.contact_order import _ROWS, _SPARSE_ROWS, CanonicalOrder
+from lyceum_warp.engines.deterministic import order_kernels as order
+from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
-from lyceum_warp.engines.deterministic.sort_memory import Scratch, ScratchSizes
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 
 
@@ -41,28 +38,6 @@ def test_deterministic_engine_takes_the_same_steps_as_the_warp_engine() -> None:
     model, _ = engine.bare()
     assert model.callback.contactfilter is not None and model.opt.deterministic == mjw.DeterminismType.ALL
     assert ordered.bytes_per_world > 3 * plain.bytes_per_world
-
-
-@pytest.mark.usefixtures("without_allocators")
-def test_scratch_memory_is_reserved_before_graphs_are_captured(monkeypatch: pytest.MonkeyPatch) -> None:
-    engine: Any = lw.make("hopper", engine=DeterministicEngine, nworld=2).engine
-    assert not engine._scratch.blocks
-    engine.nworld = 1000
-    plain = WarpEngine.bytes_per_world(engine.model, engine.fields.values())
-    for sizes, message in [
-        (ScratchSizes(fixed=10, each=100, most=999), "1000 worlds are too many for .* use nworld=999 at most"),
-        (ScratchSizes(fixed=10, each=100, most=1000), ""),
-        (ScratchSizes(fixed=0, each=10 * plain, most=1000), r"^1000 worlds need about .* at most, or omit determ"),
-    ]:
-        monkeypatch.setattr(ScratchSizes, "probe", lambda capture, sizes=sizes: sizes)
-        monkeypatch.setattr(memory, "free_memory", lambda device: 2 * plain * 1000)
-        if message:
-            with pytest.raises(ValueError, match=message):
-                engine.prepare_capture()
-        else:
-            engine.prepare_capture()
-    (block,) = engine._scratch.blocks
-    assert 100_010 <= block.size < 100_010 + 512
 
 
 # these tests shuffle contacts and rows, because their order is random only on a GPU
@@ -144,48 +119,3 @@ def test_shuffled_constraint_rows_are_sorted_into_the_same_order(forwarded: tupl
             np.testing.assert_array_equal(found[name][w, :nblock], wanted[name][w, :nblock], err_msg=name)
     n = int(d.nacon.numpy()[0])
     np.testing.assert_array_equal(d.contact.efc_address.numpy()[:n], addresses[:n])
-
-
-class Capturing:
-    """Imitate a CUDA device on which Warp captures a graph."""
-
-    is_capturing = True
-
-    def __init__(self) -> None:
-        self.stream = types.SimpleNamespace(is_capturing=False)
-        self.freed: list[int] = []
-
-    def get_allocator(self) -> "Capturing":
-        return self
-
-    def allocate(self, size: int) -> int:
-        return -size
-
-    def deallocate(self, address: int, size: int) -> None:
-        self.freed.append(address)
-
-
-def test_captured_launches_share_scratch_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    device, empty = Capturing(), wp.empty
-    monkeypatch.setattr(wp, "ScopedAllocator", lambda *args: contextlib.nullcontext())
-    monkeypatch.setattr(wp, "empty", lambda shape, dtype, device: empty(shape, dtype=dtype, device="cpu"))
-    scratch = Scratch(device)  # type: ignore[arg-type]
-    scratch.add_block(5000)
-    launches = []
-    for sizes in ([1000, 2000], [512, 1500, 1000], [4000]):
-        scratch.open()
-        launches.append([range(start := scratch.allocate(size), start + size) for size in sizes])
-    for pieces in launches:
-        for before, after in itertools.pairwise(pieces):
-            assert before.stop <= after.start
-        assert pieces[0].start == launches[0][0].start and pieces[-1].stop <= pieces[0].start + 5120
-    assert (scratch.peak, scratch.largest) == (4096, 4096)
-    more = scratch.allocate(2000)
-    assert more not in range(launches[0][0].start, launches[0][0].start + 5120)
-    scratch.deallocate(more, 2000)
-    assert not device.freed
-    for within in (True, False):
-        device.stream.is_capturing, device.is_capturing = within, within
-        assert scratch.allocate(300) == -300
-        scratch.deallocate(-300, 300)
-    assert device.freed == [-300, -300] and scratch.peak == 4096 + 2048

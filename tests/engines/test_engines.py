@@ -2,7 +2,6 @@ import gc
 from pathlib import Path
 
 import mujoco
-import numpy as np
 import pytest
 import torch
 import warp as wp
@@ -14,8 +13,6 @@ from lyceum_warp.core.fields import describe
 from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.testing import check_task
-from lyceum_warp.testing.state_rules import check_reset, check_restoring
 
 TASK = """
 import mujoco
@@ -118,15 +115,6 @@ def test_fields_listed_as_cleared_are_zero_when_an_episode_begins(
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "warp"])
-def test_controls_are_saved_and_reset_with_the_state(file: Path, engine: str) -> None:
-    env = lw.make(file, engine=engine, nworld=2)
-    for steps in range(1, 5):
-        env.step(torch.ones(2, 1))
-        np.testing.assert_allclose(env.obs[:, 2], 1 - 0.9**steps, rtol=1e-5)
-    check_task(file, engine=engine, steps=20, checks=[check_reset, check_restoring])
-
-
-@pytest.mark.parametrize("engine", ["mujoco", "warp"])
 def test_view_of_a_field_stays_valid_after_its_environment_is_deleted(engine: str) -> None:
     field = lw.make("point_mass", engine=engine, nworld=64).field("qpos")
     before = field.clone()
@@ -193,16 +181,6 @@ def test_option_deterministic_has_no_effect_on_the_cpu() -> None:
         assert env.replicate().options.physics.deterministic
         assert type(env.engine) is type(lw.make("point_mass", engine=engine).engine)
         env.step()
-
-
-def test_contact_buffer_has_room_for_one_world_with_all_contacts() -> None:
-    env = lw.make("hopper", engine="warp", nworld=4)
-    engine = env.engine
-    assert isinstance(engine, WarpEngine)
-    assert engine.d.naconmax == 4 * engine.nconmax + engine.spare and engine.spare >= 256
-    model, data = engine.bare()
-    assert (data.naconmax, data.njmax, model.opt.warn_overflow) == (engine.d.naconmax, engine.njmax, 0)
-    assert lw.make("point_mass", engine="warp", nconmax=8).engine.d.naconmax == 8  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("partial", [True, False])

@@ -1,3 +1,4 @@
+import os
 import types
 from typing import Any
 
@@ -12,6 +13,7 @@ from lyceum_warp.engines import Engine, engine_name, memory, options_for_few_wor
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.placement import find_device, open_engine, place_samples
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
+from lyceum_warp.support.machine import cpu_cores
 
 ON_CPU = {"engine": "mujoco", "device": "cpu", "nconmax": None, "njmax": None, "deterministic": None}
 
@@ -140,3 +142,8 @@ def test_engine_of_a_planner_depends_on_the_number_of_samples(gpu: Any) -> None:
 def test_c_engine_on_a_gpu_raises_an_error(model: mujoco.MjModel, gpu: Any) -> None:
     with pytest.raises(ValueError, match="runs on the CPU, not on 'cuda:0': use device='cpu' or engine='warp'"):
         open_engine("mujoco", model, 1, gpu, [])
+
+
+def test_cpu_cores_counts_the_cores_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5}, raising=False)
+    assert cpu_cores() == 3

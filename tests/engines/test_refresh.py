@@ -8,7 +8,7 @@ import pytest
 import step_table as table
 import warp as wp
 
-from lyceum_warp.core.fields import Stage, describe, early_sensor_columns, state_columns
+from lyceum_warp.core.fields import describe, early_sensor_columns
 from lyceum_warp.engines import Engine
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
@@ -131,25 +131,6 @@ def test_a_refresh_equals_a_full_forward_pass(kind: type[Engine], sensors: str) 
         begin(engine, everyone(engine), steps)
 
 
-@pytest.mark.parametrize("sensors", ["position", "velocity", "mixed", "histories"])
-def test_refresh_on_warp_computes_no_collisions_and_no_constraints(
-    sensors: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    engine = make(WarpEngine, sensors)
-    engine.step(1)
-    state = state_of(engine)
-
-    def refuse(*args: Any, **options: Any) -> None:
-        raise AssertionError("the refresh computed an unnecessary part of the forward pass")
-
-    for name in ("forward", "fwd_position", "collision", "make_constraint", "solve"):
-        monkeypatch.setattr(mjw, name, refuse)
-    engine.refresh_current(everyone(engine))
-    put(engine, state, everyone(engine))
-    if engine.reset_stage < Stage.ACCELERATION:
-        begin(engine, only(engine, 1), 1)
-
-
 @pytest.mark.quick("mujoco", "warp")
 @pytest.mark.parametrize("sensors", ["mixed", "histories"])
 def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type[Engine], sensors: str) -> None:
@@ -174,47 +155,6 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
-
-
-@pytest.mark.quick("mujoco", "warp")
-def test_reset_clears_the_histories_of_sensors(kind: type[Engine]) -> None:
-    used, fresh = make(kind, "histories"), make(kind, "histories")
-    assert mujoco.mj_stateSize(used.model, mujoco.mjtState.mjSTATE_HISTORY.value) > 0
-    for _ in range(4):
-        used.step(1)
-    for engine in (used, fresh):
-        begin(engine, everyone(engine), 6)
-        engine.step(2)
-    np.testing.assert_array_equal(state_of(used), state_of(fresh))
-
-
-@pytest.mark.quick("mujoco", "warp")
-def test_a_refresh_uses_the_equality_constraints_of_each_world(kind: type[Engine]) -> None:
-    engine = make(kind, "mixed", "joint")
-    held = shown(engine)["sensordata"]
-    state = state_of(engine)
-    state[1, state_columns(engine.model, "eq_active")] = 0.0
-    put(engine, state, everyone(engine))
-    engine.refresh(everyone(engine))
-    check_current(engine, whole=True)
-    assert (shown(engine)["sensordata"] != held).any(axis=1).tolist() == [False, True, False, False]
-
-
-@pytest.mark.quick("mujoco", "warp")
-def test_limit_sensor_is_zero_after_the_joint_leaves_its_limit(kind: type[Engine]) -> None:
-    engine = make(kind, "limits")
-    elbow = int(engine.model.joint("elbow").qposadr[0])
-    column = state_columns(engine.model, "qpos").start + elbow
-    sensor = next(i for i in range(engine.model.nsensor)
-                  if engine.model.sensor_type[i] == mujoco.mjtSensor.mjSENS_JOINTLIMITPOS)  # fmt: skip
-    adr = int(engine.model.sensor_adr[sensor])
-    state = state_of(engine)
-    for angle, beyond in ((0.2, True), (-0.3, False), (0.2, True), (-0.3, False)):
-        state[:, column] = angle
-        put(engine, state, only(engine, 0, 1))
-        found = shown(engine)["sensordata"][:2, adr]
-        assert (found < -0.1).all() if beyond else (found == 0.0).all()
-        check_current(engine)
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:

@@ -217,14 +217,3 @@ def test_engines_reject_the_listed_combinations(levels: dict[str, tuple[str, ...
     for chosen in itertools.product(*levels.values()):
         with pytest.raises((ValueError, NotImplementedError), match=reason):
             make(table.model_of(table.PLAIN | dict(zip(levels, chosen, strict=True))), [], wp.get_device("cpu"))
-
-
-def test_table_contains_every_member_of_the_mujoco_enums() -> None:
-    """Add each new MuJoCo element to the table, or give a reason in ``UNKNOWN``."""
-    models = [table.model_of(case) for case in table.covering(1)]
-    unknown = {name for names in table.UNKNOWN.values() for name in names}
-    for enum, members in table.ENUMS.items():
-        found = {int(member) for model in models for member in members(model)}
-        every = {name: member.value for name, member in getattr(mujoco, enum).__members__.items()}
-        missing = {name for name, value in every.items() if value not in found}
-        assert missing == unknown & every.keys(), enum

@@ -1,5 +1,3 @@
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -27,25 +25,6 @@ def test_step_with_tensors_does_not_wait_for_the_device(mode: str) -> None:
             obs, *_ = envs.step(action)
         envs.reset(options={"reset_mask": mask})
     assert obs["policy"].device == torch.device(CUDA)
-
-
-def test_numpy_arrays_and_tensors_have_the_same_values() -> None:
-    arrays, tensors = (GymnasiumVectorEnv(Full, N, torch=t, device=CUDA, deterministic=True) for t in (False, True))
-    arrays.reset(seed=3)
-    tensors.reset(seed=3)
-    rng, ends = np.random.default_rng(0), 0
-    for _ in range(30):
-        action = rng.uniform(-1, 1, (N, 3)).astype(np.float32)
-        array: Any = arrays.step(action)
-        tensor: Any = tensors.step(torch.from_numpy(action).to(CUDA))
-        np.testing.assert_array_equal(array[0]["critic"], tensor[0]["critic"].cpu().numpy())
-        for i in (1, 2, 3):
-            np.testing.assert_array_equal(array[i], tensor[i].cpu().numpy())
-        for world in (array[2] | array[3]).nonzero()[0]:
-            final = tensor[4]["final_obs"]["critic"][world].cpu().numpy()
-            np.testing.assert_array_equal(array[4]["final_obs"][world]["critic"], final)
-            ends += 1
-    assert ends
 
 
 def test_stable_baselines3_receives_numpy_arrays() -> None:

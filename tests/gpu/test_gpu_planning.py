@@ -5,7 +5,6 @@ import torch
 import warp as wp
 from rail_task import Picky
 from test_gpu import CUDA, nothing_waits
-from varied_task import Varied
 
 import lyceum_warp as lw
 from lyceum_warp import Row
@@ -160,33 +159,6 @@ def test_problems_of_plans_are_reported_without_waiting_for_the_device(caplog: p
             wrong(state)
             torch.cuda.synchronize()
     assert not wrong.actions.any()
-
-
-@pytest.mark.parametrize("risk", ["mean", "worst"])
-def test_plans_in_several_models_are_equal_on_gpu_and_cpu(risk: Any) -> None:
-    gpu, cpu = (
-        lw.MPPI(Varied, device=device, engine=engine, horizon=4, samples=20, models=3, risk=risk, temperature=10.0)
-        for device, engine in ((CUDA, "warp"), ("cpu", "mujoco"))
-    )
-    torch.testing.assert_close(gpu.model_fields["body_mass"].cpu(), cpu.model_fields["body_mass"])
-    torch.testing.assert_close(gpu(gpu.state_of()).cpu(), cpu(cpu.state_of()), rtol=1e-3, atol=1e-3)
-    torch.testing.assert_close(gpu.model_returns.cpu(), cpu.model_returns, rtol=1e-3, atol=1e-3)
-
-
-def test_value_functions_in_torch_and_in_warp_agree() -> None:
-    warp, tensor = (
-        lw.MPPI("reach", device=CUDA, engine="warp", samples=64, value=value, temperature=10.0, deterministic=True)
-        for value in (first_squared, PLANNERS["a value in torch"]["value"])
-    )
-    state = warp.state_of(mocap_pos=[0.1, 0.1, 0.2])
-    for _ in range(3):
-        torch.testing.assert_close(warp(state), tensor(state), rtol=1e-4, atol=1e-5)
-        torch.testing.assert_close(warp.returns, tensor.returns, rtol=1e-4, atol=1e-4)
-
-
-def test_a_planner_on_the_gpu_controls_a_plant_on_the_cpu() -> None:
-    done = lw.control(plant("reach"), lw.MPPI("reach", device=CUDA, engine="warp", samples=128), seed=0)
-    assert done.succeeded
 
 
 @pytest.mark.parametrize("samples", [8, 2048])

@@ -1,4 +1,3 @@
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -63,12 +62,6 @@ def test_learner_captures_new_graphs_after_loading_a_state() -> None:
         first, second = next(one), next(other)
         assert second.learning_rate == pytest.approx(first.learning_rate)
         assert second.value_loss == pytest.approx(first.value_loss, rel=2e-2, abs=1e-3)
-
-
-def test_ppo_run_resumes_on_a_gpu(tmp_path: Path) -> None:
-    run = lw.train(made(), tmp_path / "run", 2)
-    lw.train(made(), run, 4)
-    assert [row["iteration"] for row in run.rows()] == [1, 2, 3, 4]
 
 
 def test_ppo_learns_on_a_gpu() -> None:

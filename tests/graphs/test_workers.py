@@ -13,19 +13,6 @@ def own_threads() -> set[threading.Thread]:
     return {thread for thread in threading.enumerate() if thread.name.startswith("lyceum_warp_")}
 
 
-def test_calls_run_in_parallel_threads() -> None:
-    together, threads = threading.Barrier(3), []
-
-    def call() -> None:
-        together.wait(10)  # wait() returns once three threads have called it
-        threads.append(threading.current_thread())
-
-    workers = Workers(3)
-    for _ in range(3):
-        workers.run([call] * 3)
-    assert threads.count(threading.current_thread()) == 3 and len(set(threads)) == 3
-
-
 def test_threads_start_on_demand_and_end_with_the_last_reference_to_their_pool() -> None:
     before = own_threads()
     workers = Workers(3)

@@ -42,12 +42,6 @@ def test_help_of_a_family_shows_the_meaning_of_every_parameter(struct: Any) -> N
         assert f"{name}: {doc}" in text
 
 
-def test_help_of_class_done_explains_every_bit() -> None:
-    text = page(lw.Done)
-    for bit in lw.Done:
-        assert f"{bit.name} ({int(bit)}): " in text
-
-
 def test_help_of_every_public_function_shows_its_arguments() -> None:
     functions = {
         name: value for name in lw.__all__ if callable(value := getattr(lw, name)) and not isinstance(value, type)
