@@ -7,7 +7,6 @@ import pytest
 import torch
 from conftest import SharedEnv
 from full_task import Full
-from gymnasium import wrappers
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
@@ -26,14 +25,6 @@ def vector(shared_env: SharedEnv) -> Callable[..., GymnasiumVectorEnv]:
         return GymnasiumVectorEnv(shared_env(Full, nworld=N, autoreset=same_step), **options)
 
     return get
-
-
-@pytest.fixture(scope="module")
-def hopper() -> Iterator[GymnasiumVectorEnv]:
-    env = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=N)
-    assert isinstance(env, GymnasiumVectorEnv)
-    yield env
-    env.close()
 
 
 def actions() -> Iterator[np.ndarray]:
@@ -196,19 +187,6 @@ def test_gymnasium_spaces_have_the_bounds_of_the_environment(vector: Callable[..
     assert GymnasiumVectorEnv("hopper", dict_obs=True).single_observation_space["policy"].shape == (11,)
 
 
-def test_gymnasium_wrapper_receives_the_final_observations_of_ended_worlds(hopper: GymnasiumVectorEnv) -> None:
-    envs: Any = wrappers.vector.DictInfoToList(wrappers.vector.RecordEpisodeStatistics(hopper))
-    envs.reset(seed=0)
-    envs.action_space.seed(0)
-    ends = 0
-    for _ in range(40):
-        obs, _, terminated, _, infos = envs.step(envs.action_space.sample())
-        assert obs in envs.observation_space
-        ends += terminated.sum()
-        assert all(("final_obs" in info) == end for info, end in zip(infos, terminated, strict=True))
-    assert ends
-
-
 def test_render_returns_a_picture_of_each_world(vector: Callable[..., GymnasiumVectorEnv]) -> None:
     envs = vector(render_mode="rgb_array", render_size=(64, 48))
     try:
@@ -244,7 +222,9 @@ def test_step_or_partial_reset_before_the_first_reset_raises_an_error(
         vector().reset(options={"reset_mask": np.array([True, False, False, False])})
 
 
-def test_invalid_arguments_raise_an_error(hopper: GymnasiumVectorEnv) -> None:
+def test_invalid_arguments_raise_an_error() -> None:
+    hopper = gymnasium.make_vec("lyceum_warp.gym:lyceum/Hopper-v0", num_envs=N)
+    assert isinstance(hopper, GymnasiumVectorEnv)
     for reset, text in [({"mask": 1}, "mask"), ({"reset_mask": np.ones(3, dtype=bool)}, r"\(3,\)"),
                         ({"reset_mask": np.ones(4)}, "ndarray")]:  # fmt: skip
         with pytest.raises(ValueError, match=text):

@@ -29,11 +29,6 @@ def test_step_returns_all_observation_groups_without_copies(env: lw.Env) -> None
         assert torch.equal(extras["final_obs"][group], env.final_obs_groups[group])
 
 
-def test_rsl_rl_env_passes_options_to_the_task() -> None:
-    worlds = RslRlVecEnv(Metered, 3, horizon=7, far=2.0)
-    assert (worlds.num_envs, worlds.max_episode_length, worlds.cfg["params"]) == (3, 7, {"far": 2.0})
-
-
 def test_returned_observations_are_not_overwritten_by_the_next_step(env: lw.Env) -> None:
     """rsl_rl stores the observations of a step only after the next step."""
     worlds = RslRlVecEnv(env)

@@ -1,17 +1,13 @@
-import warnings
-
 import gymnasium
 import numpy as np
 import pytest
 import torch
 from full_task import Full
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 
 import lyceum_warp as lw
 from lyceum_warp.adapters import StableBaselines3VecEnv
-from lyceum_warp.gym import GymnasiumEnv
 from lyceum_warp.viz.video import NoVideoError
 
 N = 4
@@ -62,12 +58,6 @@ def test_off_policy_learner_stores_final_observations(full: StableBaselines3VecE
     assert len(ended)
     for step, world in ended:
         assert (buffer.next_observations[step, world] != buffer.observations[step + 1, world]).any()
-
-
-def test_stable_baselines3_checker_accepts_a_single_world() -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        check_env(GymnasiumEnv("hopper"), skip_render_check=True)
 
 
 def test_get_attr_set_attr_and_env_method_reach_the_worlds() -> None:

@@ -1,10 +1,6 @@
-import contextlib
-import http.server
 import io
 import os
-import re
 import shutil
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -330,20 +326,6 @@ def test_slider_and_play_button_show_a_saved_episode(tab: Tab) -> None:
     tab.press("Space", lambda: viewer.status.step < STEPS / 2)
 
 
-@pytest.mark.long
-def test_page_has_a_title_and_links_to_new_files(tab: Tab, tmp_path: Path) -> None:
-    assert tab.page.title() == "block"
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{43}/", tab.page.url)
-    assert not [line for line in tab.log if line.startswith("error")]
-    file = tmp_path / "recorded.html"
-    file.write_text("<p>recorded")
-    tab.viewer.session.stage.videos.files.append(file)
-    with tab.page.expect_download() as download:
-        tab.page.get_by_text("recorded.html").click(timeout=SECONDS * 1000)
-    assert Path(download.value.path()).read_text() == "<p>recorded"
-    assert tab.page.evaluate("fetch('saved/other.html').then((answer) => answer.status)") == 404
-
-
 def test_a_saved_page_plays_without_a_server(browser: Browser, tmp_path: Path) -> None:
     env = lw.make(Block, autoreset=False)
     episode = lw.control(env, lambda state, obs: torch.ones(1), steps=STEPS, seed=0)
@@ -365,46 +347,6 @@ def test_a_saved_page_plays_without_a_server(browser: Browser, tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_another_browser_gets_control_after_the_first_is_closed_or_killed(
-    viewer: Viewer, launch: Callable[[], Browser], context: BrowserContext, shared_tab: Tab
-) -> None:
-    shared_tab.page.goto("about:blank")
-    victim = launch()
-    Tab(victim.new_page(), viewer).loaded()
-    processes = victim.new_browser_cdp_session().send("SystemInfo.getProcessInfo")["processInfo"]
-    for process in processes:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(process["id"], signal.SIGKILL)
-    address = None
-    for _ in range(2):
-        tab = Tab(context.new_page(), viewer, address).loaded()
-        tab.logs("role=controller")
-        paused = viewer.status.paused
-        tab.press("Space", lambda: viewer.status.paused != paused)  # noqa: B023
-        address = tab.page.url
-        tab.page.close()
-    assert viewer.window.is_open()
-
-
-@pytest.mark.long
-def test_foreground_tab_controls_the_viewer_and_another_tab_can_take_over(
-    viewer: Viewer, context: BrowserContext
-) -> None:
-    def controls(tab: Tab) -> None:
-        paused = viewer.status.paused
-        tab.press("Space", lambda: viewer.status.paused != paused)
-
-    first = Tab(context.new_page(), viewer).loaded()
-    controls(first)
-    second = Tab(context.new_page(), viewer, first.page.url).loaded()
-    controls(second)
-    first.page.evaluate("window.dispatchEvent(new Event('focus'))")
-    controls(first)
-    first.page.close()
-    controls(second)
-
-
-@pytest.mark.long
 def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> None:
     viewer = Viewer(Session(lw.make("go1_velocity"), seed=0))
     tab = Tab(context.new_page(), viewer).loaded()
@@ -419,29 +361,3 @@ def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> Non
     tab.press("Enter", lambda: not viewer.status.driven)
     viewer.window.close()
     viewer.thread.join(30)
-
-
-@pytest.mark.long
-def test_output_of_a_notebook_cell_shows_the_page_in_a_frame(context: BrowserContext) -> None:
-    shown = lw.view(lw.make(Block), seed=0, block=False)
-    assert shown is not None
-    text = f"<!doctype html><title>notebook</title>{shown._repr_html_()}".encode()
-
-    class Notebook(http.server.BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(text)
-
-    page, log = context.new_page(), []
-    page.on("console", lambda message: log.append(message.text))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Notebook) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        page.goto(f"http://localhost:{server.server_port}/")
-        deadline = time.monotonic() + SECONDS
-        while not any("First remote draw frame applied" in line for line in log):
-            assert time.monotonic() < deadline, log
-            page.wait_for_timeout(20)
-        server.shutdown()
-    page.close()
-    shown.close()

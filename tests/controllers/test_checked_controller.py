@@ -14,10 +14,6 @@ def env() -> lw.Env:
     return lw.make("point_mass", engine="mujoco", autoreset=False, horizon=40)
 
 
-def test_mppi_satisfies_the_protocol_planning_controller() -> None:
-    assert isinstance(lw.MPPI("point_mass", horizon=2, samples=1), lw.PlanningController)
-
-
 def test_controller_that_is_not_callable_raises_an_error(env: lw.Env) -> None:
     with pytest.raises(ValueError, match=r"must be callable with \(state, obs\), not str 'towards': pass a function"):
         control(env, "towards")  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import torch
 from toy_controllers import SamplingPlanner, StepPlanner, hundredths, simulated_run, towards
 
 import lyceum_warp as lw
-from lyceum_warp.controllers import Clock, ControlProgress, control_async, control_report
+from lyceum_warp.controllers import ControlProgress, control_async, control_report
 
 
 @pytest.fixture(scope="module")
@@ -190,11 +190,3 @@ except KeyboardInterrupt:
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0 and done.stdout == "ended 1\n", done.stderr
-
-
-def test_real_clock_never_returns_before_the_requested_time() -> None:
-    clock = Clock()
-    for wait in (-1.0, 0.0, 0.0002, 0.004):
-        moment = clock.now() + wait
-        clock.wait_until(moment)
-        assert clock.now() >= moment

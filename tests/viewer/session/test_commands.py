@@ -61,15 +61,6 @@ def test_body_can_be_placed_while_paused(shared_env: SharedEnv) -> None:
     assert torch.equal(env.get_state()[0], before[0])
 
 
-def test_seeking_shows_a_step_of_the_episode(shared_env: SharedEnv) -> None:
-    session = Session(shared_env("hopper", nworld=2), seed=0)
-    session.stage.advance(8)
-    for step, shown in ((3, 3), (100, 8)):
-        session.obey(command(seek, step))
-        status = session.stage.frame().status
-        assert status.step == shown and status.paused and status.seekable == (0, 8)
-
-
 def test_worlds_are_chosen_by_number_and_by_return(shared_env: SharedEnv) -> None:
     env = shared_env("hopper", nworld=4)
     session = Session(env, controllers={"policy": pushing}, paused=True, seed=0)

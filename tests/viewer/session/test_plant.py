@@ -139,10 +139,3 @@ def test_failing_controller_is_reported_and_stopped(
     assert window.messages[0].startswith(f"the controller {kind!r} failed: {text}")
     assert session.stage.paused and window.frames[-1].status.paused
     assert "Traceback" in capsys.readouterr().err
-
-
-def test_viewer_shows_frames_even_if_the_plant_never_waits(shared_env: SharedEnv) -> None:
-    env = shared_env("point_mass", autoreset=False, horizon=0)
-    session = Session(env, controllers={"none": lambda state, obs: torch.zeros(2)}, seed=0)
-    session.obey(command(set_speed, 16.0))
-    run(session, lambda frame: session.stage.live.steps > 0, *[[]] * 20)

@@ -81,14 +81,6 @@ def take(taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch) -> No
         pytest.skip(str(error))
 
 
-def test_a_video_without_frames_has_no_page(taker: VideoTaker, tmp_path: Path) -> None:
-    lines: list[str] = []
-    with taker.finishing(lines.append):
-        taker.begin(CAMERA)
-    (line,) = lines
-    assert line.startswith("no video: ") and not list(tmp_path.iterdir())
-
-
 def test_a_second_signal_discards_the_videos(
     taker: VideoTaker, frame: Frame, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -78,13 +78,6 @@ def test_process_listens_on_the_loopback_address_only(shared_window: Window) -> 
     assert listening == {"0100007F"}  # 127.0.0.1
 
 
-def test_window_requests_no_further_frame_without_a_page(shared_window: Window) -> None:
-    assert shared_window.commands() == [] and shared_window.wants_frame
-    shared_window.show(frame_of(MODEL, DATA))
-    time.sleep(0.5)
-    assert not shared_window.wants_frame
-
-
 def test_ctrl_c_does_not_end_the_window(shared_window: Window) -> None:
     os.kill(process_of(shared_window), signal.SIGINT)
     time.sleep(0.3)
