@@ -10,6 +10,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.training import Configuration, Run, run_env
 
 TINY = ["--samples", "512", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--mean-every", "2",
         "--mean-episodes", "2"]  # fmt: skip
@@ -56,6 +57,12 @@ def algorithm(env: lw.Env, **options: Any) -> lw.NPG:
 def six_iterations(folder: Path) -> Path:
     lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 6, keep_every=2)
     return folder
+
+
+def env_of(folder: Path) -> lw.Env:
+    run = Run.open(folder)
+    configuration = Configuration.of(run)
+    return run_env(run, configuration.options, configuration.params)
 
 
 def mean_action(policy: lw.GaussianPolicy) -> torch.Tensor:

@@ -3,13 +3,11 @@ import subprocess
 import sys
 
 import pytest
-from rich.console import Console
 from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.binding import task_names
-from lyceum_warp.cli import list_tasks
 
 
 def rows(out: str) -> dict[str, list[str]]:
@@ -33,13 +31,6 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
         env = lw.make(name)
         sizes = [env.obs_space.size, env.action_space.size, env.options.physics.frame_skip or env.task.frame_skip]
         assert tasks[name][:4] == list(map(str, [*sizes, f"{env.timestep:g}"]))
-
-
-def test_list_fits_into_a_narrow_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(list_tasks, "console", Console(width=60, highlight=False))
-    assert cli.main(["tasks", "adroit"]) == 0
-    table = capsys.readouterr().out.partition("\n\n")[0]
-    assert max(map(len, table.splitlines())) <= 60 and "gymnasium-robotics [hand]" in " ".join(table.split())
 
 
 @pytest.mark.parametrize(("word", "task"), [("walker", "walker2d"), ("HOP", "hopper"), ("[hand]", "adroit_pen")])

@@ -1,3 +1,4 @@
+import dataclasses
 import io
 import os
 import subprocess
@@ -9,6 +10,8 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
+from lyceum_warp.cli.arguments import NO_FLAGS, EnvFlags, Physics, Placement, given, parameter, parameters
+from lyceum_warp.core import EnvOptions, PhysicsOptions
 
 COMMANDS = ("tasks", "new", "check", "train", "eval", "export", "plan", "tune", "view", "bench")
 
@@ -39,12 +42,6 @@ def test_help_all_describes_more_options_than_help(
         assert 9 <= len(described) <= 10 and all(f"  {flag}" in every for flag in described)
         others = usual.partition(f"lyceum-warp {command} --help-all also describes")[2]
         assert all(f"  {flag}" in every for flag in others.split() if flag.startswith("--"))
-    everything = help_of(["train", "--help-all"], capsys)
-    assert all(f"  --{name} " in everything for name in ("iterations", "gamma", "require-return", "integrator"))
-    assert "Discount factor." in everything
-    for words in ("--whiten, --no-whiten", "(npg 0.995, ppo 0.99, sac)", "sac 0.0003)", "(ppo 24, sac)"):
-        assert words in " ".join(everything.split())
-    assert "hyperparameter options: --samples" in help_of(["train", "-h"], capsys)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="torch uses GNU's OpenMP on Linux only")
@@ -109,3 +106,54 @@ def test_output_that_the_terminal_cannot_encode_is_escaped(tmp_path: Path, monke
     assert cli.main(["new", "\udcffä/walk", "--model", "gymnasium:hopper.xml"]) == 0
     sys.stdout.flush()
     assert bytes_out.getvalue().startswith(b"\\udcff\\xe4/walk.py: ")
+
+
+@pytest.mark.long
+def test_bench_forwards_options_and_returns_the_exit_code_of_the_program() -> None:
+    command = [sys.executable, "-m", "lyceum_warp.cli", "bench", "plot", "no_experiment"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2 and "'no_experiment'" in done.stderr
+
+
+def test_bench_refuses_unknown_programs_and_needs_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["bench", "throughputs"]) == 2
+    refused(capsys, "'throughputs'", "throughput?")
+    monkeypatch.setattr("lyceum_warp.cli.bench.FOLDER", tmp_path / "bench")
+    assert cli.main(["bench"]) == 2
+    refused(capsys, str(tmp_path / "bench"))
+
+
+@pytest.mark.parametrize("text, value", [
+    ("a=1", 1), ("a=-0.5", -0.5), ("a=1e-3", 1e-3), ("a=inf", float("inf")), ("a=true", True), ("a=False", False),
+    ("a=0.7,inf", [0.7, float("inf")]), ("a=[1, 2]", [1, 2]),
+])  # fmt: skip
+def test_parameter_values_are_parsed_by_their_type(text: str, value: object) -> None:
+    name, parsed = parameter(text)
+    assert (name, parsed) == ("a", value)
+    assert type(parsed) is type(value)
+
+
+@pytest.mark.parametrize("text", ["mass", "mass=", "mass=heavy"])
+def test_malformed_parameter_raises_an_error(text: str) -> None:
+    with pytest.raises(ValueError, match=f"'{text}'"):
+        parameter(text)
+
+
+def test_every_option_has_a_flag_or_is_listed() -> None:
+    physics = {field.name for field in dataclasses.fields(PhysicsOptions)} - {"base"} | {"physics"}
+    assert {field.name for field in dataclasses.fields(Physics)} == physics
+    names = {field.name for field in dataclasses.fields(EnvOptions)} - {*NO_FLAGS}
+    assert {field.name for field in dataclasses.fields(EnvFlags)} == names
+    assert {field.name for field in dataclasses.fields(Placement)} == names - {"horizon"}
+    assert given(Physics()) == given(EnvFlags()) == {}
+
+
+def test_last_value_of_a_repeated_parameter_is_used() -> None:
+    assert parameters(["mass=1", "size=1,2", "mass=3"]) == {"mass": 3, "size": [1, 2]}
+
+
+def test_option_given_as_a_parameter_raises_an_error() -> None:
+    with pytest.raises(ValueError, match=r"horizon is an option.*--help-all"):
+        parameters(["mass=1", "horizon=9"])

@@ -1,7 +1,4 @@
-import importlib.util
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +9,7 @@ import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.testing import CHECKS, check_task, episode_rules as episodes, index_rules as indices
+from lyceum_warp.testing import check_task
 
 RICH = text(
     ARM
@@ -28,8 +25,6 @@ RICH = text(
     + '<sensor><gyro site="end"/><clock/><touch site="end"/><user dim="2"/></sensor>'
     '<keyframe><key name="home" qpos=".3 -.3  0 0 .1 1 0 0 0  1 0 0 0" ctrl=".5 0 0" mpos=".2 0 .5"/></keyframe>',
 )
-# the omitted checks are slow, and do not depend on the model
-QUICK_CHECKS = tuple(check for check in CHECKS if check not in (episodes.check_memory, indices.check_bounds))
 
 
 @pytest.fixture
@@ -77,24 +72,6 @@ def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, fold
     assert task.timestep == pytest.approx(0.02)
 
 
-def package_models() -> list[Path]:
-    """Return the model files of gymnasium, dm_control and MuJoCo Warp that contain actuators."""
-    folders = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite", "mujoco_warp": "test_data"}
-    files: list[Path] = []
-    for package, within in folders.items():
-        spec = importlib.util.find_spec(package)
-        if spec is not None and spec.submodule_search_locations:
-            files += sorted(Path(spec.submodule_search_locations[0], within).rglob("*.xml"))
-    return [path for path in files if path.parent.name != "common" and "<actuator" in path.read_text()]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("model", package_models(), ids=lambda path: f"{path.parent.name}-{path.stem}")
-def test_new_task_for_a_model_of_another_package_passes_check_task(model: Path, folder: Path) -> None:
-    assert cli.main(["new", "walk", "--model", str(model)]) == 0
-    check_task("walk.py", engine="mujoco", nworld=2, steps=10, horizon=6, frame_skip=2, checks=QUICK_CHECKS)
-
-
 def test_functions_in_comments_work_after_uncommenting(folder: Path) -> None:
     file = new("everything", RICH)
     head, body = file.read_text().split("# Three more functions that most tasks have:\n#\n")
@@ -107,21 +84,6 @@ def test_functions_in_comments_work_after_uncommenting(folder: Path) -> None:
     task = BoundTask(find_task(file))
     assert all(task.functions[name] is not None for name in ("evaluate", "terminated", "success"))
     assert task.params["tip"] == 0
-
-
-def test_new_files_are_formatted(folder: Path) -> None:
-    if importlib.util.find_spec("ruff") is None:
-        pytest.skip("ruff is not installed")
-    names = "abcdefghijklmnopqrstuvwxyz"
-    many = "".join(f'<site name="{letter * 15}" pos="0 0 1"/>' for letter in names)
-    for name, xml in (("everything", RICH), ("crowd", text(ARM + many))):
-        new(name, xml)
-    assert "  sites: here, aaaaaaaaaaaaaaa, bbb" in Path("crowd.py").read_text()
-    assert ", ...\n" in Path("crowd.py").read_text()
-    settings = ["--isolated", "--line-length", "120", "--target-version", "py311"]
-    for command in (["format", "--check", *settings], ["check", "--select", "E,W,F,UP,B,SIM", *settings]):
-        done = subprocess.run([sys.executable, "-m", "ruff", *command, "."], capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout
 
 
 def test_model_path_is_written_relative_to_the_task_file(folder: Path) -> None:

@@ -1,6 +1,5 @@
 import dataclasses
 import json
-import re
 import signal
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,6 @@ import mujoco
 import pytest
 import tiny_task
 import torch
-from rich.console import Console
 from training_runs import QUIET, TINY, interrupted, refused
 
 import lyceum_warp as lw
@@ -64,16 +62,6 @@ def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: p
     assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
     refused(capsys, "0.013 s", "0.02 s")
     assert not (tmp_path / "other").exists()
-
-
-@pytest.mark.long
-def test_command_plan_makes_a_video_of_the_first_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert plan(tmp_path / "run", "--no-plot", "--steps", "12", "--camera", "azimuth=20", "--camera", "track=1") == 0
-    lines = capsys.readouterr().out.splitlines()
-    video = next(line for line in lines if line.startswith("video:")).split(maxsplit=1)[1]
-    if video.startswith("none: this machine cannot render"):
-        pytest.skip(video)
-    assert Path(video).read_bytes()[4:8] == b"ftyp"
 
 
 def test_flag_real_time_runs_the_plant_asynchronously_in_real_time(
@@ -221,23 +209,6 @@ def test_complete_episodes_are_saved_after_an_interrupt(
     assert json.loads((out / "report.json").read_text())["episodes"] == 2
 
 
-def test_interrupted_episode_in_real_time_is_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def third(display: PlanDisplay, now: lw.ControlProgress) -> None:
-        if now.step == 3:
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(PlanDisplay, "__call__", third)
-    out = tmp_path / "run"
-    options = ["--horizon", "10", "--samples", "8", "--steps", "100000", *QUIET, "--real-time"]
-    assert interrupted(["plan", "point_mass", "--out", str(out), *options]) == 130
-    assert "interrupted by SIGINT after 0 episodes and 3 steps; files in" in capsys.readouterr().out
-    part = Trajectory.load(out / "episode-000.npz")
-    assert part.steps == 3 and part.done_reason == 0 and len(part.states) == 4
-    assert not (out / "report.json").exists()
-
-
 def test_every_planner_setting_has_a_flag() -> None:
     flags = [field.name for field in dataclasses.fields(Settings)]
     assert flags == [field.name for field in dataclasses.fields(lw.MPPIConfig)]
@@ -254,12 +225,3 @@ def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(t
     assert config["planner"]["temperature"] == 0.25
     assert config["params"] == {"temperature": 0.5} and config["planner_params"] == {"temperature": 0.75}
     assert Trajectory.load(tmp_path / "run" / "episode-000.npz").params["temperature"] == 0.5
-
-
-def test_live_display_shows_the_real_time_factor_or_the_age_of_actions(capsys: pytest.CaptureFixture[str]) -> None:
-    now = lw.ControlProgress(10, 0.5, 1.0, 2.0, True, 0.01, 0.03, plans=6)
-    for real_time, words in ((False, "20 Hz 0.40x real time"), (True, "10 plans/s action 30 ms old")):
-        with PlanDisplay(Console(force_terminal=True, width=120), "", 20, 0.02, real_time=real_time) as display:
-            display(now)
-            display.refresh()
-        assert f"10/20 reward 1 eval 2 {words}" in re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", capsys.readouterr().out)

@@ -65,15 +65,6 @@ def flags(command: str) -> tuple[str, ...]:
     return tuple(name for names in found for name in names.split(", ") if name not in _OMIT)
 
 
-def _word(random: Random) -> str:
-    kind = random.randrange(3)
-    if kind == 0:
-        return str(random.choice(NUMBERS))
-    if kind == 1:
-        return random.choice(TEXTS).replace("\0", "\1")  # an argument cannot contain a null byte
-    return random.choice(_WORDS)
-
-
 MODELS = ("~x.xml", "\udcff.xml", "a\nb.xml", "[red].xml", "'\".xml")
 """Unusual names of model files in the working directory."""
 
@@ -90,29 +81,17 @@ def _line(command: str, first: str, flags: dict[str, tuple[str, ...]]) -> list[s
 
 
 def words(command: str, random: Random) -> list[str]:
-    given = dict(SMALL[command])
-    first = FIRST.get(command, "point_mass")
-    others = []
+    choices = (*map(str, NUMBERS), *(text for text in TEXTS if "\0" not in text), *_WORDS)
+    first, options = FIRST.get(command, "point_mass"), dict(SMALL[command])
     known = flags(command)
-    for _ in range(random.choice((1, 1, 2, 3))):
-        kind = random.randrange(12)
-        if kind == 0:
-            first = _word(random)
-        elif kind == 1:
-            others.append(_word(random))
-        elif kind == 2 and known:
-            flag = random.choice(known)
-            given[flag[:-1] if random.random() < 0.5 else flag.replace("-", "_", 3)] = (_word(random),)
-        elif known:
-            flag = random.choice(known)
-            given.pop(flag.replace("--no-", "--"), None)
-            given.pop(flag.replace("--", "--no-", 1), None)
-            short = flag.startswith("--no-") or f"--no-{flag[2:]}" in known
-            given[flag] = () if short else tuple(_word(random) for _ in range(random.choice((1, 1, 1, 1, 0, 2, 3))))
-    line = [*_line(command, first, given), *others]
-    if random.random() < 0.03:
-        line[0] = random.choice(("trian", "", "--version", "-h", "[red]", "--"))
-    return line
+    for _ in range(random.choice((1, 1, 2, 3)) if known else 0):
+        flag = random.choice(known)
+        options.pop(flag.replace("--no-", "--"), None)
+        options.pop(flag.replace("--", "--no-", 1), None)
+        short = flag.startswith("--no-") or f"--no-{flag[2:]}" in known
+        options[flag] = () if short else (random.choice(choices),)
+    extra = [random.choice(choices)] if random.random() < 0.1 else []
+    return [*_line(command, first if random.random() < 0.9 else random.choice(choices), options), *extra]
 
 
 def attack(case: str) -> None:

@@ -77,32 +77,6 @@ def test_control_loop_in_the_documentation_reproduces_steps_of_the_environment(
     assert moved > 0.3 and not env.done.any()
 
 
-def test_onnx_metadata_contain_the_names_of_joints_and_observations(page: dict[str, Any], tmp_path: Path) -> None:
-    env = lw.make("go1_velocity")
-    env.lasting["env_steps"].fill_(130e3)  # the second of three stages of the commands
-    policy, model = walking_policy(env), copy.copy(env.model)
-    robot = page["Policy"](str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)), model)
-    data, meta = mujoco.MjData(model), robot.meta
-    page["walk"](robot, model, data, np.zeros(3), 0.5)
-    assert data.time == pytest.approx(0.5)
-    joints = [f"{leg}_{joint}" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
-    assert meta["task"] == "go1_velocity" and meta["joints"] == meta["actuators"] == joints
-    assert (meta["timestep"], meta["substep"], meta["base"]) == (0.02, 0.005, "trunk")
-    assert [(part["name"], part["size"]) for part in meta["observations"]] == [
-        ("linear_velocity", 3), ("angular_velocity", 3), ("gravity", 3), ("joint_position", 12),
-        ("joint_velocity", 12), ("last_action", 12), ("command", 3),
-    ]  # fmt: skip
-    offsets, scales = (
-        [number for part in meta["observations"] for number in part[name]] for name in ("offset", "scale")
-    )
-    obs = torch.randn(5, 48)
-    normalized = (obs - torch.tensor(offsets)) * torch.tensor(scales)
-    torch.testing.assert_close(normalized.clamp(-10.0, 10.0), policy.normalizer(obs))
-    assert meta["stiffness"][:3] == pytest.approx([15.895, 15.895, 35.764], abs=1e-3)
-    assert meta["damping"][:3] == pytest.approx([1.0119, 1.0119, 2.2768], abs=1e-4)
-    assert meta["commands"]["forward_velocity"] == [-1.5, 2.0] and meta["force_limit"][2] == pytest.approx(35.55)
-
-
 def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     runtime = pytest.importorskip("onnxruntime")
     config = lw.NPGConfig(samples=512, hidden=(8,), value_hidden=(8,), mean_every=0)

@@ -8,7 +8,6 @@ from gymnasium.vector import AutoresetMode
 import lyceum_warp as lw
 from lyceum_warp import Row
 from lyceum_warp.adapters import GymnasiumEnv, GymnasiumVectorEnv
-from lyceum_warp.testing import CHECKS, check_task
 
 N = 16
 
@@ -101,12 +100,6 @@ def test_reset_clears_the_done_reason_of_the_previous_episode() -> None:
         assert info["done_reason"] == 0
         *_, terminated, truncated, _ = env.step(np.zeros(1, np.float32))
         assert terminated == bool(env.env.get_terminated(env.env.get_state())[0]) and not truncated
-
-
-def test_rule_gives_the_same_result_alone_and_after_other_rules() -> None:
-    rule = next(check for check in CHECKS if check.__name__ == "check_set_state_shows")
-    check_task(Leave, steps=20, nworld=8)
-    check_task(Leave, steps=20, nworld=8, checks=[rule])
 
 
 @ENGINES

@@ -1,9 +1,7 @@
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import tiny_task
 import torch
 import warp as wp
 from form_tasks import Drawn, Gifted, PuckParams, PuckWorld
@@ -67,15 +65,6 @@ def test_model_fields_can_be_set_in_an_environment_of_any_task(engine: str) -> N
     assert torch.equal(other.field("body_mass")[1], other.field("body_mass")[0])
     other.set_state(state)
     assert torch.equal(other.field("body_mass"), masses)
-
-
-def test_rejected_initial_state_does_not_change_lasting_memory() -> None:
-    env = lw.make(Full, nworld=8)
-    tip = env.field("site_xpos")[:, 0, 0]
-    for count in range(2, 12):
-        env.rand_reset()
-        assert (tip >= 0.2).all()
-        assert (env.obs_groups["critic"][:, 10] == count).all()
 
 
 def test_startup_draws_lasting_memory_once_per_world_and_seed() -> None:
@@ -167,31 +156,6 @@ def test_controls_of_a_task_are_clipped_to_their_ranges(engine: str) -> None:
     env = lw.make(Full, engine=engine)
     env.step(torch.tensor([[3.0, 0.0, 0.0]]))
     assert env.field("ctrl").item() == 1.0
-
-
-PASSIVE = "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
-
-
-def test_planner_pushes_a_model_without_actuators(tmp_path: Path) -> None:
-    (tmp_path / "ball.xml").write_text(PASSIVE)
-    source = tiny_task.changed(
-        ("    qpos: Row[float]", "    qpos: Row[float]\n    qfrc_applied: Row[float]"),
-        ('"hopper.xml"', '"ball.xml"'),
-        ('obs = {"x": 1}', 'obs = {"x": 1}\n    actions = {"push": 1}\n    action_range = (-2.0, 2.0)'),
-        ("class Tiny", """@wp.func
-def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
-    s.qfrc_applied[0] = 20.0 * action[0]
-
-@wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    return s1.qpos[0]
-
-class Tiny"""),
-    )  # fmt: skip
-    plan = lw.MPPI(tiny_task.write(tmp_path, source), samples=16, horizon=4, noise=1.0, temperature=1e-6)
-    for _ in range(3):
-        action = plan(plan.state_of())
-    assert action.shape == (1,) and action[0] > 0.0
 
 
 def test_invalid_dynamics_raise_an_error_and_change_nothing() -> None:

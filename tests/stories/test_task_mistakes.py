@@ -151,6 +151,16 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    s.qpos[0] = 0.0")],
         r"observe of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): observe may write obs",
     ),
+    "a function that writes a table": (
+        [("    dt: float", "    dt: float\n    table: wp.array[float] = [1.0]"),
+         function("def initialize(s: World, p: Params):\n    p.table[0] = 2.0")],
+        r"writes p\.table \(.*\): parameters are changed with env\.set_params",
+    ),
+    "a native function that may write": (
+        [("@wp.func", '@wp.func_native("row[0] = 1.0f;")\ndef poke(row: Row[float]): ...\n\n\n@wp.func'),
+         ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    poke(s.qpos)")],
+        r"observe of the task 'tiny' uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(.*\), and may write it there",
+    ),
     "a quotient of integers in a helper": (
         [("class Tiny", "@wp.func\ndef part(row: Row[float], n: int) -> float:\n    return float(n / row.shape[0])\n\n"
           f"@wp.func\n{REWARD} -> float:\n    return part(action, 1)\n\nclass Tiny")],

@@ -1,5 +1,4 @@
 import json
-import logging
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any

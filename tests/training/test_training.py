@@ -9,7 +9,7 @@ from training_runs import CONFIG, QUIET, algorithm, mean_action, metrics, refuse
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos import evaluation_seed
-from lyceum_warp.training import Run
+from lyceum_warp.training import Run, learning_curve
 
 
 @pytest.fixture
@@ -53,13 +53,6 @@ def test_resumed_run_keeps_the_limit_of_its_policy(env: lw.Env, tmp_path: Path) 
     run = lw.train(algorithm(env, policy=wide), tmp_path / "run", 1)
     assert cli.main(["train", "--resume", str(run.folder), "--iterations", "2", *QUIET]) == 0
     assert lw.load(run).shape["limit"] == 1e6
-
-
-def test_run_resumed_in_python_gives_identical_metrics(six: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "run"
-    lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 2)
-    run = lw.train(algorithm(lw.make("point_mass", nworld=2, seed=5)), lw.Run.open(folder), 6)
-    assert metrics(folder) == metrics(six) and len(run.rows()) == 6
 
 
 def test_resume_with_another_task_or_engine_raises_an_error(six: Path, env: lw.Env, tmp_path: Path) -> None:
@@ -133,19 +126,6 @@ def test_best_policy_has_the_highest_sampled_return_if_evaluations_are_off(tmp_p
     if iteration > 0:
         best, numbered = (mean_action(lw.load(tmp_path / "run", which=which)) for which in ("best", iteration))
         assert torch.equal(best, numbered)
-
-
-def test_run_is_complete_after_an_error_in_the_callback(six: Path, tmp_path: Path) -> None:
-    def callback(iteration: lw.Iteration) -> None:
-        if iteration.iteration == 3:
-            raise KeyError("mine")
-
-    folder = tmp_path / "run"
-    with pytest.raises(KeyError) as raised:
-        lw.train(algorithm(lw.make("point_mass", nworld=2)), folder, 6, callbacks=[callback], save_every=100)
-    assert raised.value.__notes__ == [f"the run in {folder} is saved up to iteration 3"]
-    lw.train(algorithm(lw.make("point_mass", nworld=2)), lw.Run.open(folder), 6)
-    assert metrics(folder) == metrics(six)
 
 
 def test_run_resumes_identically_from_the_last_complete_state(six: Path, tmp_path: Path) -> None:
@@ -228,12 +208,9 @@ def test_evaluation_and_training_with_equal_seeds_have_different_initial_states(
     assert not torch.isclose(env.obs, trained_on).all(1).any()
 
 
-def test_train_command_accepts_ppo(six: Path, tmp_path: Path) -> None:
-    """PPO starts with the networks of an NPG run."""
-    options = ["--num-steps", "16", "--minibatches", "2", "--epochs", "2", "--nworld", "4", "--iterations", "1", *QUIET]
-    out = tmp_path / "run"
-    assert cli.main(["train", "--from", str(six), "--algorithm", "ppo", *options, "--out", str(out)]) == 0
-    assert cli.main(["train", "--resume", str(out), "--iterations", "2", *QUIET]) == 0
-    config = Run.open(out).config
-    assert config["algorithm"] == "ppo" and config["ppo"]["hidden"] == [8] and "npg" not in config
-    assert config["ppo"]["gamma"] == lw.PPOConfig().gamma != CONFIG.gamma
+def test_learning_curve_without_iterations_raises_an_error(tmp_path: Path) -> None:
+    run = Run.create(tmp_path, {"task": "point_mass", "seed": 3})
+    run.append({"iteration": 1})
+    run.cut(0)
+    with pytest.raises(ValueError, match="has no complete iteration to plot: continue its training"):
+        learning_curve(run)

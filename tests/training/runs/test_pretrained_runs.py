@@ -10,7 +10,7 @@ from lyceum_warp import cli
 from lyceum_warp.algos import check_sizes
 from lyceum_warp.binding import task_names
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.training import Run, load, pretrained_run, pretrained_text
+from lyceum_warp.training import Run, load, pretrained_run
 from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 TASKS = pretrained_tasks()
@@ -57,14 +57,6 @@ def test_task_name_in_place_of_a_run_names_the_pretrained_run(tmp_path: Path, mo
         Run.open("hopper")
     with pytest.raises(FileNotFoundError, match="no run in runs/hopper, which does not exist"):
         Run.open("runs/hopper")
-
-
-def test_description_of_a_pretrained_policy_names_the_training_settings(tmp_path: Path) -> None:
-    evaluated = {"return": 123.45, "std": 6.78, "episodes": 32, "lyceum_warp": "0.2.0"}
-    config = {"algorithm": "ppo", "task": "hopper", "params": {"ctrl_cost_weight": 0.5}, "physics": {}, "options": {}}
-    assert pretrained_text(Run(tmp_path, config | {"evaluated": evaluated})) == (
-        "pretrained by ppo on hopper with ctrl_cost_weight 0.5: return 123.5 ± 6.8 in 32 episodes of lyceum_warp 0.2.0"
-    )
 
 
 def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> None:

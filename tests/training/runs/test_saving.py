@@ -4,7 +4,6 @@ import shutil
 from pathlib import Path
 
 import pytest
-from conftest import SharedEnv
 from training_runs import QUIET, algorithm, metrics, refused, six_iterations
 
 import lyceum_warp as lw
@@ -13,29 +12,9 @@ from lyceum_warp.training import Run
 from lyceum_warp.training.runs.saving import Saver
 
 
-@pytest.fixture
-def npg(shared_env: SharedEnv) -> lw.NPG:
-    return algorithm(shared_env("point_mass", nworld=2))
-
-
 @pytest.fixture(scope="module")
 def six(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return six_iterations(tmp_path_factory.mktemp("runs") / "six")
-
-
-@pytest.mark.parametrize("seconds, wait", [(0.02, 2.0), (1.0, 30.0), (9.0, 180.0)])
-def test_saving_takes_a_small_fraction_of_the_training_time(
-    seconds: float, wait: float, npg: lw.NPG, tmp_path: Path
-) -> None:
-    run = Run.create(tmp_path / "run", {})
-    saver = Saver(run, npg)
-    saver.save()
-    assert saver.saved == 0 and not saver.due()
-    saver._seconds = seconds
-    saver._when -= 0.9 * wait
-    assert not saver.due()
-    saver._when -= 0.2 * wait
-    assert saver.due()
 
 
 def test_run_ends_with_its_last_save_intact_if_a_file_cannot_be_written(six: Path, tmp_path: Path) -> None:

@@ -7,14 +7,14 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from training_runs import QUIET, TINY, metrics, refused
+from training_runs import QUIET, TINY, env_of, metrics, refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.binding import find_task
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.env import Env
-from lyceum_warp.training import Configuration, Run, run_env, task_copy
+from lyceum_warp.training import Run, task_copy
 
 TASK = Path(__file__).parents[2] / "data" / "runs_0_2" / "task_file" / "task"
 SOURCE, SCENE, PART = ((TASK / name).read_text() for name in ("slide.py", "robot/scene.xml", "robot/parts/block.xml"))
@@ -34,12 +34,6 @@ def trained(folder: Path) -> Path:
     arguments = ["train", str(folder / "mine" / "slide.py"), "--out", str(out), "--param", f"goal={table}", *TINY]
     assert cli.main([*arguments, *QUIET, "--iterations", "2"]) == 0
     return out
-
-
-def env_of(folder: Path) -> Env:
-    run = Run.open(folder)
-    saved = Configuration.of(run)
-    return run_env(run, saved.options, saved.params)
 
 
 def returns(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -105,32 +99,6 @@ def test_run_copies_all_files_of_a_model(kind: str, folder: Path) -> None:
     assert kept["model"] == {"attached": "robot/whole.xml", "urdf": "robot/arm.urdf", "python": "robot/model.xml"}[kind]
 
 
-def test_modules_that_a_task_imports_are_copied_with_it(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mine = folder / "mine"
-    source = SOURCE.replace("import warp as wp\n", "import warp as wp\nfrom slide_terms.goal import miss\n", 1)
-    source = source.replace("-wp.abs(s1.qpos[0] - p.goal[0])", "-miss(s1.qpos[0], p.goal[0])")
-    terms = "import warp as wp\n\n@wp.func\ndef miss(x: float, goal: float) -> float:\n    return wp.abs(x - goal)\n"
-    (mine / "slide_terms").mkdir()
-    (mine / "slide.py").write_text(source)
-    (mine / "slide_terms" / "goal.py").write_text(terms)
-    out = trained(folder)
-    before = returns(capsys, str(out))
-    assert capsys.readouterr().err == ""
-    (mine / "slide_terms" / "goal.py").write_text(terms.replace("wp.abs", "7.0 - wp.abs"))
-    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
-    refused(
-        capsys,
-        f"{mine / 'slide_terms' / 'goal.py'} has changed since the run began: the run's own copy is used",
-        f"give {mine / 'slide.py'} as the task to use the new version",
-    )
-    assert returns(capsys, str(out)) == before
-    assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
-    mine.rename(folder / "moved")
-    assert returns(capsys, str(out)) == before
-    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
-    assert not list(out.rglob("__pycache__"))
-
-
 @pytest.mark.parametrize("moved", [False, True])
 def test_run_started_from_another_run_uses_the_model_copy_of_that_run(
     moved: bool, folder: Path, capsys: pytest.CaptureFixture[str]
@@ -186,21 +154,6 @@ def test_resuming_in_python_reports_a_changed_task_and_model(folder: Path, caplo
     train(Run.open(out), 3)
     changed = "has changed since the run began: the new version is used"
     assert caplog.messages == [f"{file} {changed}", f"the model of the task 'slide' {changed}"]
-
-
-def test_run_uses_its_copy_of_a_changed_table(
-    folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
-) -> None:
-    out, table = trained(folder), folder / "mine" / "goal.npy"
-    before = returns(capsys, str(out))
-    np.save(table, np.array([9.0, 0.4]))
-    assert returns(capsys, str(out)) == before
-    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
-    copy = out / "task" / "tables" / "goal.npy"
-    text = f"{table} has changed since the run began: the run's own copy is used, {copy}"
-    assert caplog.messages == [text, text]
-    assert returns(capsys, str(out), "--param", f"goal={table}") != before
-    assert caplog.messages[2:] == [f"{table} has changed since the run began: the new version is used"]
 
 
 def test_relative_path_of_a_table_does_not_depend_on_the_working_directory(
@@ -319,23 +272,40 @@ def reading(folder: Path) -> Path:
     return folder
 
 
-def test_data_files_that_a_task_reads_are_copied_with_it(
+CHANGES: dict[str, tuple[str, str] | None] = {
+    "goal.npy": None,
+    "clips/scale.npy": None,
+    "offset.csv": ("5.0", "-9.0"),
+    "gravity.txt": ("-3.0", "-9.0"),
+    "slide_data.py": ("float(", "7.0 + float("),
+    "robot/parts/block.xml": ('type="mesh"', 'type="mesh" mass="9"'),
+}
+"""Changes of a parameter's table, of files that the task reads, of a module that it imports, and of its model. The
+value None multiplies an array by 3."""
+
+
+def test_run_uses_its_own_copies_of_changed_or_moved_files(
     reading: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     out, mine = trained(reading), reading / "mine"
     assert not caplog.messages and not (out / "task" / "unread.txt").exists()
     before = returns(capsys, str(out))
-    for name in ("clips/scale.npy", "offset.csv", "gravity.txt"):
+    for name, change in CHANGES.items():
         file = mine / name
         original = file.read_bytes()
-        np.save(file, 3.0) if file.suffix == ".npy" else file.write_text("-9.0")
+        np.save(file, 3.0 * np.load(file)) if change is None else file.write_text(original.decode().replace(*change))
         assert returns(capsys, str(out)) == before
-        assert caplog.messages[-1].startswith(f"{file} has changed since the run began: the run's own copy is used")
-        if name == "offset.csv":
-            assert returns(capsys, str(out), "--task", str(mine / "slide.py")) != before
+        subject = "the model of the task 'slide'" if file.suffix == ".xml" else str(file)
+        text = f"{subject} has changed since the run began: the run's own copy is used"
+        assert caplog.messages[-1].startswith(text)
+        if name not in ("gravity.txt", "robot/parts/block.xml"):  # these hardly affect the returns
+            option = ["--param", f"goal={file}"] if name == "goal.npy" else ["--task", str(mine / "slide.py")]
+            assert returns(capsys, str(out), *option) != before
         file.write_bytes(original)
     mine.rename(reading / "moved")
     assert returns(capsys, str(out)) == before
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3", *QUIET]) == 0
+    assert not list(out.rglob("__pycache__"))
 
 
 def test_changed_data_is_read_again(reading: Path) -> None:

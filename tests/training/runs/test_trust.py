@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 import tiny_task
-from training_runs import QUIET, TINY, refused, train
+from training_runs import QUIET, TINY, env_of, refused, train
 
 import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
-from lyceum_warp.training import Configuration, Run, run_env
+from lyceum_warp.training import Run
 
 SOURCE = tiny_task.changed(
     ("@wp.struct", 'if "WITNESS" in os.environ:\n    Path(os.environ["WITNESS"]).touch()\n\n@wp.struct'),
@@ -47,12 +47,6 @@ def theirs(made: Path, witness: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 def change(folder: Path, **entries: Any) -> None:
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | entries))
-
-
-def env_of(folder: Path) -> lw.Env:
-    run = Run.open(folder)
-    configuration = Configuration.of(run)
-    return run_env(run, configuration.options, configuration.params)
 
 
 @pytest.mark.parametrize("name", ["eval", "view", "resume", "from"])
