@@ -12,8 +12,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp.core.fields import describe
-from lyceum_warp.engines.deterministic import order_kernels as order
-from lyceum_warp.engines.deterministic.contact_order import CanonicalOrder
+from lyceum_warp.engines.deterministic.contact_order import _ROWS, _SPARSE_ROWS, CanonicalOrder
 from lyceum_warp.engines.deterministic.deterministic_engine import DeterministicEngine
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
 

@@ -6,7 +6,7 @@ from conftest import SharedEnv
 from memory_window import pushing
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.commands import command, perturb, reset, seek, set_mode, set_number, set_world
+from lyceum_warp.viewer.commands import command, perturb, reset, set_mode, set_number, set_world
 from lyceum_warp.viewer.session.clock import Session
 
 FORCES = np.zeros((5, 6))
