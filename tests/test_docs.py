@@ -132,10 +132,10 @@ class Walkthrough:
 
 @pytest.fixture(autouse=True)
 def short_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    def opened(*words: object, **options: object) -> MemoryWindow:
+    def window(*words: object, **options: object) -> MemoryWindow:
         return MemoryWindow(lambda frame, number: [] if number < 1 else None)
 
-    monkeypatch.setattr(views, "opened", opened)
+    monkeypatch.setattr(views, "Window", window)
 
 
 @pytest.fixture(autouse=True)

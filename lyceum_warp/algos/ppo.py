@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
-from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.distributed import Team, unflatten
 from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, Activation
@@ -251,7 +251,7 @@ class PPO(OnPolicyLearner):
         self._cuda = device.type == "cuda"
         self.optimizer = Adam(self._parameters, self.rate, numbers=4)
         self._sums = self.optimizer.sums
-        for parameter, part in zip(self._parameters, self.optimizer.shaped(self.optimizer.gradient), strict=True):
+        for parameter, part in zip(self._parameters, unflatten(self.optimizer.gradient, self._parameters), strict=True):
             parameter.grad = part  # for clip_grad_norm_
         self._losses = torch.zeros(3, device=device)
         self._entropy_coef = torch.zeros((), device=device)

@@ -19,7 +19,8 @@ import numpy as np
 import torch
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from lyceum_warp.algos.common.distributed import Captured, GradientStep, Team
+from lyceum_warp.algos.common.adam import GradientStep
+from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
@@ -532,7 +533,6 @@ class SAC(Learner):
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
         self._warms_up = state.get("warms_up", self._warms_up)  # missing in runs of release 0.2.0
-        self._learn.forget()  # the graph contains the addresses of Adam's old moments
 
 
 def action_bounds(env: Env, limit: float) -> tuple[list[float], list[float]]:

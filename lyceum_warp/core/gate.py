@@ -81,7 +81,8 @@ class Verdict:
     @property
     def passed(self) -> bool:
         """Whether every number with a limit was measured and keeps the limit."""
-        return all(limit.allows(self.numbers.get(name, math.nan)) for name, limit in self.limits.items())
+        limits = {name: limit for name, limit in self.limits.items() if limit.range}
+        return all(limit.allows(self.numbers.get(name, math.nan)) for name, limit in limits.items())
 
     @property
     def line(self) -> str:

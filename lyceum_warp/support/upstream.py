@@ -1,4 +1,4 @@
-"""Access and patch internals of Warp and MuJoCo Warp.
+"""Access and patch internals of Warp, MuJoCo Warp and torch.
 
 No other module uses such internals.
 """
@@ -24,6 +24,13 @@ def builtin_functions() -> Mapping[str, Any]:
     """
     functions: Mapping[str, Any] = wp._src.context.builtin_functions
     return functions
+
+
+def fused_adam(*tensors: Any, **options: Any) -> None:
+    """Make a step of Adam by torch's fused kernel, as ``torch.optim.Adam`` calls it."""
+    import torch
+
+    torch._fused_adam_(*tensors, **options)
 
 
 class _StructDoc:

@@ -121,8 +121,8 @@ def test_sac_update_equals_plain_torch_in_float64(changes: dict[str, Any], env: 
         loss = sum(quantile_huber(values, target) for values in predicted)
     step = torch.optim.Adam([p for critic in critics for p in critic.parameters()], lr=config.learning_rate)
     for k, critic in enumerate(critics):
-        for own, p in zip(critic.parameters(), sac.value.network.parameters(), strict=True):
-            saved = sac.critic_step.optimizer.state[p]
+        for i, own in enumerate(critic.parameters()):
+            saved = sac.critic_step.optimizer.state_dict()["state"][i]
             step.state[own] = {"step": saved["step"].clone()} | {
                 name: saved[name][k].double().clone() for name in ("exp_avg", "exp_avg_sq")
             }

@@ -53,7 +53,7 @@ def test_failed_video_prints_one_line_and_training_succeeds(
 
     monkeypatch.setattr(policy_videos, "write_video", fail)
     out = tmp_path / "run"
-    options = [*TINY, "--horizon", "6", "--no-plot", "--iterations", "1", "--video-every", "1"]
+    options = [*TINY, "--horizon", "6", "--no-plot", "--iterations", "1", "--video", "--video-every", "1"]
     assert cli.main(["train", "point_mass", "--out", str(out), *options]) == 0
     shown = capsys.readouterr()
     assert "video:      none: [Errno 28] No space left on device" in shown.out.splitlines()
@@ -117,7 +117,8 @@ def test_resumed_run_uses_its_saved_physics_and_environment_options(
     resume = ["train", "--resume", str(out), *QUIET, "--iterations"]
     assert cli.main([*resume, "2", "--solver", "iterations=7", "--integrator", "euler"]) == 0
     assert cli.main(["eval", str(out), "--episodes", "2", "--video"]) == 0
-    assert {physics(env) for env in made_envs} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
+    learning = [env for env in made_envs if env.nworld != 32]  # the verdict is in exact physics
+    assert {physics(env) for env in learning} == {(mujoco.mjtIntegrator.mjINT_EULER, 7, 9, True)}
     assert {env.nworld for env in made_envs} == {1, 2, 32}
     assert {(env.horizon, env.options.nthread) for env in made_envs} == {(32, 2)}
     made_envs.clear()

@@ -5,8 +5,11 @@ from typing import Any
 
 import torch
 
-_BETAS = 0.9, 0.999
-_EPS = 1e-8
+from lyceum_warp.algos.common.distributed import Team, flatten, unflatten
+from lyceum_warp.support.upstream import fused_adam
+
+BETAS = 0.9, 0.999
+EPS = 1e-8
 
 
 class Adam:
@@ -31,25 +34,20 @@ class Adam:
         """The moments."""
         self.count = torch.zeros((), device=self.gradient.device)
         """The number of steps."""
-        self._parts = [self.shaped(flat) for flat in (self.gradient, self.first, self.second)]
-
-    def shaped(self, flat: torch.Tensor) -> list[torch.Tensor]:
-        """Split a flat tensor into views with the shapes of the parameters."""
-        sizes = [parameter.numel() for parameter in self.parameters]
-        return [part.view_as(p) for part, p in zip(flat.split(sizes), self.parameters, strict=True)]
+        self._parts = [unflatten(vector, self.parameters) for vector in (self.gradient, self.first, self.second)]
 
     @torch.no_grad()
     def step(self) -> None:
         """Make a step with the gradient."""
         self.count += 1
-        torch._fused_adam_(  # type: ignore[call-overload]
-            self.parameters, *self._parts, [], [self.count] * len(self.parameters), lr=self.rate, beta1=_BETAS[0],
-            beta2=_BETAS[1], weight_decay=0.0, eps=_EPS, amsgrad=False, maximize=False,
+        fused_adam(
+            self.parameters, *self._parts, [], [self.count] * len(self.parameters), lr=self.rate, beta1=BETAS[0],
+            beta2=BETAS[1], weight_decay=0.0, eps=EPS, amsgrad=False, maximize=False,
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state in the format of torch.optim.Adam. The tensors are views."""
-        moments = zip(self.shaped(self.first), self.shaped(self.second), strict=True)
+        moments = zip(self._parts[1], self._parts[2], strict=True)
         state = {i: {"step": self.count, "exp_avg": m, "exp_avg_sq": v} for i, (m, v) in enumerate(moments)}
         return {"state": state, "param_groups": [{"lr": self.rate, "params": list(state)}]}
 
@@ -57,9 +55,27 @@ class Adam:
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Restore the moments, the number of steps, and the learning rate if it is a tensor."""
         state = saved["state"]
-        for name, flat in (("exp_avg", self.first), ("exp_avg_sq", self.second)):
-            for i, part in enumerate(self.shaped(flat)):
+        for name, parts in zip(("exp_avg", "exp_avg_sq"), self._parts[1:], strict=True):
+            for i, part in enumerate(parts):
                 part.copy_(state[i][name]) if state else part.zero_()
         self.count.fill_(float(state[0]["step"]) if state else 0.0)
         if isinstance(self.rate, torch.Tensor):
             self.rate.copy_(saved["param_groups"][0]["lr"])
+
+
+class GradientStep:
+    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes."""
+
+    def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
+        self.parameters, self.team = [p for p in parameters if p.requires_grad], team
+        self.optimizer = Adam(self.parameters, rate)
+
+    def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
+        """Make a gradient step, and return the loss and ``numbers``, each summed over all processes."""
+        # backward() accumulates on the CUDA stream of its first call
+        gradients = torch.autograd.grad(loss, self.parameters)
+        details = torch.stack([number.detach().float() for number in (loss, *numbers)])
+        sums = self.team.sum(flatten(part.float() for part in (*gradients, details)))
+        self.optimizer.gradient.copy_(sums[: -len(details)])
+        self.optimizer.step()
+        return sums[-len(details) :]

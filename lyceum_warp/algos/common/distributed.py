@@ -143,27 +143,6 @@ def unflatten(vector: torch.Tensor, tensors: Sequence[torch.Tensor]) -> list[tor
     return [part.view_as(tensor) for part, tensor in zip(parts, tensors, strict=True)]
 
 
-class GradientStep:
-    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes."""
-
-    def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
-        self.parameters, self.team = [p for p in parameters if p.requires_grad], team
-        cuda = self.parameters[0].is_cuda
-        self.optimizer = torch.optim.Adam(self.parameters, lr=rate, fused=True, capturable=cuda)
-
-    def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
-        """Make a gradient step, and return the loss and ``numbers``, each summed over all processes."""
-        # backward() accumulates on the CUDA stream of its first call
-        gradients = torch.autograd.grad(loss, self.parameters)
-        details = torch.stack([number.detach().float() for number in (loss, *numbers)])
-        sums = self.team.sum(flatten(part.float() for part in (*gradients, details)))
-        *gradient_sums, details = unflatten(sums, [*self.parameters, details])
-        for parameter, part in zip(self.parameters, gradient_sums, strict=True):
-            parameter.grad = part
-        self.optimizer.step()
-        return details
-
-
 class Captured:
     """Calls a function that runs torch operations and communicates with other processes.
 
@@ -215,9 +194,6 @@ def join(device: str = "cpu") -> Iterator[Team]:
     if size == 1 or "MASTER_ADDR" not in os.environ:
         yield Team(device=device)
         return
-    # The first optimizer imports torch's compiler, which keeps an existing process group alive until Python exits. The
-    # group's threads then sometimes abort the process, so import the compiler before making the group.
-    torch.optim.SGD([torch.zeros(1)])
     place, neighbours = int(os.environ.get("LOCAL_RANK", "0")), int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if device.startswith("cuda"):
         if neighbours > torch.cuda.device_count():

@@ -33,7 +33,7 @@ def gate(
         seed: Seed of the worlds.
         curriculum: How far curricula have come, such as ``lw.load_curriculum(run)``; by default as far as in ``env``.
         nthread: Threads of the C engine; by default all cores.
-        quick: Whether to leave out all parts of the gate after one that fails.
+        quick: Whether to leave out all parts of the gate after one that fails, and those that have no limits.
 
     Raises:
         ValueError: The task has no gate, or the policy does not fit the task.
@@ -52,8 +52,10 @@ def gate(
 
     local = moved(policy, worlds(1)) if isinstance(policy, torch.nn.Module) else policy
     numbers: dict[str, float] = {}
+    limits = {name: limit for name, limit in test.limits.items() if limit.range}
     for part in test.measure(worlds, acting(local)):
         numbers |= part
-        if quick and any(name in test.limits and not test.limits[name].allows(x) for name, x in part.items()):
+        fails = any(name in limits and not limits[name].allows(number) for name, number in part.items())
+        if quick and (fails or limits.keys() <= numbers.keys()):
             break
     return Verdict(task=env.task.name, seed=seed, memory=curriculum.text, numbers=numbers, limits=test.limits)

@@ -6,8 +6,9 @@ from typing import Any
 
 import torch
 
+from lyceum_warp.algos.common.adam import BETAS, EPS, GradientStep
 from lyceum_warp.algos.common.dense import DensePasses
-from lyceum_warp.algos.common.distributed import Captured, GradientStep, Team, flatten, unflatten
+from lyceum_warp.algos.common.distributed import Captured, Team, flatten, unflatten
 from lyceum_warp.algos.common.timing import one_thread
 from lyceum_warp.algos.common.value import BOUND, ValueFunction
 
@@ -25,13 +26,13 @@ class ValueFit:
     ) -> None:
         self.value, self.team = value, team
         self.samples, self.nworld = samples, nworld
-        self.epochs, self.batch = epochs, batch
+        self.rate, self.epochs, self.batch = rate, epochs, batch
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.step = GradientStep(self.parameters, rate, team)
         self.optimizer = self.step.optimizer
         self.captured: CapturedStep | None = None
-        self._good = flatten(self.parameters).detach()
+        self._good = flatten(self._numbers()).detach()
 
     def __call__(
         self, obs: torch.Tensor, step: torch.Tensor, target: torch.Tensor, generator: torch.Generator
@@ -65,17 +66,14 @@ class ValueFit:
         return finite
 
     def _numbers(self) -> list[torch.Tensor]:
-        moments = [moment for p in self.parameters for moment in self.optimizer.state.get(p, {}).values()]
-        return [*self.parameters, *moments]
+        return [*self.parameters, self.optimizer.first, self.optimizer.second]
 
     @torch.no_grad()
     def _keep_if_finite(self) -> torch.Tensor:
         """Back up the parameters and moments if all are finite, without waiting for the device."""
         present = flatten(self._numbers())
-        # Adam's initial moments are zero
-        good = torch.nn.functional.pad(self._good, (0, len(present) - len(self._good)))
         finite = self.team.sum((~present.isfinite()).any().float()) == 0
-        self._good = torch.where(finite, present, good)
+        self._good = torch.where(finite, present, self._good)
         return finite
 
     @torch.no_grad()
@@ -102,30 +100,22 @@ class ValueFit:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the optimizer's state on this device."""
         self.optimizer.load_state_dict(state)
-        for group in self.optimizer.param_groups:
-            group["capturable"] = self.cuda
-        self.captured = None  # the graph contains the addresses of Adam's old moments
 
 
 class DenseSteps:
-    """Makes the mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's Adam.
+    """Makes the mini-batch steps of a ``ValueFit`` on the CPU, without autograd or torch's kernel for Adam.
 
-    The steps change flat copies of the parameters and moments. ``store`` writes them back.
+    The steps change the optimizer's moments and a flat copy of the parameters. ``store`` writes the parameters back.
     """
 
     def __init__(self, fit: ValueFit, passes: DensePasses) -> None:
         self.fit, self.team = fit, fit.team
-        self.count = int((fit.optimizer.state.get(fit.parameters[0]) or {}).get("step", 0))
+        self.count = int(fit.optimizer.count)
         self.parameters = flatten(passes.parameters)
-        self.first, self.second = self._moments("exp_avg"), self._moments("exp_avg_sq")
+        self.first, self.second = fit.optimizer.first, fit.optimizer.second
         self.gradient, self.root = torch.empty_like(self.parameters), torch.empty_like(self.parameters)
         self.passes = DensePasses(self._shaped(self.parameters), passes.activation)
         self.gradients = self._shaped(self.gradient)
-
-    def _moments(self, name: str) -> torch.Tensor:
-        state = self.fit.optimizer.state
-        moments = [(state.get(p) or {}).get(name, torch.zeros_like(p)) for p in self.fit.parameters]
-        return flatten(moments).detach()
 
     def _shaped(self, vector: torch.Tensor) -> list[torch.Tensor]:
         return unflatten(vector, self.fit.parameters)
@@ -135,26 +125,22 @@ class DenseSteps:
         error = self.passes(features).sub_(target)
         self.passes.pull(error.mul_(2.0 * weight), self.gradients)
         self.team.sum(self.gradient)
-        group = self.fit.optimizer.param_groups[0]
-        decay, slow = group["betas"]
+        decay, slow = BETAS
         self.count += 1
         self.first.lerp_(self.gradient, 1.0 - decay)
         self.second.mul_(slow).addcmul_(self.gradient, self.gradient, value=1.0 - slow)
         # include the bias corrections of both moments in the step's factor
         unbias = math.sqrt(1.0 - slow**self.count)
-        torch.sqrt(self.second, out=self.root).add_(group["eps"] * unbias)
-        factor = group["lr"] * unbias / (1.0 - decay**self.count)
+        torch.sqrt(self.second, out=self.root).add_(EPS * unbias)
+        factor = self.fit.rate * unbias / (1.0 - decay**self.count)
         self.parameters.addcdiv_(self.first, self.root, value=-factor)
 
     @torch.no_grad()
     def store(self) -> None:
-        """Write parameters and moments back into the value function and the optimizer."""
-        shaped = zip(*map(self._shaped, (self.parameters, self.first, self.second)), strict=True)
-        for parameter, (new, first, second) in zip(self.fit.parameters, shaped, strict=True):
-            parameter.copy_(new)
-            self.fit.optimizer.state[parameter] = {
-                "step": torch.tensor(float(self.count)), "exp_avg": first, "exp_avg_sq": second,
-            }  # fmt: skip
+        """Write the parameters and the number of steps back."""
+        for parameter, part in zip(self.fit.parameters, self._shaped(self.parameters), strict=True):
+            parameter.copy_(part)
+        self.fit.optimizer.count.fill_(self.count)
 
 
 class CapturedStep:
