@@ -53,14 +53,17 @@ class Adam:
 
     @torch.no_grad()
     def load_state_dict(self, saved: dict[str, Any]) -> None:
-        """Restore the moments, the number of steps, and the learning rate if it is a tensor."""
+        """Restore the moments, the number of steps and the learning rate."""
         state = saved["state"]
         for name, parts in zip(("exp_avg", "exp_avg_sq"), self._parts[1:], strict=True):
             for i, part in enumerate(parts):
                 part.copy_(state[i][name]) if state else part.zero_()
         self.count.fill_(float(state[0]["step"]) if state else 0.0)
+        rate = saved["param_groups"][0]["lr"]
         if isinstance(self.rate, torch.Tensor):
-            self.rate.copy_(saved["param_groups"][0]["lr"])
+            self.rate.copy_(rate)
+        else:
+            self.rate = float(rate)
 
 
 class GradientStep:

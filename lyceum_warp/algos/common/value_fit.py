@@ -26,7 +26,7 @@ class ValueFit:
     ) -> None:
         self.value, self.team = value, team
         self.samples, self.nworld = samples, nworld
-        self.rate, self.epochs, self.batch = rate, epochs, batch
+        self.epochs, self.batch = epochs, batch
         self.parameters = list(value.parameters())
         self.cuda = self.parameters[0].is_cuda
         self.step = GradientStep(self.parameters, rate, team)
@@ -132,7 +132,7 @@ class DenseSteps:
         # include the bias corrections of both moments in the step's factor
         unbias = math.sqrt(1.0 - slow**self.count)
         torch.sqrt(self.second, out=self.root).add_(EPS * unbias)
-        factor = self.fit.rate * unbias / (1.0 - decay**self.count)
+        factor = float(self.fit.optimizer.rate) * unbias / (1.0 - decay**self.count)
         self.parameters.addcdiv_(self.first, self.root, value=-factor)
 
     @torch.no_grad()
