@@ -15,7 +15,7 @@ def test_velocity_error_of_a_standing_robot_equals_its_command(shared_env: Share
     play.step(lambda obs: torch.zeros(2, 12), 50)
     velocity_error, yaw_rate_error, fell, _, _ = play.results()
     torch.testing.assert_close(velocity_error[30:].mean(0), torch.tensor([1.0, 0.0]), atol=0.1, rtol=0.0)
-    torch.testing.assert_close(yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.05, rtol=0.0)
+    torch.testing.assert_close(yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.1, rtol=0.0)
     assert not fell.any()
 
 
