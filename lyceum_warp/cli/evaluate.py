@@ -9,6 +9,7 @@ import torch
 import tyro
 
 from lyceum_warp.algos import (
+    EXACT,
     Episodes,
     Policy,
     Transfer,
@@ -40,6 +41,7 @@ from lyceum_warp.training import (
     note_changes,
     pretrained_run,
     pretrained_text,
+    read_checkpoint,
     run_env,
 )
 from lyceum_warp.viz import check_video, find_camera, parsed_camera, policy_video
@@ -245,10 +247,14 @@ def run_worlds(
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
-    A different task has its own defaults. With the engine auto and no device, the worlds run on the CPU.
+    The physics is that of the run's last iteration. A different task has its own defaults. With the engine auto and no
+    device, the worlds run on the CPU.
     """
     saved = Configuration.of(run)
     defaults = saved.options.changed({"seed": 0})
+    if (number := run.config.get("exact_from")) is not None:
+        done = read_checkpoint(run.policy_file(), parts=("iteration",))["iteration"]
+        defaults = defaults.changed({"physics": EXACT} if done > number else {})
     if task is None or task_name(find_task(task)) == run.task_name:
         params = {**saved.params, **params}
     else:

@@ -60,3 +60,8 @@ def test_command_follows_the_task_and_names_the_physics(tmp_path: Path, capsys: 
     assert config["exact_from"] == 2 and config["physics"] == {"cone": "elliptic", "integrator": "discrete"}
     assert cli.main(["train", TASK, "--out", str(tmp_path / "exact"), "--physics", "exact", *words]) == 0
     assert "coarse physics" not in capsys.readouterr().out
+    assert cli.main(["train", TASK, "--out", str(tmp_path / "short"), *words, "--iterations", "1"]) == 0
+    for name, physics in (("run", "exact"), ("short", "coarse")):
+        capsys.readouterr()
+        assert cli.main(["eval", str(tmp_path / name), "--episodes", "1"]) == 0
+        assert f"on the C engine, {physics} physics" in capsys.readouterr().out

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import described, first_sentence, memoryless_action
@@ -89,7 +90,8 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     ================  ===================================================================================
     ``task``          name of the task
     ``timestep``      seconds between two actions
-    ``substep``       seconds between two steps of the physics
+    ``substep``       seconds between two steps of the exact physics
+    ``physics``       the physics of ``env``, in which the policy has learned
     ``observations``  the parts of an observation in order: name, size, and the normaliser's offset and
                       scale of each column; the file applies them: (obs - offset) * scale
     ``actions``       the parts of an action in order: name and size
@@ -98,7 +100,8 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
 
     A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
     """
-    task, model = env.task, env.task.model
+    exact = env if task_physics(env)[1] == EXACT else env.replicate_few(1, physics=EXACT)
+    task, model = env.task, exact.task.model
     memory = {name: values.numpy(force=True) for name, values in {**env.shared, **env.lasting}.items()}
     parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
     normalizer: Any = getattr(policy, "normalizer", None)
@@ -109,6 +112,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         "task": task.name,
         "timestep": env.timestep,
         "substep": model.opt.timestep,
+        "physics": simulation(env).partition(", ")[2],
         "observations": parts,
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
         "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
