@@ -36,7 +36,7 @@ class PassGate(Callback):
         every: Iterations between policies to test. While a test lasts, the next ones are left out.
 
     Raises:
-        ValueError: ``every`` is not a positive number, or the task has no gate.
+        ValueError: ``every`` is not a positive number, the task has no gate, or its code is not a file of its own.
     """
 
     def __init__(self, every: int = 20) -> None:
@@ -48,6 +48,11 @@ class PassGate(Callback):
         """Start the subprocess, which gets ready while the first iterations run."""
         if learner.env.task.definition.gate is None:
             raise ValueError(f"the task {learner.env.task.name!r} has no gate: set its attribute gate to a lw.Gate")
+        if run.config["task"] is None or run.manifest.get("program"):
+            raise ValueError(
+                "lw.PassGate tests policies in another process, which can't execute a notebook or the training script: "
+                f"define the task {learner.env.task.name!r} in a file of its own"
+            )
         self._run, self._learner, self._last = run, learner, iterations
         self._file = run.folder / "gate.jsonl"
         self._tries = len(self._file.read_text().splitlines()) if self._file.exists() else 0

@@ -49,3 +49,12 @@ def test_task_without_a_gate_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
     assert cli.main(["train", "hopper", "--out", str(tmp_path / "run"), "--gate-every", "5", *QUIET]) == 2
     refused(capsys, "'hopper'", "no gate")
     assert not (tmp_path / "run").exists()
+
+
+def test_task_of_a_notebook_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gated = lw.make(f"{TASKS}:Easy", nworld=2)
+    monkeypatch.setattr("lyceum_warp.training.runs.configuration.spelled_task", lambda task: None)
+    npg = lw.NPG(gated, config=lw.NPGConfig(samples=12, hidden=(4,), value_hidden=(4,)))
+    with pytest.raises(ValueError, match="'easy' in a file of its own"):
+        lw.train(npg, tmp_path / "run", 4, callbacks=[lw.PassGate(4)])
+    assert not (tmp_path / "run").exists()
