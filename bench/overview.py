@@ -1,19 +1,16 @@
-"""List the experiments with their durations on two cores."""
+"""List the experiments, by the first lines of their docstrings."""
 
-import experiment
-from rich.console import Console
-from rich.table import Table
+import ast
+from pathlib import Path
 
 
 def main() -> None:
-    table = Table("experiment", "what it measures", "--short", "whole", box=None, pad_edge=False)
-    for name in experiment.NAMES:
-        definition = experiment.load(name)
-        times = (
-            sum(map(definition.estimate, definition.cases(definition.options(short=short)))) for short in (True, False)
-        )
-        table.add_row(name, definition.summary, *map(experiment.duration, times))
-    Console(width=120).print(table)
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        module = ast.parse(path.read_text())
+        names = [target.id for each in module.body if isinstance(each, ast.Assign) for target in each.targets
+                 if isinstance(target, ast.Name)]  # fmt: skip
+        if "EXPERIMENT" in names:
+            print(f"{path.stem:<13} {(ast.get_docstring(module) or '').splitlines()[0]}")
     print("\nlyceum-warp bench NAME --help     # list the options of an experiment or of another program in bench/")
     print("lyceum-warp bench compare OLD     # compare this working tree with a revision, bit for bit")
     print("lyceum-warp bench plot [NAME]     # draw figures of stored results: bench/results/NAME-MACHINE.png")
