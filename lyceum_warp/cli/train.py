@@ -194,6 +194,39 @@ class Train:
     hyperparameters: Annotated[Hyperparameters, tyro.conf.arg(name="hyperparameter")] = Hyperparameters()
 
     def run(self) -> int:
+        self._check_flags()
+        folder = self.resume or self.from_run
+        source = None if folder is None else Run.open(folder)
+        settings = self._settings({} if source is None else source.config)
+        camera = parsed_camera(self.camera)
+        if camera is not None and not (self.video or settings["video_every"]):
+            raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
+        with join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
+            if not team.leads:  # only one process prints messages
+                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
+            with team.together():  # check all options before the folder is created
+                configuration = self.configuration(source, team)
+                learner, folder, entries = self._learner(configuration, source, team)
+                find_camera(learner.env.model, camera)
+                callbacks = self._callbacks(settings)
+            total = configuration.iterations
+            hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+            try:
+                run = train(
+                    learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
+                    **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
+                    take_over=self.take_over, entries=settings | entries,
+                )  # fmt: skip
+            except Interrupted as signalled:
+                if team.leads and (folder / "policy.pt").exists():
+                    self._say_interrupted(folder, signalled, total, hint)
+                return 128 + signalled.number
+            if not team.leads:
+                return 0
+            self._say_end(run, learner.iteration, total, hint)
+            return self._report(run, learner)
+
+    def _check_flags(self) -> None:
         if self.resume is not None:
             for name, flag in _RUN_FLAGS.items():
                 if getattr(self, name) is not None:
@@ -202,58 +235,37 @@ class Train:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         if self.take_over and self.resume is None:
             raise ValueError("--take-over has no effect without --resume: omit it")
-        folder = self.resume or self.from_run
-        source = None if folder is None else Run.open(folder)
-        saved = {} if source is None else source.config
+
+    def _settings(self, saved: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of ``_SETTINGS``: the flags, those of the source run, or the task's suggestions."""
         settings: dict[str, Any] = {}
         for name, default in _SETTINGS.items():
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
-        if source is None and self.exact_from is None:
+        if not saved and self.exact_from is None:
             settings["exact_from"] = self._training().exact_from
         if self.resume is None:
             settings["target_return"] = self.target_return
-        camera = parsed_camera(self.camera)
-        if camera is not None and not (self.video or settings["video_every"]):
-            raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
-        with join(self.env.device or saved.get("device", "cpu")) as team:
-            if not team.leads:  # only one process prints messages
-                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
-            with team.together():  # check all options before the folder is created
-                configuration = self.configuration(source, team)
-                learner, folder, entries = self._learner(configuration, source, team)
-                find_camera(learner.env.model, camera)
-                callbacks = self._callbacks(settings)
-            leads, total = team.leads, configuration.iterations
-            hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-            try:
-                run = train(
-                    learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
-                    keep_every=settings["keep_every"], save_every=settings["save_every"],
-                    exact_from=settings["exact_from"], take_over=self.take_over,
-                    entries=settings | entries,
-                )  # fmt: skip
-            except Interrupted as signalled:
-                if leads and (path := folder / "policy.pt").exists():
-                    done = read_checkpoint(path, parts=("iteration",))["iteration"]
-                    name = signal.Signals(signalled.number).name
-                    rest = f"; {hint}" if done < total else ""
-                    say(f"interrupted by {name} after {done} of {total} iterations{rest}")
-                    if self.plot and (folder / "metrics.csv").exists():
-                        with obeyed():
-                            say(f"curve:      {tried(learning_curve, folder)}")
-                return 128 + signalled.number
-            if not leads:
-                return 0
-            reached, passed = run.config.get("reached", {}), run.config.get("passed")
-            if passed is not None:
-                say(f"the policy of iteration {passed['iteration']} passes the gate (tries: {passed['tries']}): "
-                    f"lyceum-warp gate {folder} --which {passed['iteration']}")  # fmt: skip
-            if reached.get("iteration") == learner.iteration < total:
-                say(f"the target return is reached: {reached['return']:.6g} in iteration {learner.iteration}")
-            elif learner.iteration < total and self.minutes is not None:
-                limit = f"the limit is {self.minutes:g} minutes"
-                say(f"stopped after {learner.iteration} of {total} iterations: {limit}; {hint}")
-            return self._report(run, learner)
+        return settings
+
+    def _say_interrupted(self, folder: Path, signalled: Interrupted, total: int, hint: str) -> None:
+        done = read_checkpoint(folder / "policy.pt", parts=("iteration",))["iteration"]
+        name = signal.Signals(signalled.number).name
+        say(f"interrupted by {name} after {done} of {total} iterations{f'; {hint}' if done < total else ''}")
+        if self.plot and (folder / "metrics.csv").exists():
+            with obeyed():
+                say(f"curve:      {tried(learning_curve, folder)}")
+
+    def _say_end(self, run: Run, iteration: int, total: int, hint: str) -> None:
+        """Say why the run has ended before its last iteration."""
+        reached, passed = run.config.get("reached", {}), run.config.get("passed")
+        if passed is not None:
+            number = passed["iteration"]
+            say(f"the policy of iteration {number} passes the gate (tries: {passed['tries']}): lyceum-warp gate "
+                f"{run.folder} --which {number}")  # fmt: skip
+        if reached.get("iteration") == iteration < total:
+            say(f"the target return is reached: {reached['return']:.6g} in iteration {iteration}")
+        elif iteration < total and self.minutes is not None:
+            say(f"stopped after {iteration} of {total} iterations: the limit is {self.minutes:g} minutes; {hint}")
 
     def _callbacks(self, settings: Mapping[str, Any]) -> list[Callback]:
         display = Display(console)
