@@ -1,4 +1,7 @@
-from lyceum_warp.models.actuators import follow_velocity as follow_velocity
+from lyceum_warp.models.actuators import (
+    follow_velocity as follow_velocity,
+    unstable_servos as unstable_servos,
+)
 from lyceum_warp.models.legs import Legs as Legs
 from lyceum_warp.models.terrain import (
     Terrain as Terrain,

@@ -1,5 +1,7 @@
 """Change the actuators of a model in a task's ``edit_model``."""
 
+import math
+
 import mujoco
 
 from lyceum_warp.support.validate import positive_number
@@ -30,3 +32,30 @@ def follow_velocity(actuator: mujoco.MjsActuator, speed: float) -> None:
     speed = positive_number("speed", speed, "m/s or rad/s")
     actuator.set_to_intvelocity(kp=kp, kv=-actuator.biasprm[2])
     actuator.actrange, actuator.ctrlrange = actuator.ctrlrange, (-speed, speed)
+
+
+def unstable_servos(model: mujoco.MjModel) -> dict[str, float]:
+    """Find the position servos of joints that are unstable in the model's substep.
+
+    A servo of stiffness k and damping d on a joint of inertia m is stable in a substep of h seconds if
+    h²k/m + 2hd/m < 4, or h²k/m - 2hd/m < 4 if the integrator is implicit in the damping. The inertia is that at
+    ``qpos0``, with all other joints free. The integrator ``discrete`` is stable in every substep.
+
+    Returns:
+        The longest stable substep of each of these servos in seconds, by the servo's name.
+    """
+    integrator, limits = mujoco.mjtIntegrator(model.opt.integrator), {}
+    if integrator == mujoco.mjtIntegrator.mjINT_DISCRETE:
+        return {}
+    implicit = integrator in (mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    sign = -1.0 if implicit else 1.0
+    for i in range(model.nu):
+        _, stiffness, damping = -model.actuator_biasprm[i, :3] * model.actuator_gear[i, 0] ** 2
+        if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or stiffness <= 0.0:
+            continue
+        inverse = float(model.dof_invweight0[model.jnt_dofadr[model.actuator_trnid[i, 0]]])
+        k, d = stiffness * inverse, sign * damping * inverse
+        longest = (math.sqrt(d * d + 4.0 * k) - d) / k if k > 0.0 else math.inf
+        if longest < model.opt.timestep:
+            limits[model.actuator(i).name] = longest
+    return limits

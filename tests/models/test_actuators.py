@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 import lyceum_warp as lw
+from lyceum_warp.models import unstable_servos
 
 XML = """
 <mujoco>
@@ -52,3 +53,26 @@ def test_invalid_actuators_and_speeds_raise_an_error_and_change_nothing(name: st
     with pytest.raises(ValueError, match=message):
         lw.follow_velocity(spec.actuator(name), speed)
     assert spec.to_xml() == before
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST"])
+@pytest.mark.parametrize("damping", [0.0, 0.6])
+def test_servo_is_unstable_beyond_the_longest_stable_substep(integrator: str, damping: float) -> None:
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" type="slide"/><geom size=".1" mass="2"/>
+        </body></worldbody><actuator><position name="servo" joint="j" kp="800" kv="{20 * damping}"/></actuator></mujoco>""")
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
+    model.opt.timestep = 1.0
+    (limit,) = unstable_servos(model).values()
+    for factor, stable in ((0.98, True), (1.02, False)):
+        model.opt.timestep = factor * limit
+        assert (not unstable_servos(model)) == stable
+        data = mujoco.MjData(model)
+        data.qpos[0] = 1e-3
+        largest = 0.0
+        for _ in range(600):
+            mujoco.mj_step(model, data)
+            largest = max(largest, abs(data.qpos[0]))  # MuJoCo resets a state that diverges
+        assert (largest < 0.1) == stable
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    assert not unstable_servos(model)
