@@ -60,7 +60,8 @@ def test_invalid_actuators_and_speeds_raise_an_error_and_change_nothing(name: st
 def test_servo_is_unstable_beyond_the_longest_stable_substep(integrator: str, damping: float) -> None:
     model = mujoco.MjModel.from_xml_string(f"""
         <mujoco><option gravity="0 0 0"/><worldbody><body><joint name="j" type="slide"/><geom size=".1" mass="2"/>
-        </body></worldbody><actuator><position name="servo" joint="j" kp="800" kv="{20 * damping}"/></actuator></mujoco>""")
+        </body></worldbody>
+        <actuator><position name="servo" joint="j" kp="800" kv="{20 * damping}"/></actuator></mujoco>""")
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator}")
     model.opt.timestep = 1.0
     (limit,) = unstable_servos(model).values()
