@@ -46,7 +46,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.training import Run, load_value
-from lyceum_warp.viz import control_plot, find_camera, parsed_camera, write_video
+from lyceum_warp.viz import find_camera, parsed_camera, write_video
 
 
 class Settings(OptionFlags, options=[MPPIConfig]):
@@ -81,9 +81,9 @@ class Plan:
     chooses the largest number of samples that meets the deadline. If no number meets the deadline, the command tries a
     shorter horizon, and then other physics that the task defines. Values that you give are never changed.
 
-    The command writes config.json, report.json and plan.png into a folder. It also writes video.mp4 of the first
-    episode, and a numpy file such as episode-000.npz for each episode. After Ctrl-C, the interrupted episode is saved,
-    too, but is not part of the report.
+    The command writes config.json and report.json into a folder. It also writes video.mp4 of the first episode, and a
+    numpy file such as episode-000.npz for each episode. After Ctrl-C, the interrupted episode is saved, too, but is not
+    part of the report.
 
     $ lyceum-warp plan reach
     $ lyceum-warp plan reach --real-time --episodes 10
@@ -125,8 +125,6 @@ class Plan:
     video: bool = True
     """Whether to make a video of the first episode."""
     camera: CameraWords = ()
-    plot: bool = True
-    """Whether to plot rewards, planning times and ages of actions."""
     planner: Placement = Placement()
     """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
     engine."""
@@ -307,8 +305,6 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
         if label != "success" or plant.task.functions["success"] is not None:
             say(f"  {label:<30}{text}")
     paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
-    if options.plot:
-        paths["plot"] = tried(control_plot, complete, run.folder / "plan.png")
     if options.video:
         camera = parsed_camera(options.camera)
         paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)

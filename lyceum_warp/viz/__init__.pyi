@@ -4,7 +4,6 @@ from lyceum_warp.viz.cameras import (
     find_camera as find_camera,
     parsed_camera as parsed_camera,
 )
-from lyceum_warp.viz.episode_plot import control_plot as control_plot
 from lyceum_warp.viz.extra import NoVideoError as NoVideoError
 from lyceum_warp.viz.page import write_states as write_states
 from lyceum_warp.viz.pictures import WorldPictures as WorldPictures

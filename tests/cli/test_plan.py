@@ -8,7 +8,7 @@ import mujoco
 import pytest
 import tiny_task
 import torch
-from training_runs import QUIET, TINY, interrupted, refused
+from training_runs import TINY, interrupted, refused
 
 import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
@@ -29,7 +29,7 @@ def test_command_plan_starts_no_episode_after_the_time_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    assert plan(out, *QUIET, "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
+    assert plan(out, "--no-video", "--steps", "3", "--episodes", "3", "--minutes", "1e-9") == 0
     assert "stopped after 1 of 3 episodes" in capsys.readouterr().out
     assert [file.name for file in out.glob("*.npz")] == ["episode-000.npz"]
 
@@ -40,7 +40,7 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
     shown = capsys.readouterr().out
     assert str(out) in shown and "episode 2/2" in shown and "planning time p50" in shown
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.json", "episode-000.npz", "episode-001.npz", "plan.png", "report.json",
+        "config.json", "episode-000.npz", "episode-001.npz", "report.json",
     ]  # fmt: skip
     config = json.loads((out / "config.json").read_text())
     assert config["planner"]["horizon"] == 10 and config["planner"]["noise"] == 0.3 and config["seed"] == 3
@@ -55,11 +55,11 @@ def test_command_plan_writes_episodes_and_a_report(tmp_path: Path, capsys: pytes
 
 def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, flags, timestep in (("fast", [], 0.015), ("exact", ["--physics", "exact"], None)):
-        small = ["--steps", "2", "--horizon", "2", *QUIET, *flags]
+        small = ["--steps", "2", "--horizon", "2", "--no-video", *flags]
         assert plan(tmp_path / name, *small, task="humanoid") == 0
         assert json.loads((tmp_path / name / "config.json").read_text())["planner"].get("timestep") == timestep
         assert ("timestep 0.015" in capsys.readouterr().out) == (name == "fast")
-    assert plan(tmp_path / "other", "--timestep", "0.013", *QUIET) == 2
+    assert plan(tmp_path / "other", "--timestep", "0.013", "--no-video") == 2
     refused(capsys, "0.013 s", "0.02 s")
     assert not (tmp_path / "other").exists()
 
@@ -67,7 +67,7 @@ def test_planner_uses_the_suggested_physics_by_default(tmp_path: Path, capsys: p
 def test_flag_real_time_runs_the_plant_asynchronously_in_real_time(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert plan(tmp_path / "run", *QUIET, "--real-time") == 0
+    assert plan(tmp_path / "run", "--no-video", "--real-time") == 0
     assert "async" in capsys.readouterr().out
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["mode"] == "async" and report["deadline_ms"] == pytest.approx(20.0)
@@ -88,7 +88,10 @@ def test_flag_real_time_leaves_given_settings_unchanged(
     monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
     for flags, samples in ((["--horizon", "10"], 32), (["--samples", "8", "--horizon", "10"], 8)):
         out = tmp_path / str(samples)
-        assert cli.main(["plan", "point_mass", "--out", str(out), "--steps", "3", "--real-time", *QUIET, *flags]) == 0
+        assert (
+            cli.main(["plan", "point_mass", "--out", str(out), "--steps", "3", "--real-time", "--no-video", *flags])
+            == 0
+        )
         config = json.loads((out / "config.json").read_text())
         assert (config["planner"]["samples"], config["planner"]["horizon"]) == (samples, 10)
         assert json.loads((out / "report.json").read_text())["deadline_ms"] == pytest.approx(20.0)
@@ -99,14 +102,14 @@ def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
 ) -> None:
     monkeypatch.setattr(plan_command, "planning_time", measured_by(250.0))
     out = tmp_path / "run"
-    argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", *QUIET]
+    argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", "--no-video"]
     assert cli.main(argv) == 0
     assert "16 samples, horizon 16: 64 ms of 20 ms, so there is a plan every 80 ms" in capsys.readouterr().out
     config, report = (json.loads((out / name).read_text()) for name in ("config.json", "report.json"))
     assert config["replan_every"] == 4 and report["deadline_ms"] == pytest.approx(80.0)
     settings = find_task("humanoid_stand").planning.settings
     half = settings["horizon"] // 2
-    argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", *QUIET]
+    argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", "--no-video"]
     monkeypatch.setattr(plan_command, "planning_time", measured_by(9000 / (16 * half)))
     assert cli.main(argv) == 0
     planner = json.loads((tmp_path / "knots" / "config.json").read_text())["planner"]
@@ -115,9 +118,11 @@ def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
 
 def test_value_function_of_a_run_changes_the_plans(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "npg"
-    assert cli.main(["train", "point_mass", "--out", str(run), *TINY, *QUIET, "--iterations", "1"]) == 0
-    assert plan(tmp_path / "with", *QUIET, "--value", str(run), "--discount", "0.97") == 0
-    assert plan(tmp_path / "without", *QUIET, "--discount", "0.97") == 0
+    assert (
+        cli.main(["train", "point_mass", "--out", str(run), *TINY, "--no-video", "--no-plot", "--iterations", "1"]) == 0
+    )
+    assert plan(tmp_path / "with", "--no-video", "--value", str(run), "--discount", "0.97") == 0
+    assert plan(tmp_path / "without", "--no-video", "--discount", "0.97") == 0
     with_value, without = (Trajectory.load(tmp_path / name / "episode-000.npz") for name in ("with", "without"))
     assert torch.equal(with_value.states[0], without.states[0])
     assert not torch.equal(with_value.actions, without.actions)
@@ -137,7 +142,7 @@ def test_physics_options_change_only_the_planner_worlds(tmp_path: Path, made_env
     out = tmp_path / "run"
     options = ["--solver", "iterations=5", "--solver", "noslip_iterations=0", "--deterministic"]
     options += ["--engine", "mujoco", "--nthread", "2"]
-    assert plan(out, *QUIET, "--steps", "3", "--episodes", "2", *options, task="hopper") == 0
+    assert plan(out, "--no-video", "--steps", "3", "--episodes", "2", *options, task="hopper") == 0
     plant, planner = made_envs
     assert (plant.model.opt.integrator, plant.model.opt.iterations) == (mujoco.mjtIntegrator.mjINT_RK4, 100)
     assert (planner.model.opt.integrator, planner.model.opt.iterations) == (mujoco.mjtIntegrator.mjINT_EULER, 5)
@@ -158,7 +163,7 @@ def test_chosen_plan_update_is_saved_and_printed(
     update: str, flags: list[str], title: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shared = ["--update", update, "--knots", "4", "--include-plan", "--replan-every", "3", "--steps", "9"]
-    assert plan(tmp_path / "run", *QUIET, *shared, *flags) == 0
+    assert plan(tmp_path / "run", "--no-video", *shared, *flags) == 0
     assert title in capsys.readouterr().out
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     planner = config["planner"]
@@ -201,7 +206,7 @@ def test_complete_episodes_are_saved_after_an_interrupt(
 
     monkeypatch.setattr(PlanDisplay, "__call__", seventh_of_the_third)
     out = tmp_path / "run"
-    assert interrupted(["plan", "point_mass", "--out", str(out), *SMALL, *QUIET, "--episodes", "100000"]) == 130
+    assert interrupted(["plan", "point_mass", "--out", str(out), *SMALL, "--no-video", "--episodes", "100000"]) == 130
     shown = capsys.readouterr().out
     files = sorted(out.glob("episode-*.npz"))
     assert f"interrupted by SIGINT after 2 episodes and 7 steps; files in {out}" in shown
@@ -220,7 +225,7 @@ def test_every_planner_setting_has_a_flag() -> None:
 def test_flag_param_sets_the_task_parameter_and_not_a_setting_of_the_same_name(tmp_path: Path) -> None:
     file = tiny_task.write(tmp_path, tiny_task.changed(("dt: float", "dt: float\n    temperature: float = 1.0")))
     options = ["--param", "temperature=0.5", "--temperature", "0.25", "--planner-param", "temperature=0.75"]
-    assert plan(tmp_path / "run", *QUIET, "--steps", "1", *options, task=str(file)) == 0
+    assert plan(tmp_path / "run", "--no-video", "--steps", "1", *options, task=str(file)) == 0
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     assert config["planner"]["temperature"] == 0.25
     assert config["params"] == {"temperature": 0.5} and config["planner_params"] == {"temperature": 0.75}

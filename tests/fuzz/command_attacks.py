@@ -40,7 +40,6 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     "export": {"--to": ("policy.pt2",)},
     "plan": {
         "--steps": ("2",), "--samples": ("2",), "--horizon": ("2",), "--out": ("out",), "--no-video": (),
-        "--no-plot": (),
     },
     "view": {},
     "bench": {},

@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 import torch
 from headless_screen import state_of
-from toy_controllers import towards
 from varied_task import ball
 
 import lyceum_warp as lw
-from lyceum_warp.controllers import control
-from lyceum_warp.viz import FreeCamera, Shot, control_plot, renderer, video
+from lyceum_warp.viz import FreeCamera, Shot, new_figure, renderer, video
 from lyceum_warp.viz.cameras import camera_values
 
 SMALL = (96, 64)
@@ -202,16 +200,7 @@ with Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={
     assert not list(folder.iterdir()) and not out.exists()
 
 
-def test_episodes_are_plotted_as_png(env: lw.Env, tmp_path: Path) -> None:
-    path = control_plot(
-        [control(env, towards, seed=3), control(env, towards, steps=1)], tmp_path / "new" / "control.png"
-    )
-    assert path.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and path.stat().st_size > 10_000
-
-
-def test_error_names_the_extra_if_matplotlib_is_missing(
-    env: lw.Env, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_error_names_the_extra_if_matplotlib_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
-        control_plot([control(env, towards)], tmp_path / "none.png")
+        new_figure("curves", 1.0, 1.0)
