@@ -1,7 +1,6 @@
 """Define XML models with every kind of element."""
 
 from lyceum_warp.testing import (
-    buffer_rules as buffers,
     episode_rules as episodes,
     fault_rules as faults,
     state_rules as state,
@@ -9,7 +8,6 @@ from lyceum_warp.testing import (
 
 # the checks that depend on the model; slow engines and models run only these
 MODEL_CHECKS = (
-    buffers.check_spaces,
     state.check_restoring,
     state.check_masked_restoring,
     state.check_purity,

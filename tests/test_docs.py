@@ -78,7 +78,7 @@ def test_mistakes_on_a_page_raise_the_errors_that_the_page_shows(number: int, ta
 BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 QUICK = {
-    "check": ["--nworld", "2", "--rule", "spaces", "--rule", "restoring"],
+    "check": ["--nworld", "2", "--rule", "reset", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
     "train --algorithm": shlex.split(
         "--iterations 2 --nworld 4 --horizon 32 --no-video --hidden 8 --value-hidden 8 --mean-every 1"

@@ -7,7 +7,26 @@ import warp as wp
 from lyceum_warp.core import COUNTERS, FAULTS
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import launch_worlds, torch_view
-from lyceum_warp.testing.context import SHORT, Context
+from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
+
+
+def check_addresses(ctx: Context) -> None:
+    """Buffers keep their addresses through steps, resets and ``set_state``."""
+    env = ctx.a
+    names = (*OUTCOMES, "action", "time")
+    before = {name: (id(getattr(env, name)), getattr(env, name).data_ptr()) for name in names}
+    fields = {name: array.ptr for name, array in env.engine.arrays.items()}
+    state = env.get_state()
+    for action in ctx.actions(SHORT):
+        env.step(action)
+    env.reset()
+    env.rand_reset()
+    env.set_state(state)
+    for name in names:
+        ctx.that(id(getattr(env, name)) == before[name][0], f"env.{name} is another object than before")
+        ctx.that(getattr(env, name).data_ptr() == before[name][1], f"env.{name} has moved")
+    for name, pointer in fields.items():
+        ctx.that(env.engine.arrays[name].ptr == pointer, f"the field {name} has moved")
 
 
 def check_restoring(ctx: Context) -> None:

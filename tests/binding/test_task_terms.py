@@ -7,8 +7,7 @@ import torch
 from terms_task import Terms
 
 import lyceum_warp as lw
-from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing import check_task
 
 ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
@@ -164,8 +163,7 @@ def test_invalid_term_raises_a_one_line_error_that_names_it(
 
 @ENGINES
 def test_task_with_terms_passes_check_task(engine: str) -> None:
-    quick = [check for check in CHECKS if check is not check_memory]
-    check_task(Terms, engine=engine, steps=40, checks=quick)
+    check_task(Terms, engine=engine, steps=40)
 
 
 def test_term_that_reads_out_of_range_raises_an_error(tmp_path: Path) -> None:

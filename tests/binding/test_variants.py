@@ -10,8 +10,7 @@ from terms_task import Terms
 from terms_variant import Same, Variant
 
 import lyceum_warp as lw
-from lyceum_warp.testing import CHECKS, check_task
-from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing import check_task
 
 ENGINES = pytest.mark.parametrize("engine", ["mujoco", "warp"])
 
@@ -43,8 +42,7 @@ def test_variants_share_kernels_and_do_not_change_their_parents() -> None:
 
 @ENGINES
 def test_variant_passes_check_task(engine: str) -> None:
-    quick = [check for check in CHECKS if check is not check_memory]
-    check_task(Variant, engine=engine, steps=30, checks=quick)
+    check_task(Variant, engine=engine, steps=30)
 
 
 PARENT = tiny_task.changed(

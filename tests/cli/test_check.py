@@ -16,10 +16,10 @@ def test_check_command_lists_all_rules_with_their_durations(capsys: pytest.Captu
 
 
 def test_check_command_runs_only_the_named_rules(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["check", "point_mass", "--rule", "spaces", "--rule", "time"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == ["spaces", "time"]
-    assert cli.main(["check", "point_mass", "--rule", "space"]) == 2
-    refused(capsys, "no rule 'space'", "did you mean spaces")
+    assert cli.main(["check", "point_mass", "--rule", "graphs", "--rule", "reset"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == ["graphs", "reset"]
+    assert cli.main(["check", "point_mass", "--rule", "graph"]) == 2
+    refused(capsys, "no rule 'graph'", "did you mean graphs")
 
 
 def test_check_command_prints_a_violated_rule_and_exits_with_1(
@@ -27,7 +27,7 @@ def test_check_command_prints_a_violated_rule_and_exits_with_1(
 ) -> None:
     fixed = "def randomize(s: World, p: Params, rng: Row[wp.uint32]):\n    s.qpos[0] = 0.5"
     file = task_file("alike.py", tiny_task.with_function(fixed))
-    assert cli.main(["check", str(file), "--rule", "spaces", "--rule", "rand_reset"]) == 1
+    assert cli.main(["check", str(file), "--rule", "graphs", "--rule", "rand_reset"]) == 1
     out = capsys.readouterr().out
     broken, state = out.splitlines()
     assert broken == "tiny on the mujoco engine breaks the rule 'rand_reset': two consecutive draws are the same"

@@ -29,7 +29,7 @@ RUN, HERE = Path("commands/good").absolute(), Path("commands/here").absolute()
 SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     "tasks": {},
     "new": {"--model": ("gymnasium:hopper.xml",)},
-    "check": {"--nworld": ("2",), "--steps": ("2",), "--rule": ("spaces",)},
+    "check": {"--nworld": ("2",), "--steps": ("2",), "--rule": ("graphs",)},
     "train": {
         "--iterations": ("1",), "--samples": ("8",), "--nworld": ("2",), "--hidden": ("4",), "--value-hidden": ("4",),
         "--mean-every": ("0",), "--horizon": ("4",), "--out": ("out",), "--no-video": (), "--no-plot": (),

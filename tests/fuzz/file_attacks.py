@@ -120,7 +120,7 @@ READERS: dict[str, Callable[[], object]] = {
     "make": lambda: lw.make(SLIDE_PY, model=CASE / "model.xml").step(),
     "new": lambda: command("new", "case/my_new_task", "--model", CASE / "model.xml"),
     "make file": lambda: lw.make(CASE / "slide.py").step(),
-    "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "spaces"),
+    "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "reset"),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
 }  # fmt: skip
 WITHOUT = {"resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}

@@ -10,11 +10,11 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp import Row
-from lyceum_warp.testing import CHECKS, check_task, episode_rules as episodes
+from lyceum_warp.testing import check_task
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "mujoco": {
-        "nworld": 3, "steps": 20, "frame_skip": 2, "checks": [c for c in CHECKS if c is not episodes.check_memory],
+        "nworld": 3, "steps": 20, "frame_skip": 2,
     },
     "warp": {"nworld": 2, "steps": 20, "horizon": 6, "frame_skip": 1, "checks": MODEL_CHECKS},
 }  # fmt: skip

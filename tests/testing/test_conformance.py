@@ -1,11 +1,9 @@
 import pytest
-from conftest import settle
 from toy_engine import ToyEngine
 
 import lyceum_warp as lw
 from lyceum_warp.binding import find_task
-from lyceum_warp.testing import CHECKS, buffer_rules as buffers, check_task, state_rules as state
-from lyceum_warp.testing.episode_rules import check_memory
+from lyceum_warp.testing import CHECKS, check_task, state_rules as state
 from lyceum_warp.testing.fault_rules import check_not_finite
 from lyceum_warp.testing.physics_rules import check_dynamics
 
@@ -14,20 +12,14 @@ EVERY_RULE = {
     "warp": ("hopper", "adroit_pen", "soft_ball"),
 }
 """The tasks that pass every check on an engine. Together they use most features of models."""
-OF_THE_TASK = tuple(check for check in CHECKS if check not in (check_memory, check_not_finite))
-"""On the C engine, the other tasks pass these checks. Two slow checks, which hardly depend on the task, are missing."""
+OF_THE_TASK = tuple(check for check in CHECKS if check is not check_not_finite)
+"""On the C engine, the other tasks pass these checks. A slow check, which hardly depends on the task, is missing."""
 OF_THE_STATE = (
-    buffers.check_addresses, state.check_restoring, state.check_purity, state.check_determinism,
+    state.check_addresses, state.check_restoring, state.check_purity, state.check_determinism,
     state.check_reset,
 )  # fmt: skip
 """On the Warp engine, the other tasks pass only these checks, because this engine is slow on a CPU."""
 PACKAGE = [name for name in lw.task_names() if find_task(name).__module__.startswith("lyceum_warp.tasks.")]
-
-
-@pytest.fixture(autouse=True)
-def settled_again() -> None:
-    """Free the objects of earlier tests, because the memory rule counts all objects."""
-    settle()
 
 
 def options(task: str, engine: str) -> dict[str, int]:
