@@ -10,10 +10,7 @@ from lyceum_warp.controllers.controller import (
 )
 from lyceum_warp.controllers.episode_collector import ControlProgress as ControlProgress
 from lyceum_warp.controllers.loop import control as control
-from lyceum_warp.controllers.real_time import (
-    Clock as Clock,
-    control_async as control_async,
-)
+from lyceum_warp.controllers.real_time import control_async as control_async
 from lyceum_warp.controllers.real_time_setting import (
     RealTimeChoice as RealTimeChoice,
     RealTimeSetting as RealTimeSetting,

@@ -43,7 +43,6 @@ def control_async(
     on_step: OnStep | None = None,
     on_abort: OnAbort | None = None,
     predict: bool = False,
-    clock: "Clock | None" = None,
 ) -> Trajectory:
     """Control one world, the plant, in real time: it steps at a fixed rate and does not wait for plans.
 
@@ -87,7 +86,6 @@ def control_async(
         on_abort: Called with the trajectory of the complete steps if an exception, such as Ctrl-C, ends the run after
             the first step. The trajectory's ``done_reason`` is 0. The exception is then raised again.
         predict: Whether to plan from predicted states.
-        clock: Replacement for the wall clock, for example to do other work while the plant waits.
 
     Returns:
         The episode.
@@ -98,7 +96,6 @@ def control_async(
         ValueError: A number is out of range, or an action has the wrong shape or is not finite.
         Exception: Any exception that the controller raises.
     """
-    check_kind("clock", clock, Clock | None, "which has now, wait_until and wait_for")
     check_flag("predict", predict)
     check_kind("env", env, Env, "as lw.make(..., autoreset=False) makes it")
     period = positive_number("period", env.timestep if period is None else period, "seconds")
@@ -107,15 +104,14 @@ def control_async(
     checked, limit, first = begin_episode(env, controller, steps, seed, reset=reset, on_step=on_step, on_abort=on_abort)
     _capture_graphs(env)
     predictor = Predictor(env) if predict else None
-    clock = Clock() if clock is None else clock
-    episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed, now=clock.now)
-    planner = PlannerThread(checked, clock, seed, first, reset=reset, predictor=predictor)
+    episode = EpisodeCollector(env, checked, mode="async", period=period, seed=seed)
+    planner = PlannerThread(checked, seed, first, reset=reset, predictor=predictor)
     with _frequent_thread_switches():
         try:
             planner.publish(0, episode.states[0], episode.obs[0], None)
             planner.wait()
-            episode.start = clock.now()
-            wall = run_plant(env, checked, planner, clock, episode, limit, on_step)
+            episode.start = time.perf_counter()
+            wall = run_plant(env, checked, planner, Clock(), episode, limit, on_step)
             planner.stop()
             planner.check()
         except BaseException:
@@ -129,10 +125,10 @@ def control_async(
 
 
 class Clock:
-    """The wall clock, with waits more precise than ``time.sleep``."""
+    """The wall clock, with waits more precise than ``time.sleep``. Tests replace it."""
 
     def now(self) -> float:
-        """Return the seconds since an arbitrary origin."""
+        """Return the seconds since an arbitrary origin, as ``time.perf_counter`` does."""
         return time.perf_counter()
 
     def wait_until(self, moment: float) -> None:
@@ -141,10 +137,6 @@ class Clock:
             time.sleep(left - _SPIN)
         while self.now() < moment:
             pass
-
-    def wait_for(self, event: threading.Event) -> None:
-        """Wait until an event is set. The loop uses this method to wait for the first plan."""
-        event.wait()
 
 
 def run_plant(
@@ -233,10 +225,10 @@ class PlannerThread:
     """
 
     def __init__(
-        self, controller: CheckedController, clock: Clock, seed: int | None, first: int, *, reset: bool,
+        self, controller: CheckedController, seed: int | None, first: int, *, reset: bool,
         predictor: Predictor | None = None,
     ) -> None:  # fmt: skip
-        self._controller, self._predictor, self._clock = controller, predictor, clock
+        self._controller, self._predictor = controller, predictor
         self._seed, self._first, self._reset = seed, first, reset
         self._plans: list[TimedPlan] = []
         self._qualities: dict[int, tuple[float, float]] = {}
@@ -257,7 +249,7 @@ class PlannerThread:
 
     def wait(self) -> None:
         """Wait for the first plan."""
-        self._clock.wait_for(self._begun)
+        self._begun.wait()
         self.check()
 
     def check(self) -> None:
@@ -316,14 +308,14 @@ class PlannerThread:
             controller(state, obs, 0, step)
             if self._reset:
                 controller.reset(self._seed)
-        begun, ahead = self._clock.now(), 0
+        begun, ahead = time.perf_counter(), 0
         if self._predictor is not None and action is not None:
             predicted = self._predictor(state, action)
             if predicted is not None:
                 (state, obs), ahead = predicted, 1
         start = step + ahead
         actions = controller(state, obs, controller.passed(self._first + last, self._first + start), step)
-        plan = TimedPlan(len(self._plans), start, begun, self._clock.now() - begun, actions, ahead)
+        plan = TimedPlan(len(self._plans), start, begun, time.perf_counter() - begun, actions, ahead)
         self._plans.append(plan)
         # read the quality after publishing the plan, so that the plant gets the plan sooner
         self._qualities[plan.index] = controller.quality()
