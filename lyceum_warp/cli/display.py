@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from lyceum_warp.algos import Iteration, Learner, simulation
-from lyceum_warp.controllers import ControlProgress, Trajectory
+from lyceum_warp.controllers import Trajectory
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Callback, Run
 from lyceum_warp.viz import one_line
@@ -179,43 +179,11 @@ def tried(make: Callable[..., object], *args: Any, **kwargs: Any) -> str:
         return f"none: {one_line(error)}"
 
 
-# plans
-
-
-class PlanDisplay(Progress):
-    """Shows the progress of a planner's episode: a live line on a terminal, and a line when the episode ends.
-
-    The live line shows the steps per second. With ``real_time``, it shows the plans per second and the age of the
-    action.
-    """
-
-    def __init__(self, console: Console, title: str, steps: int, timestep: float, *, real_time: bool = False) -> None:
-        self.title = title
-        self.timestep = timestep
-        self.real_time = real_time
-        super().__init__(
-            TextColumn(self.title), BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
-            console=console, disable=not console.is_terminal, transient=True,
-        )  # fmt: skip
-        self.bar = self.add_task("", total=steps, text="")
-
-    def __call__(self, now: ControlProgress) -> None:
-        """Show a step."""
-        if self.console.is_terminal:
-            time = max(now.time, 1e-9)
-            if self.real_time:  # the clock starts after the first plan
-                pace = f"{(now.plans - 1) / time:.0f} plans/s action {1000 * now.age:.3g} ms old"
-            else:
-                pace = f"{now.step / time:.0f} Hz {now.step / time * self.timestep:.2f}x real time"
-            text = f"reward {now.reward:.3g} eval {now.eval:.3g} {pace}"
-            self.update(self.bar, completed=now.step, text=text)
-
-    def done(self, trajectory: Trajectory) -> None:
-        """Print the episode's result."""
-        factor = trajectory.steps * trajectory.timestep / trajectory.wall_seconds
-        end = "success, " if trajectory.succeeded else "ended early, " if trajectory.terminated else ""
-        self.console.print(
-            f"{self.title}: {end}return {trajectory.episode_return:.4g}, evaluation {trajectory.evals[-1]:.3g} after "
-            f"{trajectory.steps} steps, {trajectory.wall_seconds:.3g} s, {factor:.2f}x real time", soft_wrap=True,
-        )  # fmt: skip
-        sys.stdout.flush()
+def episode_result(trajectory: Trajectory) -> str:
+    """Describe the result of a planner's episode in one line."""
+    factor = trajectory.steps * trajectory.timestep / trajectory.wall_seconds
+    end = "success, " if trajectory.succeeded else "ended early, " if trajectory.terminated else ""
+    return (
+        f"{end}return {trajectory.episode_return:.4g}, evaluation {trajectory.evals[-1]:.3g} after "
+        f"{trajectory.steps} steps, {trajectory.wall_seconds:.3g} s, {factor:.2f}x real time"
+    )

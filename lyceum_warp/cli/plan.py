@@ -28,7 +28,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import PlanDisplay, console, counted, say, tried
+from lyceum_warp.cli.display import console, counted, episode_result, say, tried
 from lyceum_warp.controllers import (
     CheckedController,
     ControlReport,
@@ -44,6 +44,7 @@ from lyceum_warp.controllers import (
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
 from lyceum_warp.support.interrupts import Interrupted
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number, whole_number
 from lyceum_warp.training import Run, load_value
 from lyceum_warp.viz import find_camera, parsed_camera, write_video
@@ -284,11 +285,14 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
                 say(f"stopped after {len(complete)} of {options.episodes} episodes: {limit}")
                 break
             title = f"episode {episode + 1}/{options.episodes}"
-            with PlanDisplay(console, title, plant.horizon, plant.timestep, real_time=options.real_time) as display:
-                seed = options.seed + episode
-                trajectory = method(plant, planner, seed=seed, on_step=display, on_abort=aborted.append)
+            with LongWork(title, "steps", console) as work:
+                trajectory = method(
+                    plant, planner, seed=options.seed + episode, on_abort=aborted.append,
+                    on_step=lambda now, work=work: work(now.step, plant.horizon),
+                )  # fmt: skip
             complete.append(trajectory)
-            display.done(trajectory)
+            say(f"{title}: {episode_result(trajectory)}")
+            console.file.flush()
             report = _save(run, complete, options)
     except BaseException as error:  # ignore further signals until the files are written
         if complete:

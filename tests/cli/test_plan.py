@@ -14,8 +14,8 @@ import lyceum_warp as lw
 from lyceum_warp import Trajectory, cli
 from lyceum_warp.binding import find_task
 from lyceum_warp.cli import plan as plan_command
-from lyceum_warp.cli.display import PlanDisplay
 from lyceum_warp.cli.plan import Settings
+from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Run
 
 SMALL = ["--horizon", "10", "--samples", "8", "--temperature", "0.01", "--noise", "0.3", "--steps", "40"]
@@ -199,12 +199,12 @@ def test_complete_episodes_are_saved_after_an_interrupt(
 ) -> None:
     steps = []
 
-    def seventh_of_the_third(display: PlanDisplay, now: lw.ControlProgress) -> None:
-        steps.append(now.step)
+    def seventh_of_the_third(work: LongWork, done: int, total: int) -> None:
+        steps.append(done)
         if len(steps) == 2 * 40 + 7:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(PlanDisplay, "__call__", seventh_of_the_third)
+    monkeypatch.setattr(LongWork, "__call__", seventh_of_the_third)
     out = tmp_path / "run"
     assert interrupted(["plan", "point_mass", "--out", str(out), *SMALL, "--no-video", "--episodes", "100000"]) == 130
     shown = capsys.readouterr().out
