@@ -14,7 +14,7 @@ Velocity: TypeAlias = tuple[float, float, float]
 """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
 
 MOST_GHOSTS = 32
-"""Maximum number of other worlds or episodes that are shown at once."""
+"""Maximum number of other worlds that are shown at once."""
 MOST_BURST = 50
 """Maximum number of states along a trajectory that are shown at once."""
 
@@ -74,8 +74,6 @@ class Ghosts:
     """The number of other worlds to show as ghosts."""
     grid: bool = False
     """Whether to show the other worlds side by side."""
-    episodes: int = 0
-    """The number of other saved episodes to show as ghosts. All ghosts are at the displayed step."""
     burst: int = 0
     """The maximum number of ghosts along the trajectory. Past states are red, and future states are blue."""
     plan: bool = True

@@ -62,7 +62,8 @@ class FrameMaker:
             traces: The paths of a planner's samples.
             status: A function that completes a ``Status``, given some of its fields.
         """
-        worlds = _following(main.world, main.env.nworld, self.ghosts.worlds)
+        nworld = main.env.nworld
+        worlds = [(main.world + i) % nworld for i in range(1, min(self.ghosts.worlds, nworld - 1) + 1)]
         rows = live.rows(worlds if live is main else (), self.ghosts.burst)
         state, parts = rows.states[0], live.env.state_space.parts
         self._report(rows, main.world if live is not main else None)
@@ -84,11 +85,8 @@ class FrameMaker:
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; for ``status``, see ``of_worlds``."""
         episode, state = playback.episode, playback.state
-        indices = _following(playback.index, len(playback.episodes), self.ghosts.episodes)
-        episodes = [playback.episodes[index].states for index in indices]
-        ghosts = self._coloured(states[min(playback.step, len(states) - 1)] for states in episodes)
         around = playback.around(self.ghosts.burst)
-        ghosts += self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
+        ghosts = self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
         ghosts += self._burst((episode.states[s] for s in around if s > playback.step), _FUTURE)
         text = [("episode", episode.name)]
         if episode.end:
@@ -143,10 +141,6 @@ class FrameMaker:
 
     def _physics(self, state: np.ndarray) -> np.ndarray:
         return state[: self._env.engine.integration_size]
-
-
-def _following(index: int, number: int, count: int) -> list[int]:
-    return [(index + i) % number for i in range(1, min(count, number - 1) + 1)]
 
 
 def model_bytes(model: mujoco.MjModel) -> bytes:

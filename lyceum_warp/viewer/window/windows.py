@@ -216,7 +216,6 @@ class Windows:
         imgui.PushItemWidth(150)
         for name, most, what in (
             ("worlds", min(self._scene.nworld - 1, MOST_GHOSTS), "number of other worlds"),
-            ("episodes", min(len(self._scene.episodes) - 1, MOST_GHOSTS), "number of other episodes"),
             ("burst", MOST_BURST, "number of states along the trajectory (Ctrl+B)"),
         ):
             if most > 0:

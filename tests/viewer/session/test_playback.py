@@ -42,11 +42,10 @@ def test_playback_can_seek_reverse_and_loop(shared_env: SharedEnv, trajectories:
     session.stage.advance(3)
     points = session.stage.frame().points
     np.testing.assert_allclose(points[:, 2], trajectories[1].rewards[:3])
-    session.obey(command(set_ghosts, Ghosts(episodes=2, burst=4)))
+    session.obey(command(set_ghosts, Ghosts(burst=4)))
     ghosts = session.stage.frame().ghosts
-    np.testing.assert_array_equal(ghosts[0].state[qpos], trajectories[0].states[3, qpos])
-    past = [ghost for ghost in ghosts[1:] if ghost.colour[0] > ghost.colour[2]]
-    assert len(past) == 1 and len(ghosts) == 5
+    past = [ghost for ghost in ghosts if ghost.colour[0] > ghost.colour[2]]
+    assert len(past) == 1 and len(ghosts) == 4
 
 
 def test_worlds_continue_from_the_state_of_a_playback(shared_env: SharedEnv, trajectories: list[lw.Trajectory]) -> None:
