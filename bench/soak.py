@@ -240,7 +240,7 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     """Write a variant of a task, whose additional action requests a fault; return it, and the range of the other
     actions."""
     parent, plain = find_task(task), lw.make(task, nworld=1, engine="mujoco")
-    source_task = TaskSource(parent, task)
+    source_task = TaskSource(parent)
     functions, nact = source_task.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")

@@ -12,6 +12,7 @@ from lyceum_warp.binding.opened_files import (
 from lyceum_warp.binding.parameters import defaults as defaults
 from lyceum_warp.binding.parts import length as length
 from lyceum_warp.binding.registry import (
+    errors_of as errors_of,
     file_name as file_name,
     find_task as find_task,
     package_task_names as package_task_names,

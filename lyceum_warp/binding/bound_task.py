@@ -49,7 +49,7 @@ class BoundTask:
         """The task's class."""
         self.nworld = nworld
         self.name = task_name(task)
-        self.source = source = TaskSource(task, self.name)
+        self.source = source = TaskSource(task)
         check_attributes(source)
         self.functions, self.types = source.functions, source.types
         self.metrics, self.curriculum = source.terms.metrics, source.curriculum
@@ -72,7 +72,7 @@ class BoundTask:
         except ValueError as error:
             origin: Any = task.model if model is None else model
             file = origin if isinstance(origin, str | Path) else getattr(origin, "file", None)
-            raise ValueError(f"{file or f'the model of the task {self.name!r}'}: {error}") from error
+            raise ValueError(f"{file or 'the model'}: {error}") from error
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
@@ -127,8 +127,7 @@ class BoundTask:
         """The model fields that resets or events write. A reset first restores their nominal values."""
         if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
             raise ValueError(
-                f"the model field {both[0]!r} of the task {self.name!r} is written by startup and by resets or "
-                "events: write it in one of them"
+                f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"
             )
         written = frozenset().union(dynamics, *drawn.values())
         varied = [name for name in dict.fromkeys([*names, *dynamics]) if name in written]
@@ -138,20 +137,20 @@ class BoundTask:
         drawn_constants = [field.name for field in self.dynamics if field.constants]
         if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
             raise ValueError(
-                f"the task {self.name!r} reads {stale[0]!r}, but its value stays the same when a world changes "
-                f"{drawn_constants[0]!r}: read the fields from which MuJoCo computes {stale[0]}"
+                f"World.{stale[0]} stays the same when a world changes {drawn_constants[0]!r}: read the fields from "
+                f"which MuJoCo computes {stale[0]}"
             )
 
     def _actions(self) -> dict[str, int] | None:
         if self.definition.actions is not None:
             return {
-                name: parts.length(f"the size of the action {name!r} of the task {self.name!r}", size, self.params)
+                name: parts.length(f"the size of the action {name!r}", size, self.params)
                 for name, size in self.definition.actions.items()
             }
         if self.model.nu == 0:
             raise ValueError(
-                f"the model of the task {self.name!r} has no actuators: add actuators, or give the task actions = "
-                "{...} and a control function that writes inputs"
+                "the model has no actuators: add actuators, or give the task actions = {...} and a control function "
+                "that writes inputs"
             )
         return None
 
@@ -174,7 +173,7 @@ class BoundTask:
         dtype, ndim = (kind.dtype, kind.ndim) if hasattr(kind, "ndim") else (kind, 0)
         if not wp.types.types_equal(dtype, array.dtype) or ndim != array.ndim - 1:
             wanted = _spelled(array.dtype, array.ndim - 1)
-            raise ValueError(f"World.{name} of the task {self.name!r} must be declared as {wanted}")
+            raise ValueError(f"World.{name} must be declared as {wanted}")
 
     def declaration(self, name: str) -> str:
         """Return the line of World that declares a field of the model, such as "qvel: Row[float]"."""

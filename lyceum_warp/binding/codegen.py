@@ -15,6 +15,7 @@ import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.parts import Layout, view_lines
+from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.core.fields import is_data_field
 from lyceum_warp.core.model_fields import NOT_NEGATIVE
@@ -76,7 +77,8 @@ class _Generator:
 
     def run(self) -> dict[str, Any]:
         """Return the fields of ``TaskCode`` by name, among other names."""
-        source, scope = self._source, self._scope
+        source, scope, task = self._source, self._scope, self._source.definition
+        name, path = kernel_name(task), f"{task.__module__}.{task.__qualname__}"
         self._row_views()
         self._batch()
         self._observations()
@@ -85,12 +87,12 @@ class _Generator:
         for form in FUNCTIONS.values():
             if form.default is not None:
                 self._function(f"no_{form.signature}", [form.default])
-        scope["__name__"] = f"{_MODULE}{source.name}"
-        run_source("\n\n".join(self._texts), f"<lyceum_warp {source.path}>", scope)
-        terms = source.terms.generated(f"<lyceum_warp {source.path} terms>")
+        scope["__name__"] = f"{_MODULE}{name}"
+        run_source("\n\n".join(self._texts), f"<lyceum_warp {path}>", scope)
+        terms = source.terms.generated(f"{_MODULE}terms.{name}", f"<lyceum_warp {path} terms>")
         functions = source.functions | {name: terms[name] for name in source.terms.combined}
         return scope | {
-            "module": free_module_name(f"{_MODULE}{source.kernel_name}"),
+            "module": free_module_name(f"{_MODULE}{name}"),
             "functions": SimpleNamespace(**{name: f or scope.get(f"no_{name}") for name, f in functions.items()}),
             "written": [name for name, function in functions.items() if function is not None],
             "terms": SimpleNamespace(**terms),

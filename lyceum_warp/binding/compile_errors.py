@@ -1,4 +1,4 @@
-"""Translate Warp's compile errors into one line that names the task, the line and the fix."""
+"""Translate Warp's compile errors into one line that names the function, the line and the fix."""
 
 import re
 from pathlib import Path
@@ -42,19 +42,17 @@ def explained(error: Exception, task: BoundTask) -> Exception:
     found = re.match(r'"(\w+)" at (.*?):(\d+):\n(.*?)\n;(.*)', innermost, re.DOTALL)
     if not found:
         known = type(error).__module__.startswith("warp")
-        return ValueError(f"Warp can't compile the task {task.name!r}: {' '.join(text.split())}") if known else error
+        return ValueError(f"Warp can't compile it: {' '.join(text.split())}") if known else error
     function, file, line, source, message = (" ".join(group.split()) for group in found.groups())
     call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", source)
     kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", message)
     if call and kind:
         name, returned = call.group(1), kind.group(1) or kind.group(2)
-        return ValueError(
-            f"{name} of the task {task.name!r} returns {returned}: it must be written as {FUNCTIONS[name].signature}"
-        )
+        return ValueError(f"{name} returns {returned}: it must be written as {FUNCTIONS[name].signature}")
     hint = _hint(f"{source} {message}", task)
     return ValueError(
-        f"Warp can't compile {function} of the task {task.name!r} ({Path(file).name}, line {line}): '{source}': "
-        f"{message.rstrip('.')}{hint and f': {hint}'}"
+        f"Warp can't compile {function} ({Path(file).name}, line {line}): '{source}': {message.rstrip('.')}"
+        f"{hint and f': {hint}'}"
     )
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
-from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import is_struct, overloads, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
@@ -45,10 +44,8 @@ def check_field_name(name: str) -> None:
 class TaskSource:
     """What a task's class and modules define. The signatures fit those of ``core.task.FUNCTIONS``."""
 
-    def __init__(self, definition: type[Task], name: str) -> None:
-        self.definition, self.name = definition, name
-        self.path = f"{definition.__module__}.{definition.__qualname__}"
-        self.kernel_name = kernel_name(definition)
+    def __init__(self, definition: type[Task]) -> None:
+        self.definition = definition
         self._owners: Any = definition.__mro__[: definition.__mro__.index(Task)]
         self._variant: Variant | None = None
         self.world: Any = self._struct("World")
@@ -57,7 +54,7 @@ class TaskSource:
         self.defaults: type = type("Params", (declared.cls,), replaced) if definition.params else declared.cls
         """The class whose attributes are the defaults of Params."""
         self.params: Any = self._with_functions(declared)
-        self._variant = variant_of(name, self._owners, self.world, self.params, declared)
+        self._variant = variant_of(self._owners, self.world, self.params, declared)
         self.memory: dict[str, Part] = parts_of(self.world, "World")
         self.shared_structs = self._shared_structs()
         """``Shared`` and ``Sums`` by name, or nothing."""
@@ -66,8 +63,8 @@ class TaskSource:
         self.functions = {name: self._function(form) for name, form in FUNCTIONS.items()}
         """The functions of ``FUNCTIONS`` that the task defines. Others are None."""
         if self.functions["observe"] is None:
-            raise ValueError(f"the task {name!r} has no observe(s, p, obs), which every task needs")
-        self.terms = Terms(definition, name, self._term, self.functions, self.world, self.params)
+            raise ValueError("there is no observe(s, p, obs), which every task needs")
+        self.terms = Terms(definition, self._term, self.functions, self.world, self.params)
         self._check_names()
 
     @functools.cached_property
@@ -91,13 +88,13 @@ class TaskSource:
         functions = {name: function for name, function in self.functions.items() if function is not None}
         functions |= {observer_name(group): function for group, function in observers.items()}
         for name, function in functions.items():
-            check_writes(self.name, name, function, rights)
+            check_writes(name, function, rights)
         for name in _BEFORE_FORWARD & functions.keys():
-            check_reads(self.name, name, functions[name])
+            check_reads(name, functions[name])
         for name, term in self.terms.functions.items():
             for overload in overloads(term):
                 none = {name: dict.fromkeys(overload.input_types, ())}
-                check_writes(self.name, name, overload, rights | none)
+                check_writes(name, overload, rights | none)
 
     def observers(self, groups: Collection[str]) -> dict[str, wp.Function]:
         """Return the functions that write observation groups, by group name."""
@@ -106,10 +103,7 @@ class TaskSource:
             form = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
             observer = self._function(form)
             if observer is None:
-                raise ValueError(
-                    f"no function of the task {self.name!r} writes the group {group!r} of its observations: add "
-                    f"{form.signature}"
-                )
+                raise ValueError(f"no function writes the group {group!r} of observations: add {form.signature}")
             observers[group] = observer
         return observers
 
@@ -145,9 +139,9 @@ class TaskSource:
     def _struct(self, name: str) -> Any:
         struct = self._declared(name, self.definition)
         if isinstance(struct, type):
-            raise ValueError(f"{name} of the task {self.name!r} must be a Warp struct: decorate it with @wp.struct")
+            raise ValueError(f"{name} must be a Warp struct: decorate it with @wp.struct")
         if not is_struct(struct):
-            raise ValueError(f"the task {self.name!r} needs a @wp.struct named {name} in its module")
+            raise ValueError(f"there is no {name}: add a @wp.struct of this name to the task's module")
         return struct
 
     def _declared(self, name: str, owner: type[Task]) -> Any:
@@ -182,20 +176,18 @@ class TaskSource:
                    if isinstance(function, wp.Function) and len(function.input_types) > i]  # fmt: skip
         if field is None or not is_struct(field.type) or len(structs) < 2 or structs[0] is not structs[1]:
             raise ValueError(
-                f"the task {self.name!r} lacks a part of shared memory: it needs the structs Shared and Sums, a field "
-                f"World.shared of the type Shared, and the functions {FUNCTIONS['tally'].signature} and "
-                f"{FUNCTIONS['share'].signature}"
+                "a part of shared memory is missing: it needs the structs Shared and Sums, a field World.shared of the "
+                f"type Shared, and the functions {FUNCTIONS['tally'].signature} and {FUNCTIONS['share'].signature}"
             )
         return {"Shared": field.type, "Sums": structs[0]}
 
     def _field_types(self) -> dict[str, Any]:
         for name, part in self.memory.items():
             if part.kind not in MEMORIES:
-                raise ValueError(f"World.{name} of the task {self.name!r} is declared by lw.part: use lw.memory(...)")
+                raise ValueError(f"World.{name} is declared by lw.part: use lw.memory(...)")
             if is_data_field(name) or is_model_field(name) or name in OWN_PARTS:
                 raise ValueError(
-                    f"the memory World.{name} of the task {self.name!r} has the name of an existing field or part of "
-                    "the state: rename it"
+                    f"the memory World.{name} has the name of an existing field or part of the state: rename it"
                 )
         known = (*self.memory, "shared") if self.shared_structs else self.memory
         types = {name: v.type for name, v in self.world.vars.items() if name not in known}
@@ -228,7 +220,7 @@ class TaskSource:
         if function is None:
             return None
         if not isinstance(function, wp.Function):
-            raise ValueError(f"{name} of the task {self.name!r} must be a @wp.func, not {function!r}")
+            raise ValueError(f"{name} must be a @wp.func, not {function!r}")
         types = list(function.input_types.values())
         structs = [kind for kind in types if is_struct(kind)]
         foreign = structs and self.world not in structs and self.params not in structs
@@ -236,15 +228,15 @@ class TaskSource:
             return None  # the function belongs to another task in the module
         returns = any(isinstance(node, ast.Return) for node in ast.walk(source_of(function).tree))
         if form.result is not None and not returns:
-            raise ValueError(f"{name} of the task {self.name!r} has no return: write it as {form.signature}")
-        check_structs(self.name, function, {self.world: self.world.cls, self.params: self.defaults})
+            raise ValueError(f"{name} has no return: write it as {form.signature}")
+        check_structs(function, {self.world: self.world.cls, self.params: self.defaults})
         kinds = tuple(map(self._kind, types))
         returned = function.adj.arg_types.get("return")
         if kinds not in (form.kinds, form.all_kinds) or returned not in (None, form.result):
             more = f", with or without a last argument {form.optional}" if form.optional else ""
             if form.name.startswith("observe") and len(structs) == 3:
                 more = f"{more}; to write the struct {structs[2].key}, remove obs from the class"
-            raise ValueError(f"{name} of the task {self.name!r} must be written as {form.signature}{more}")
+            raise ValueError(f"{name} must be written as {form.signature}{more}")
         return function
 
     def _kind(self, argument: Any) -> str:
@@ -269,7 +261,7 @@ class TaskSource:
                 guesses[name] = closest(name, missing, 1, 0.85) if self.world in value.input_types.values() else []
         for name, guess in guesses.items():
             if guess:
-                raise ValueError(f"the task {self.name!r} has {name!r}: did you mean {guess[0]}?")
+                raise ValueError(f"{name!r}: did you mean {guess[0]}?")
 
 
 def draws_noise(observer: wp.Function) -> bool:

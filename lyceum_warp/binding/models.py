@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.fields import ON_DEMAND, SENSED
 from lyceum_warp.core.model_fields import MOVED_INERTIA
 from lyceum_warp.core.model_files import ModelFile, gymnasium_model, read_spec
@@ -29,8 +28,7 @@ def read_task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco
     if model is not None:
         return load_spec(model)
     if not hasattr(task, "model"):
-        name = task_name(task)
-        raise ValueError(f'the task {name!r} has no model: add one to its class, such as model = "robot.xml"')
+        raise ValueError('there is no model: add one to the class, such as model = "robot.xml"')
     return load_spec(task.model() if callable(task.model) else task.model, task)
 
 
@@ -41,25 +39,23 @@ def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSp
 
 def edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
     """Apply ``edit_model`` of a task and its parents to a copy of a spec."""
-    copy, name = spec.copy(), task_name(task)
+    copy = spec.copy()
     edits = [vars(owner)["edit_model"] for owner in reversed(task.__mro__) if "edit_model" in vars(owner)]
     for edit in (edit.__get__(None, task) for edit in edits):
         if "edit_model" in getattr(getattr(edit, "__code__", None), "co_names", ()):
             raise ValueError(
-                f"edit_model of the task {name!r} calls edit_model of another class, which would then run twice: "
-                "remove the call, because the edits of all parents run first"
+                "edit_model calls edit_model of another class, which would then run twice: remove the call, because "
+                "the edits of all parents run first"
             )
         try:
             result: Any = edit(copy)
         except Exception as error:
             raise ValueError(
-                f"edit_model of the task {name!r} fails on the model {spec.modelname!r}: {type(error).__name__}: "
-                f"{error}"
+                f"edit_model fails on the model {spec.modelname!r}: {type(error).__name__}: {error}"
             ) from error
         if result is not None:
             raise ValueError(
-                f"edit_model of the task {name!r} returns {type(result).__name__}: it must change the spec in place "
-                "and return None"
+                f"edit_model returns {type(result).__name__}: it must change the spec in place and return None"
             )
     return copy
 

@@ -40,16 +40,16 @@ class Parameters:
         self, source: TaskSource, model: mujoco.MjModel, values: Mapping[str, Any], *, nworld: int, timestep: float
     ) -> None:
         self._struct, self._owner, self._weights = source.params, source.defaults, source.terms.weights
-        self._task_name, self._model, self._nworld = source.name, model, nworld
-        struct, task_name = self._struct, self._task_name
+        self._model, self._nworld = model, nworld
+        struct = self._struct
         self._sizes: dict[str, int] = {}
         self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
         self._arrays: dict[str, tuple[Any, Any]] = {}
         self._check_tables()
         if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
-                f"the parameter {taken[0]!r} of the task {task_name!r} has the name of an option of make(), so "
-                f"make() would set the option: rename it in Params"
+                f"the parameter {taken[0]!r} has the name of an option of make(), so make() would set the option: "
+                "rename it in Params"
             )
         initial = (
             defaults(struct, self._owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
@@ -73,13 +73,13 @@ class Parameters:
             if name not in names:
                 if name in OPTIONS:
                     raise ValueError(
-                        f"{name!r} is an option, not a parameter of the task {self._task_name!r}: make another "
-                        f"environment with env.replicate({name}=...)"
+                        f"{name!r} is an option, not a parameter: make another environment with "
+                        f"env.replicate({name}=...)"
                     )
                 hint = suggestion(name, names) or f"it has {', '.join(names) or 'none'}"
-                raise ValueError(f"the task {self._task_name!r} has no parameter {name!r}: {hint}")
+                raise ValueError(f"there is no parameter {name!r}: {hint}")
         if missing := [name for name in known if name not in self.values and name not in values]:
-            raise ValueError(f"the task {self._task_name!r} needs values for {', '.join(missing)}")
+            raise ValueError(f"it needs values for {', '.join(missing)}")
         other = copy.copy(self)
         other._computed = self._computed - set(values)
         other.values = {
@@ -98,7 +98,7 @@ class Parameters:
             result = getattr(self._owner, name).function(self._model, SimpleNamespace(**values))
         except Exception as error:  # the task's function may raise any error
             message = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            raise ValueError(f"the parameter {name} of {self._task_name!r} can't be computed: {message}") from error
+            raise ValueError(f"the parameter {name} can't be computed: {message}") from error
         value, before = self._converted(name, result), self.values[name]
         return before if name in self.tables and np.array_equal(before, value) else value
 
@@ -132,8 +132,8 @@ class Parameters:
             scalar = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
             if not wp.types.type_repr(kind).startswith("array(") or scalar not in (wp.float32, wp.int32):
                 raise ValueError(
-                    f"the parameter {name!r} of the task {self._task_name!r} has the type {wp.types.type_repr(kind)}: "
-                    "a table is a wp.array, wp.array2d or wp.array3d of float, int, or vectors and matrices of float"
+                    f"the parameter {name!r} has the type {wp.types.type_repr(kind)}: a table is a wp.array, "
+                    "wp.array2d or wp.array3d of float, int, or vectors and matrices of float"
                 )
 
     def _converted(self, name: str, value: Any) -> Any:
@@ -141,7 +141,7 @@ class Parameters:
         if name in self.tables:
             return self._table(name, value)
         kind = self._struct.vars[name].type if name in self._struct.vars else wp.float32
-        text = f"the parameter {name}={value!r} of {self._task_name!r}"
+        text = f"the parameter {name}={value!r}"
         array = self._numbers(name, text, value, whole=kind is wp.int32)
         if np.isnan(array).any():
             raise ValueError(f"{text} is not a number")
@@ -162,7 +162,7 @@ class Parameters:
         """Convert a table to a read-only array of float32 or int32. The last axes are those of a vector or matrix."""
         if value is self.values.get(name) and isinstance(value, np.ndarray) and not value.flags.writeable:
             return value
-        kind, text = self.tables[name], f"the parameter {name} of {self._task_name!r}"
+        kind, text = self.tables[name], f"the parameter {name}"
         element = tuple(getattr(kind.dtype, "_shape_", ()))
         whole = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is wp.int32
         if isinstance(value, (str, Path)):

@@ -1,5 +1,6 @@
 """Find tasks by name, by file or by class, and register users' tasks."""
 
+import contextlib
 import functools
 import importlib
 import importlib.util
@@ -13,7 +14,7 @@ import threading
 import traceback
 import weakref
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -154,11 +155,21 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
         return _task_of_file(Path(path), attribute)
     if task not in _tasks and (module := _package_modules().get(task)) is not None:
         importlib.import_module(module)
-    if task not in _tasks:
-        hint = did_you_mean(task, task_names(), "lyceum-warp tasks lists them")
-        raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
-    source_files(_tasks[task])
-    return _tasks[task]
+    if task in _tasks:
+        source_files(_tasks[task])
+        return _tasks[task]
+    hint = did_you_mean(task, task_names(), "lyceum-warp tasks lists them")
+    raise ValueError(f"there is no task {task!r}: {hint} (a task of your own is given as path/to/file.py)")
+
+
+@contextlib.contextmanager
+def errors_of(task: type[Task]) -> Iterator[None]:
+    """Put the task's name in front of the message of an error."""
+    try:
+        yield
+    except (ValueError, FileNotFoundError) as error:
+        error.args = (f"the task {task_name(task)!r}: {error}",)
+        raise
 
 
 def source_files(task: type[Task]) -> Mapping[Path, bytes]:

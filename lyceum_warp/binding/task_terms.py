@@ -36,21 +36,19 @@ class Terms:
     def __init__(
         self,
         task: type[Task],
-        name: str,
         lookup: Callable[[str], wp.Function | None],
         written: Mapping[str, wp.Function | None],
         world: Any,
         params: Any,
     ) -> None:
-        self._name, self.lookup = name, lookup
-        self._world, self._params = world, params
+        self.lookup, self._world, self._params = lookup, world, params
         self.weights = self._checked_weights(task.rewards)
         self.ends = {name: self._names(name, getattr(task, name)) for name in _ENDS}
         self._reward, self._measure = written["reward"], written["measure"]
         functions = self._names("metrics", task.metrics, written=self._measure is not None)
         for attribute, kind in (("rewards", "reward"), ("rewards", "measure"), *_ENDS.items()):
             if getattr(task, attribute) and written[kind]:
-                raise ValueError(f"the task {name!r} has {attribute} and a function {kind}: remove one of them")
+                raise ValueError(f"there are {attribute} and a function {kind}: remove one of them")
         self.functions: dict[str, wp.Function] = {}
         self.text = ""
         """The source of the generated functions."""
@@ -61,16 +59,16 @@ class Terms:
         if self.weights or ends or functions:
             self.text = self._written_text((*functions, *ends), len(task.metrics) - len(functions))
 
-    def generated(self, file: str) -> dict[str, wp.Function]:
+    def generated(self, module: str, file: str) -> dict[str, wp.Function]:
         """Generate those of ``reward``, ``score``, ``terminated`` and ``truncated`` that the task does not define.
 
-        ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``file`` names
-        the generated text in error messages.
+        ``reward`` computes a transition's reward with given weights. ``score`` also writes the metrics. ``module``
+        names their module, and ``file`` names the generated text in error messages.
         """
         if not self.text:
             return {}
         scope: dict[str, Any] = {"wp": wp, "Row": Row, "World": self._world, "Params": self._params}
-        scope |= {"__name__": f"lyceum_warp.generated.terms.{self._name}", **self.functions}
+        scope |= {"__name__": module, **self.functions}
         scope |= {"reward": self._reward, "measure": self._measure}
         run_source(self.text, file, scope)
         names = {"score", *self.combined, *(["reward"] if self.weights else [])}
@@ -79,19 +77,18 @@ class Terms:
     def _checked_weights(self, rewards: Any) -> dict[str, float]:
         if not isinstance(rewards, Mapping):
             raise ValueError(
-                f"rewards of the task {self._name!r} must be a dict of names and weights, such as {{'upright': 1.0}}, "
-                f"not {rewards!r}"
+                f"rewards must be a dict of names and weights, such as {{'upright': 1.0}}, not {rewards!r}"
             )
         for term, weight in rewards.items():
             if not isinstance(weight, int | float) or not math.isfinite(weight):
-                raise ValueError(f"the weight of {term!r} of the task {self._name!r} must be a number, not {weight!r}")
+                raise ValueError(f"the weight of {term!r} must be a number, not {weight!r}")
         self._names("rewards", tuple(rewards))
         if rewards and "dt" not in self._params.vars:
-            raise ValueError(f"rewards of the task {self._name!r} are multiplied by dt: add dt: float to its Params")
+            raise ValueError("rewards are multiplied by dt: add dt: float to Params")
         if taken := [term for term in rewards if term in self._params.vars]:
             raise ValueError(
-                f"the task {self._name!r} has a term and a parameter named {taken[0]!r}: set_params would not know "
-                "which one to set, so rename one"
+                f"{taken[0]!r} is the name of a term and of a parameter: set_params would not know which one to set, "
+                "so rename one"
             )
         return {term: float(weight) for term, weight in rewards.items()}
 
@@ -101,13 +98,13 @@ class Terms:
         If ``written`` is True, a function of the task computes all of them, so return ().
         """
         if not isinstance(names, tuple | list) or not all(isinstance(name, str) and name for name in names):
-            raise ValueError(f"{attribute} of the task {self._name!r} must be names, as ('x', 'y'), not {names!r}")
+            raise ValueError(f"{attribute} must be names, as ('x', 'y'), not {names!r}")
         for name in () if written else names:
             if self.lookup(name) is None:
                 more = ", or write measure" if attribute == "metrics" else ""
                 raise ValueError(
-                    f"{attribute} of the task {self._name!r} has {name!r}, but there is no such function: write it as "
-                    f"a @wp.func in the task's file, or import it there{more}"
+                    f"{attribute} has {name!r}, but there is no such function: write it as a @wp.func in the task's "
+                    f"file, or import it there{more}"
                 )
         return () if written else tuple(names)
 
@@ -150,9 +147,7 @@ class Terms:
             within: The chain of functions that need this function's result, for the detection of cycles.
         """
         if name in within:
-            raise ValueError(
-                f"terms of the task {self._name!r} depend on each other in a cycle: {' needs '.join((*within, name))}"
-            )
+            raise ValueError(f"terms depend on each other in a cycle: {' needs '.join((*within, name))}")
         function = self.lookup(name)
         assert function is not None
         errors = []
@@ -210,9 +205,9 @@ class Terms:
         return kind
 
     def place(self, function: wp.Function) -> str:
-        """Name a function, the task, and the function's line, for messages."""
+        """Name a function and its line, for messages."""
         source = source_of(function)
-        return f"{source.name} of the task {self._name!r} ({source.place(source.tree)})"
+        return f"{source.name} ({source.place(source.tree)})"
 
 
 class _Body:

@@ -91,7 +91,7 @@ class Variant:
 _variants: dict[Any, Variant] = {}
 
 
-def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any, declared: Any) -> Variant | None:
+def variant_of(owners: Sequence[type[Task]], world: Any, params: Any, declared: Any) -> Variant | None:
     """Copy a family's functions for a task, or return None if the task has no structs or functions of its own.
 
     Tasks with the same structs and replacements share a variant and its compiled kernels. ``declared`` is the Params
@@ -115,7 +115,7 @@ def variant_of(task: str, owners: Sequence[type[Task]], world: Any, params: Any,
         variant = _variants[key] = Variant(modules, functions, structs, replacements)
         for replacement in replacements.values():
             copy = variant.seen(replacement, _home(replacement))
-            check_structs(task, copy, {world: world.cls, params: declared.cls})
+            check_structs(copy, {world: world.cls, params: declared.cls})
     return _variants[key]
 
 
@@ -219,7 +219,7 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
     )  # fmt: skip
 
 
-def check_structs(task: str, function: wp.Function, declared: Mapping[Any, type]) -> None:
+def check_structs(function: wp.Function, declared: Mapping[Any, type]) -> None:
     """Raise a ValueError if a function takes another World or Params than its task uses.
 
     ``declared`` maps the World and the Params that the task's functions take to the classes that the task declares.
@@ -230,7 +230,7 @@ def check_structs(task: str, function: wp.Function, declared: Mapping[Any, type]
                 bases = [base for base in cls.__bases__ if base is not object and not issubclass(kind.cls, base)]
                 named = ", ".join(f"{Path(_file(base)).stem}.{base.__name__}" for base in (*bases, kind.cls))
                 raise ValueError(
-                    f"{name_of(function)} of the task {task!r} takes {name} from {_file(kind.cls)}, but the task uses "
+                    f"{name_of(function)} takes {name} from {_file(kind.cls)}, but the task uses "
                     f"{name} from {_file(cls)}: import World and Params from the same file, write the task's struct as "
                     f"class {name}({named}), or rewrite {name_of(function)}"
                 )

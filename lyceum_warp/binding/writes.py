@@ -82,7 +82,7 @@ Rights = Mapping[str, Collection[str] | None]
 """Maps each argument of a function to the fields that the function may write. For an output row, the value is None."""
 
 
-def check_writes(task: str, name: str, function: wp.Function, rights: Mapping[str, Rights]) -> None:
+def check_writes(name: str, function: wp.Function, rights: Mapping[str, Rights]) -> None:
     """Raise a ValueError if a function of a task writes a field or a row that it must not write.
 
     ``rights`` has the rights of all functions by name.
@@ -96,19 +96,19 @@ def check_writes(task: str, name: str, function: wp.Function, rights: Mapping[st
         place = f"{within} ({write.place})"
         if write.use is not None:
             raise ValueError(
-                f"{name} of the task {task!r} uses {write.target} as a whole in '{write.use}'{place}, and may write "
-                "it there: read and write its elements directly"
+                f"{name} uses {write.target} as a whole in '{write.use}'{place}, and may write it there: read and "
+                "write its elements directly"
             )
-        raise ValueError(f"{name} of the task {task!r} writes {write.target}{place}: {_advice(write, name, rights)}")
+        raise ValueError(f"{name} writes {write.target}{place}: {_advice(write, name, rights)}")
 
 
-def check_reads(task: str, name: str, function: wp.Function) -> None:
+def check_reads(name: str, function: wp.Function) -> None:
     """Raise a ValueError if a function that changes the initial state reads a field that MuJoCo computes from it."""
     for field, place in trace(function).reads.items():
         if field in DERIVED_FIELDS or field == "sensordata":
             raise ValueError(
-                f"{name} of the task {task!r} reads {field} in {place}, but MuJoCo computes {field} after {name}, so "
-                "the values are those of an earlier state: compute them from qpos and qvel"
+                f"{name} reads {field} in {place}, but MuJoCo computes {field} after {name}, so the values are those "
+                "of an earlier state: compute them from qpos and qvel"
             )
 
 

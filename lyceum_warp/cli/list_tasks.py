@@ -44,7 +44,7 @@ class Tasks:
         for name in names:
             task = find_task(name)
             note = ""
-            source = TaskSource(task, name)
+            source = TaskSource(task)
             params = defaults(source.params, source.defaults)
             obs = sum(obs_layouts(source, params)["policy"].values())
             actions = step = "-"

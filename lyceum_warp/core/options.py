@@ -140,7 +140,7 @@ class PhysicsOptions:
             return self
         known = {"exact": PhysicsOptions(), **named}
         if self.base not in known:
-            raise ValueError(f"the task has no physics {self.base!r}: it has {', '.join(map(repr, known))}")
+            raise ValueError(f"there is no physics {self.base!r}: use {', '.join(map(repr, known))}")
         return dataclasses.replace(known[self.base], **(self.given() | {"base": None}))
 
 

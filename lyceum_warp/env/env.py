@@ -14,7 +14,7 @@ import warp as wp
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.functions import check_field_name
-from lyceum_warp.binding.registry import find_task
+from lyceum_warp.binding.registry import errors_of, find_task
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
@@ -184,55 +184,57 @@ class Env:
     ) -> None:
         check_kind("options", options, EnvOptions | None, "as lw.EnvOptions(nworld=64)")
         task, options, params = find_task(task), options or EnvOptions(), dict(params or {})
-        self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
-        self.nworld = options.nworld
-        self.device = find_device(options.device)
-        self.task = BoundTask(
-            task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
-            physics=options.physics, params=params,
-        )  # fmt: skip
-        self.timestep = self.task.timestep
-        self.engine = open_engine(
-            options.engine, self.task.model, self.nworld, self.device, self.task.fields, dynamics=self.task.dynamics,
-            initial=self.task.initial, reserved=own_bytes_per_world(self.task), **options.for_engine(),
-        )  # fmt: skip
         self._given_params = params
         self._scratch: Env | None = None
-        try:
-            self.worlds = worlds = Worlds(self.task, self.engine, options)
-            call_once_gone(self, worlds.drop_programs)
-            for name, buffer in worlds.buffers.items():
-                setattr(self, name, buffer)
-            self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
-            self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
-            self.action_space, self.state_space = worlds.action_space, worlds.state_space
-            self.metrics, self.episode_metrics = (
-                Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
-                for array in (worlds.metrics, worlds.episode_metrics)
-            )
-            self.episode_metric_sums = torch_view(worlds.episode_metrics)
-            memory = torch_view(worlds.shared)[0]
-            self.shared = {name: memory[part.start : part.start + part.size]
-                           for name, part in self.task.shared.get("Shared", {}).items()}  # fmt: skip
-            lasting = torch_view(worlds.lasting_memory)
-            self.lasting = {name: lasting[:, part.start : part.start + part.size]
-                            for name, part in self.task.memory["lasting_memory"].items()}  # fmt: skip
-            self.reward_space = self.eval_space = Space()
-            self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
-            self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
-            compile_ahead(worlds.rehearsal, self.device, self.task.name)
-            if self.engine.capturable and options.graphs:
-                self.engine.prepare_capture()
-            self.engine.reset(worlds.everyone)
-            Probe(worlds).check_bounds()  # a write out of range would damage the environment's own arrays
-            self.rand_reset(options.seed)
-            if self.task.dynamics and not _replica:  # after construction, invalid values are faults
-                self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
-            Probe(worlds).check_observations()
-        except Exception as error:
-            if (clear := explained(error, self.task)) is error:
-                raise
-            raise clear from None
+        with errors_of(task):
+            self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
+            self.nworld = options.nworld
+            self.device = find_device(options.device)
+            self.task = BoundTask(
+                task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
+                physics=options.physics, params=params,
+            )  # fmt: skip
+            self.timestep = self.task.timestep
+            self.engine = open_engine(
+                options.engine, self.task.model, self.nworld, self.device, self.task.fields,
+                dynamics=self.task.dynamics, initial=self.task.initial, reserved=own_bytes_per_world(self.task),
+                **options.for_engine(),
+            )  # fmt: skip
+            try:
+                self.worlds = worlds = Worlds(self.task, self.engine, options)
+                call_once_gone(self, worlds.drop_programs)
+                for name, buffer in worlds.buffers.items():
+                    setattr(self, name, buffer)
+                self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
+                self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
+                self.action_space, self.state_space = worlds.action_space, worlds.state_space
+                self.metrics, self.episode_metrics = (
+                    Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
+                    for array in (worlds.metrics, worlds.episode_metrics)
+                )
+                self.episode_metric_sums = torch_view(worlds.episode_metrics)
+                memory = torch_view(worlds.shared)[0]
+                self.shared = {name: memory[part.start : part.start + part.size]
+                               for name, part in self.task.shared.get("Shared", {}).items()}  # fmt: skip
+                lasting = torch_view(worlds.lasting_memory)
+                self.lasting = {name: lasting[:, part.start : part.start + part.size]
+                                for name, part in self.task.memory["lasting_memory"].items()}  # fmt: skip
+                self.reward_space = self.eval_space = Space()
+                self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
+                self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)
+                compile_ahead(worlds.rehearsal, self.device, self.task.name)
+                if self.engine.capturable and options.graphs:
+                    self.engine.prepare_capture()
+                self.engine.reset(worlds.everyone)
+                Probe(worlds).check_bounds()  # a write out of range would damage the environment's own arrays
+                self.rand_reset(options.seed)
+                if self.task.dynamics and not _replica:  # after construction, invalid values are faults
+                    self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
+                Probe(worlds).check_observations()
+            except Exception as error:
+                if (clear := explained(error, self.task)) is error:
+                    raise
+                raise clear from None
         leave_in_parent(self, "worlds", "engine")
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -503,15 +505,16 @@ class Env:
             ValueError: A field is not a model field that differs between worlds, or a value is invalid.
         """
         state = self.get_state()
-        put_rows(self.task.model, fields, self.state_space.split(state))
-        self._check_dynamics(state, fields)
+        with errors_of(self.task.definition):
+            put_rows(self.task.model, fields, self.state_space.split(state))
+            self._check_dynamics(state, fields)
         self.set_state(state, mask)
 
     def _check_dynamics(self, state: torch.Tensor, names: Collection[str]) -> None:
         columns = self.state_space.split(state)
         for field in self.task.dynamics:
             if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
-                raise ValueError(f"{self.task.name!r}: {problem}")
+                raise ValueError(problem)
 
     # shared memory
 
@@ -569,7 +572,8 @@ class Env:
         Raises:
             ValueError: A parameter is unknown, or the size of the observation would change.
         """
-        self.task.change_params(params)
+        with errors_of(self.task.definition):
+            self.task.change_params(params)
         self._given_params = self._given_params | params
         self.worlds.update_params()
         if self._scratch is not None:

@@ -93,8 +93,8 @@ class Probe:
         for (function, first), (_, second) in zip(*runs, strict=True):
             if not np.array_equal(first, second):
                 raise ValueError(
-                    f"{function} of the task {self._task.name!r} reads out of range: its result depends on memory "
-                    "beside its arguments, or on elements of obs that it has not written"
+                    f"{function} reads out of range: its result depends on memory beside its arguments, or on elements "
+                    "of obs that it has not written"
                 )
 
     def check_observations(self) -> None:
@@ -103,7 +103,7 @@ class Probe:
         list(run.judge())
         for group, layout in self._task.obs_layouts.items():
             rows, columns = run.groups[group], np.array(Space.of(layout).columns)
-            function = f"{observer_name(group)} of the task {self._task.name!r}"
+            function = observer_name(group)
             if (unwritten := rows.unwritten()).any():
                 raise ValueError(f"{function} leaves {', '.join(columns[unwritten])} of obs unwritten")
             if (bad := np.isnan(rows.array.numpy()[0])).any():
@@ -219,5 +219,5 @@ class _Run:
             # Warp counts negative indices from the end
             text = f"{last} numbers" if last > size else f"at index {int(outside[0]) - size}"
             where = target and f" {'into' if last > size else 'of'} {target}"
-            raise ValueError(f"{function} of the task {self._task.name!r} writes {text}{where}, but {declared}")
+            raise ValueError(f"{function} writes {text}{where}, but {declared}")
         return function, rows.words()

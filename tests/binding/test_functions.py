@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 import tiny_task
 
-from lyceum_warp.binding import TaskSource, find_task, task_name
+from lyceum_warp.binding import TaskSource, find_task
 from lyceum_warp.core import FUNCTIONS
 
 MEANT = {
@@ -14,8 +14,7 @@ MEANT = {
 
 
 def source_of(folder: Path, text: str) -> TaskSource:
-    task = find_task(tiny_task.write(folder, text))
-    return TaskSource(task, task_name(task))
+    return TaskSource(find_task(tiny_task.write(folder, text)))
 
 
 @pytest.mark.parametrize("name", MEANT)
@@ -27,19 +26,19 @@ def test_function_with_the_documented_signature_is_found_and_another_signature_i
     with pytest.raises(ValueError) as caught:
         source_of(tmp_path, text.replace(f"def {name}(", f"def {name}(more: float, "))
     more = ", with or without a last argument rng: Row[wp.uint32]" if name == "observe" else ""
-    assert str(caught.value) == f"{name} of the task 'tiny' must be written as {FUNCTIONS[name].signature}{more}"
+    assert str(caught.value) == f"{name} must be written as {FUNCTIONS[name].signature}{more}"
 
 
 CLASS = "class Tiny(lw.Task):"
 MISTAKES = {
     "another result": (
         CLASS, f"@wp.func\ndef terminated(s: World, p: Params) -> float:\n    return 1.0\n\n{CLASS}",
-        r"terminated of the task 'tiny' must be written as terminated\(s: World, p: Params\) -> bool",
+        r"terminated must be written as terminated\(s: World, p: Params\) -> bool",
     ),
-    "no observe": ("def observe", "def look", r"the task 'tiny' has no observe\(s, p, obs\)"),
+    "no observe": ("def observe", "def look", r"there is no observe\(s, p, obs\)"),
     "an ordinary class World": (
         CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
-        "World of the task 'tiny' must be a Warp struct: decorate it with @wp.struct",
+        "World must be a Warp struct: decorate it with @wp.struct",
     ),
     "a misspelt attribute": (CLASS, f"{CLASS}\n    horzon = 10", "'horzon': did you mean horizon"),
 }  # fmt: skip

@@ -70,7 +70,7 @@ def test_weights_are_set_like_parameters_and_may_differ_between_worlds(engine: s
     assert env.replicate().task.params["near"].tolist() == [1.0, 4.0]
     env.set_params(near=1)
     assert torch.equal(env.get_reward(start, action, after), plain)
-    with pytest.raises(ValueError, match="the task 'terms' has no parameter 'neer': did you mean near"):
+    with pytest.raises(ValueError, match="there is no parameter 'neer': did you mean near"):
         env.set_params(neer=2.0)
 
 
@@ -86,68 +86,68 @@ UPRIGHT = "def upright(s: World) -> float:\n    return s.qpos[1]"
 
 MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a misspelt term": (
-        term(UPRIGHT, 'rewards = {"uprihgt": 1.0}'), "rewards of the task 'tiny' has 'uprihgt', but there is no such",
+        term(UPRIGHT, 'rewards = {"uprihgt": 1.0}'), "rewards has 'uprihgt', but there is no such",
     ),
     "a misspelt argument": (
         term("def upright(qops: Row[float]) -> float:\n    return qops[1]"),
-        r"upright of the task 'tiny' \(tiny\.py, line \d+\) takes qops, which is not a function of the task, a "
+        r"upright \(tiny\.py, line \d+\) takes qops, which is not a function of the task, a "
         r"parameter or a field of World: did you mean qpos\?",
     ),
     "an argument of another type": (
         term("def upright(qpos: float) -> float:\n    return qpos"),
-        r"upright of the task 'tiny' \(.*\) takes qpos as float, but s1\.qpos is array\(ndim=1, dtype=float32\)",
+        r"upright \(.*\) takes qpos as float, but s1\.qpos is array\(ndim=1, dtype=float32\)",
     ),
     "a result of another type": (
         term("def upright(s: World) -> bool:\n    return s.qpos[1] > 1.0"),
-        r"upright of the task 'tiny' \(.*\) returns bool, but must return float",
+        r"upright \(.*\) returns bool, but must return float",
     ),
     "no type of the result": (
-        term("def upright(s: World):\n    return s.qpos[1]"), r"upright of the task 'tiny' \(.*\) has no type for its",
+        term("def upright(s: World):\n    return s.qpos[1]"), r"upright \(.*\) has no type for its",
     ),
     "a termination that asks for the action": (
         term("def fell(action: Row[float]) -> bool:\n    return action[0] > 1.0", 'terminations = ("fell",)'),
-        r"fell of the task 'tiny' \(.*\) takes action, but the end of an episode depends only on the state",
+        r"fell \(.*\) takes action, but the end of an episode depends only on the state",
     ),
     "terms that need each other": (
         term("def a(b: float) -> float:\n    return b", 'rewards = {"a": 1.0}',
              before="@wp.func\ndef b(a: float) -> float:\n    return a\n\n"),
-        "terms of the task 'tiny' depend on each other in a cycle: a needs b needs a",
+        "terms depend on each other in a cycle: a needs b needs a",
     ),
     "a term that writes": (
         term("def upright(s: World) -> float:\n    s.qpos[0] = 1.0\n    return 1.0"),
-        r"upright of the task 'tiny' writes s\.qpos \(tiny\.py, line \d+\): upright may write nothing",
+        r"upright writes s\.qpos \(tiny\.py, line \d+\): upright may write nothing",
     ),
     "rewards beside reward": (
         term(f"def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:\n    return 0.0\n\n"
              f"@wp.func\n{UPRIGHT}"),
-        "the task 'tiny' has rewards and a function reward: remove one of them",
+        "there are rewards and a function reward: remove one of them",
     ),
     "names without weights": (
-        term(UPRIGHT, 'rewards = ("upright",)'), r"rewards of the task 'tiny' must be a dict of names and weights",
+        term(UPRIGHT, 'rewards = ("upright",)'), r"rewards must be a dict of names and weights",
     ),
     "a weight that is not a number": (
         term(UPRIGHT, 'rewards = {"upright": "1"}'),
-        "the weight of 'upright' of the task 'tiny' must be a number, not '1'",
+        "the weight of 'upright' must be a number, not '1'",
     ),
     "a term with the name of a parameter": (
         [*term(UPRIGHT), ("    dt: float", "    dt: float\n    upright: float = 1.0")],
-        "the task 'tiny' has a term and a parameter named 'upright'",
+        "'upright' is the name of a term and of a parameter",
     ),
     "a term with the name of an option": (
         term("def horizon(s: World) -> float:\n    return 1.0", 'rewards = {"horizon": 1.0}'),
-        "the parameter 'horizon' of the task 'tiny' has the name of an option of make",
+        "the parameter 'horizon' has the name of an option of make",
     ),
     "no seconds in a step": (
         [*term(UPRIGHT), ("    dt: float", "    gain: float = 1.0")],
-        "rewards of the task 'tiny' are multiplied by dt: add dt: float to its Params",
+        "rewards are multiplied by dt: add dt: float to Params",
     ),
     "a metric without a function": (
         [(TASK, f'{TASK}\n    metrics = ("height",)')],
-        "metrics of the task 'tiny' has 'height', but there is no such function: .*, or write measure",
+        "metrics has 'height', but there is no such function: .*, or write measure",
     ),
     "a metric that is a term": (
         term(UPRIGHT, 'rewards = {"upright": 1.0}', 'metrics = ("upright",)'),
-        "the task 'tiny' names the metric 'upright' twice",
+        "the metric 'upright' is named twice",
     ),
 }  # fmt: skip
 
@@ -156,7 +156,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
 def test_invalid_term_raises_a_one_line_error_that_names_it(
     changes: list[tuple[str, str]], message: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(ValueError, match=f"^{message}") as caught:
+    with pytest.raises(ValueError, match=message) as caught:
         lw.make(tiny_task.write(tmp_path, tiny_task.changed(*changes)))
     assert "\n" not in str(caught.value)
 
@@ -168,5 +168,5 @@ def test_task_with_terms_passes_check_task(engine: str) -> None:
 
 def test_term_that_reads_out_of_range_raises_an_error(tmp_path: Path) -> None:
     source = tiny_task.changed(*term("def upright(qpos: Row[float]) -> float:\n    return qpos[60]"))
-    with pytest.raises(ValueError, match="reward of the task 'tiny' reads out of range"):
+    with pytest.raises(ValueError, match="reward reads out of range"):
         lw.make(tiny_task.write(tmp_path, source))

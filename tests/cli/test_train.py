@@ -147,7 +147,7 @@ def test_named_physics_are_saved_as_options_and_eval_can_replace_them(
         assert made_envs[-1].model.opt.timestep == timestep
     capsys.readouterr()
     assert cli.main(["train", str(task), "--physics", "slow", "--out", str(tmp_path / "other")]) == 2
-    refused(capsys, "the task has no physics 'slow': it has 'exact', 'fast'")
+    refused(capsys, "there is no physics 'slow': use 'exact', 'fast'")
     assert not (tmp_path / "other").exists()
 
 

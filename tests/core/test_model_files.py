@@ -119,9 +119,9 @@ def test_edit_model_runs_once_for_a_model_from_any_source() -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (lambda spec: spec, "edit_model of the task 'light' returns MjSpec: it must change the spec in place"),
-        (lambda spec: Light.edit_model(spec), "edit_model of the task 'light' calls edit_model of another class"),
-        (lambda spec: spec.body("tail").pos, "edit_model of the task 'light' fails on the model 'hopper': Attribute"),
+        (lambda spec: spec, "edit_model returns MjSpec: it must change the spec in place"),
+        (lambda spec: Light.edit_model(spec), "edit_model calls edit_model of another class"),
+        (lambda spec: spec.body("tail").pos, "edit_model fails on the model 'hopper': Attribute"),
     ],
 )
 def test_error_of_a_failing_model_edit_names_the_task(edit, message: str, monkeypatch: pytest.MonkeyPatch) -> None:

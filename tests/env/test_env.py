@@ -154,7 +154,7 @@ def test_follow_copies_the_parameters_of_another_environment() -> None:
 
 
 def test_set_params_with_an_option_raises_an_error_that_suggests_replicate() -> None:
-    with pytest.raises(ValueError, match=r"'nworld' is an option, not a parameter .* env.replicate\(nworld=...\)"):
+    with pytest.raises(ValueError, match=r"'nworld' is an option, not a parameter: .*env.replicate\(nworld=...\)"):
         lw.make("hopper").set_params(nworld=3)
 
 

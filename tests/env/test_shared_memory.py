@@ -215,7 +215,7 @@ def test_writing_shared_memory_in_a_function_other_than_share_raises_an_error() 
         s1.shared.falls[0] = 1.0
         return 0.0
 
-    with pytest.raises(ValueError, match="reward of the task 'lawless' writes s1.shared"):
+    with pytest.raises(ValueError, match="reward writes s1.shared"):
         lw.make(type("Lawless", (Balance,), {"reward": writes}))
 
 
@@ -230,11 +230,11 @@ def test_make_raises_an_error_for_writes_beyond_shared_memory(name: str, row: st
         shared.falls[3] = 1.0
 
     function = {"tally": beyond_sums, "share": beyond_shared}[name]
-    with pytest.raises(ValueError, match=f"{name} of the task 'beyond' writes .* into {row}, but {row.title()} decl"):
+    with pytest.raises(ValueError, match=f"{name} writes .* into {row}, but {row.title()} decl"):
         lw.make(type("Beyond", (Balance,), {name: function}))
 
 
 def test_task_that_defines_share_without_tally_raises_an_error(tmp_path: Path) -> None:
     file = write(tmp_path, with_function("def share(shared: World, sums: World, p: Params):\n    pass"))
-    with pytest.raises(ValueError, match="lacks a part of shared memory: it needs the structs Shared and Sums"):
+    with pytest.raises(ValueError, match="a part of shared memory is missing: it needs the structs Shared and Sums"):
         lw.make(str(file))

@@ -77,9 +77,9 @@ KINDS = {
     "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone",)),
     "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
     "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),
-    "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("of the task 'tiny'",)),
+    "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("the task 'tiny'",)),
     "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
-    "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("of the task 'tiny'",)),
+    "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("the task 'tiny'",)),
     "task.py": Kind("slide.py", mutations.mutated_task, ("make file", "check"), ("the task 'tiny'",)),
     "table.npy": Kind("table.npy", _table, ("table",)),
 }  # fmt: skip

@@ -72,19 +72,19 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         r"line \d+: a @wp\.struct has a field of the type str: it can hold float, int, bool, vectors and matrices",
     ),
     # functions
-    "observe without wp.func": ([("@wp.func\n", "")], r"observe of the task 'tiny' must be a @wp\.func, not <function"),
+    "observe without wp.func": ([("@wp.func\n", "")], r"observe must be a @wp\.func, not <function"),
     "a reward without return": (
         [function(f"{REWARD} -> float:\n    wp.abs(action[0])")],
-        f"reward of the task 'tiny' has no return: write it as {WRITE_REWARD}",
+        f"reward has no return: write it as {WRITE_REWARD}",
     ),
     "a function of another file": (
         [(OWN_WORLD, "from other_rewards import World, reward\n")],
-        r"reward of the task 'tiny' takes Params from .*other_rewards\.py, but the task uses Params from .*tiny\.py"
+        r"reward takes Params from .*other_rewards\.py, but the task uses Params from .*tiny\.py"
         r": import World and Params from the same file, write the task's struct as class Params\(other_rewards\.",
     ),
     "a function of another file with its own structs": (
         [("class Tiny", "from other_rewards import reward\n\nclass Tiny")],
-        r"reward of the task 'tiny' takes World from .*other_rewards\.py, but the task uses World from .*tiny\.py",
+        r"reward takes World from .*other_rewards\.py, but the task uses World from .*tiny\.py",
     ),
     # attributes, fields and writes
     "a name like no field": ([field("wheels: Row[float]")], "there is no field 'wheels': .*MuJoCo's names"),
@@ -95,7 +95,7 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "drawn twice": (
         [MASS, function(f"def startup(s: World, p: Params, {RNG}):\n    s.body_mass[1] = 2.0"),
          function(f"def randomize(s: World, p: Params, {RNG}):\n    s.body_mass[2] = 2.0")],
-        "the model field 'body_mass' of the task 'tiny' is written by startup and by resets or events",
+        "the model field 'body_mass' is written by startup and by resets or events",
     ),
     "a group that no function fills": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "critic": {"x": 1}}')],
@@ -103,19 +103,19 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     ),
     "a group of two words": (
         [('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "my group": {"x": 1}}')],
-        "obs of the task 'tiny' has the group 'my group': a group's name must be a Python name, such as 'critic'",
+        "obs has the group 'my group': a group's name must be a Python name, such as 'critic'",
     ),
     "groups without a policy": (
         [('obs = {"x": 1}', 'obs = {"actor": {"x": 1}, "critic": {"x": 1}}')],
         "must be a dict of parts and sizes, or a dict of such dicts for groups, including 'policy'",
     ),
-    "metrics as a number": ([line("metrics = 5")], r"metrics of the task 'tiny' must be names, .*, not 5"),
+    "metrics as a number": ([line("metrics = 5")], r"metrics must be names, .*, not 5"),
     "a comma in a metric's name": (
         [line('metrics = ("a,b",)'), function(f"def measure({STEP}, metrics: Row[float]):\n    metrics[0] = 1.0")],
-        "the task 'tiny' has the metric 'a,b': .* no comma, quote or line break",
+        "the metric 'a,b': .* no comma, quote or line break",
     ),
     "a keyframe that is not there": ([line('keyframe = "home"')], "'home'"),
-    "actions without control": ([line('actions = {"speed": 1}')], "defines its own actions, so it needs control"),
+    "actions without control": ([line('actions = {"speed": 1}')], "actions of its own needs control"),
     "actions without sizes": (
         [line('actions = ("speed",)')], r"must be a dict of names and sizes, such as \{'speed': 1\}",
     ),
@@ -123,33 +123,33 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
         [field("level: Row[wp.uint32] = lw.memory()")], r"World\.level has a size, .*: .* as level: Row\[float\]",
     ),
     "memory with the name of a field": (
-        [field("qvel: Row[float] = lw.memory()")], r"memory World\.qvel of the task 'tiny' has the name of an existing",
+        [field("qvel: Row[float] = lw.memory()")], r"memory World\.qvel has the name of an existing",
     ),
-    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], r"World\.step .* has the name of"),
+    "memory with the name of a counter": ([field("step: Row[float] = lw.memory()")], r"World\.step has the name of"),
     "memory of size 0": ([field("level: Row[float] = lw.memory(0)")], r"size of World\.level must be a whole number"),
     "memory with the size of no table": (
         [field('level: Row[float] = lw.memory("dt")')], r"size of World\.level is 'dt', which is not a table in Params",
     ),
     "a reward that writes": (
         [function(f"def reward({STEP}) -> float:\n    s1.qpos[0] = 1.0\n    return 0.0")],
-        r"reward of the task 'tiny' writes s1\.qpos \(.*tiny\.py, line 20\): ",
+        r"reward writes s1\.qpos \(.*tiny\.py, line 20\): ",
     ),
     "advance that writes an input": (
         [field("xfrc_applied: Row[wp.spatial_vector]"),
          function(f"def advance({STEP}, {RNG}):\n    s1.xfrc_applied[1] = wp.spatial_vector()")],
-        r"advance of the task 'tiny' writes s1\.xfrc_applied \(.*tiny\.py, line 21\): .* is written by control",
+        r"advance writes s1\.xfrc_applied \(.*tiny\.py, line 21\): .* is written by control",
     ),
     "control that writes the state": (
         [function("def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):\n    s.qpos[0] = 0.0")],
-        r"control of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): .* is written by initialize or randomize",
+        r"control writes s\.qpos \(.*tiny\.py, line \d+\): .* is written by initialize or randomize",
     ),
     "a substep that writes the model": (
         [MASS, function("def substep(s: World, p: Params):\n    s.body_mass[1] = 2.0")],
-        r"substep of the task 'tiny' writes s\.body_mass \(.*tiny\.py, line \d+\): .* is written by startup",
+        r"substep writes s\.body_mass \(.*tiny\.py, line \d+\): .* is written by startup",
     ),
     "observe that writes": (
         [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    s.qpos[0] = 0.0")],
-        r"observe of the task 'tiny' writes s\.qpos \(.*tiny\.py, line \d+\): observe may write obs",
+        r"observe writes s\.qpos \(.*tiny\.py, line \d+\): observe may write obs",
     ),
     "a function that writes a table": (
         [("    dt: float", "    dt: float\n    table: wp.array[float] = [1.0]"),
@@ -159,21 +159,21 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     "a native function that may write": (
         [("@wp.func", '@wp.func_native("row[0] = 1.0f;")\ndef poke(row: Row[float]): ...\n\n\n@wp.func'),
          ("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0]\n    poke(s.qpos)")],
-        r"observe of the task 'tiny' uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(.*\), and may write it there",
+        r"observe uses s\.qpos as a whole in 'poke\(s\.qpos\)' \(.*\), and may write it there",
     ),
     "a quotient of integers in a helper": (
         [("class Tiny", "@wp.func\ndef part(row: Row[float], n: int) -> float:\n    return float(n / row.shape[0])\n\n"
           f"@wp.func\n{REWARD} -> float:\n    return part(action, 1)\n\nclass Tiny")],
-        r"part of the task 'tiny' \(tiny\.py, line 20\): 'return float\(n / row\.shape\[0\]\)': .* n // 2",
+        r"part \(tiny\.py, line 20\): 'return float\(n / row\.shape\[0\]\)': .* n // 2",
     ),
     "a term with a quotient of integers": (
         [line('rewards = {"half": 1.0}'), function("def half(s: World) -> float:\n    return float(1 / 2)")],
-        r"half of the task 'tiny' \(tiny\.py, line \d+\): 'return float\(1 / 2\)': .* write 1\.0 / 2\.0",
+        r"half \(tiny\.py, line \d+\): 'return float\(1 / 2\)': .* write 1\.0 / 2\.0",
     ),
     "randomize that reads a derived field in a helper": (
         [field("xpos: Row[wp.vec3]"), function(f"def drop(s: World):\n    s.qpos[1] = -s.xpos[1][2]\n\n"
          f"@wp.func\ndef randomize(s: World, p: Params, {RNG}):\n    drop(s)")],
-        r"randomize of the task 'tiny' reads xpos in drop \(tiny\.py, line 21\), but MuJoCo computes xpos after",
+        r"randomize reads xpos in drop \(tiny\.py, line 21\), but MuJoCo computes xpos after",
     ),
 }  # fmt: skip
 

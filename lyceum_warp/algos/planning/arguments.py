@@ -12,7 +12,7 @@ import torch
 
 from lyceum_warp.algos.planning.config import SETTINGS, MPPIConfig
 from lyceum_warp.algos.planning.updates import PlanUpdate
-from lyceum_warp.binding import TaskSource, task_name, task_spec
+from lyceum_warp.binding import TaskSource, errors_of, task_name, task_spec
 from lyceum_warp.core.options import OPTIONS, EnvOptions, suggestion
 from lyceum_warp.core.task import Planning, Task
 from lyceum_warp.engines.placement import place_samples
@@ -144,7 +144,8 @@ def _hint(name: str, names: Sequence[str]) -> str:
 
 
 def _parameter_names(task: type[Task]) -> list[str]:
-    source = TaskSource(task, task_name(task))
+    with errors_of(task):
+        source = TaskSource(task)
     return [name for name in (*source.params.vars, *source.terms.weights) if name != "dt"]
 
 
