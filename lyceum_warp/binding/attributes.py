@@ -1,21 +1,52 @@
-"""Check the attributes of a task's class."""
+"""Check the attributes of a task's class, and the names of its functions and fields."""
 
 import math
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
+import warp as wp
+
 from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.core.task import FUNCTIONS
-from lyceum_warp.support.suggestions import did_you_mean
+from lyceum_warp.core.model_fields import check_field
+from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Task
+from lyceum_warp.support.suggestions import closest
 
 _LOWEST = {"frame_skip": 1, "draws": 1, "settle": 0, "horizon": 0, "success_steps": 1}
 """Attributes that are whole numbers, each with its smallest value."""
 
 
-def check_attributes(source: TaskSource) -> None:
-    """Raise a ValueError if an attribute of a task's class breaks a rule."""
+def check_attributes(source: TaskSource, fields: Collection[str] = ()) -> None:
+    """Raise a ValueError if an attribute of a task's class breaks a rule, or if a name is misspelt.
+
+    ``fields`` are names of further fields of MjData and MjModel.
+    """
+    for name, (known, similarity) in _new_names(source).items():
+        if guess := closest(name, known, 1, similarity):
+            raise ValueError(f"{name!r}: did you mean {guess[0]}?")
     for problem in _problems(source.definition, source):
         raise ValueError(problem)
+    for name in (*source.types, *fields):
+        if name not in MEMORIES:
+            check_field(name)
+
+
+def _new_names(source: TaskSource) -> dict[str, tuple[Collection[str], float]]:
+    """List the names that would be ignored if they were misspelt, each with known names and the least similarity."""
+    known = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
+    names = [name for name in vars(source.definition) if not name.startswith(("_", GROUP_PREFIX))]
+    missing = [name for name, function in source.functions.items() if function is None]
+    functions = [
+        name
+        for name, value in vars(sys.modules[source.definition.__module__]).items()
+        if isinstance(value, wp.Function) and source.world in value.input_types.values()
+    ]
+    ignored = [name for name in functions if name not in FUNCTIONS and name not in source.terms.functions]
+    return (
+        {name: (known, 0.75) for name in names if name not in known}
+        | dict.fromkeys(ignored, (missing, 0.85))
+        | {name: (source.params.vars, 0.6) for name in source.definition.params if name not in source.params.vars}
+    )
 
 
 def _problems(task: Any, source: TaskSource) -> Iterator[str]:
@@ -31,8 +62,7 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
             "succeed: lower success_steps, or raise horizon"
         )
     if unknown := [name for name in task.params if name not in source.params.vars]:
-        hint = did_you_mean(unknown[0], source.params.vars, "add it to Params")
-        yield f"params has {unknown[0]!r}, which is no field of Params: {hint}"
+        yield f"params has {unknown[0]!r}, which is no field of Params: it has {', '.join(source.params.vars)}"
     for attribute in ("lagged", "cleared"):
         for name in getattr(task, attribute):
             if name not in source.world.vars:

@@ -9,7 +9,7 @@ import warp as wp
 from lyceum_warp.binding import models, parts
 from lyceum_warp.binding.attributes import check_attributes
 from lyceum_warp.binding.codegen import kernels_of
-from lyceum_warp.binding.functions import TaskSource, check_field_name, draws_noise
+from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.observations import obs_layouts, obs_slices
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
@@ -50,7 +50,7 @@ class BoundTask:
         self.nworld = nworld
         self.name = task_name(task)
         self.source = source = TaskSource(task)
-        check_attributes(source)
+        check_attributes(source, (*fields, *dynamics))
         self.functions, self.types = source.functions, source.types
         self.metrics, self.curriculum = source.terms.metrics, source.curriculum
         self.writes = {
@@ -58,8 +58,6 @@ class BoundTask:
             for name, fields in source.written.items()
         }
         """What each function writes: fields of World and rows of memory."""
-        for name in fields:
-            check_field_name(name)
         names = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         data_fields = [name for name in names if is_data_field(name)]
         model_fields = [name for name in names if not is_data_field(name)]

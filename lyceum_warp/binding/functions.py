@@ -14,8 +14,8 @@ from lyceum_warp.binding.sources import is_struct, overloads, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
 from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
-from lyceum_warp.core.fields import DATA_FIELDS, INITIAL, INPUTS, is_data_field
-from lyceum_warp.core.model_fields import VARYING_FIELDS, is_model_field
+from lyceum_warp.core.fields import INITIAL, INPUTS, is_data_field
+from lyceum_warp.core.model_fields import is_model_field
 from lyceum_warp.core.spaces import OWN_PARTS
 from lyceum_warp.core.task import (
     FUNCTIONS,
@@ -28,17 +28,9 @@ from lyceum_warp.core.task import (
     TaskFunction,
     observer_name,
 )
-from lyceum_warp.support.suggestions import closest, did_you_mean
 
 _BEFORE_FORWARD = {"startup", "initialize", "randomize"}
 """Functions that run before the engine computes the fields of the initial state."""
-
-
-def check_field_name(name: str) -> None:
-    """Raise ValueError unless MjData or MjModel has a field of this name."""
-    if not (is_data_field(name) or is_model_field(name)):
-        hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
-        raise ValueError(f"there is no field {name!r}: {hint}")
 
 
 class TaskSource:
@@ -65,7 +57,6 @@ class TaskSource:
         if self.functions["observe"] is None:
             raise ValueError("there is no observe(s, p, obs), which every task needs")
         self.terms = Terms(definition, self._term, self.functions, self.world, self.params)
-        self._check_names()
 
     @functools.cached_property
     def written(self) -> dict[str, frozenset[str]]:
@@ -191,8 +182,6 @@ class TaskSource:
                 )
         known = (*self.memory, "shared") if self.shared_structs else self.memory
         types = {name: v.type for name, v in self.world.vars.items() if name not in known}
-        for name in types:
-            check_field_name(name)
         kinds = {part.kind for part in self.memory.values()}
         return types | {name: Row[float] for name in MEMORIES if name in kinds}
 
@@ -249,19 +238,6 @@ class TaskSource:
         element: Any = getattr(argument, "dtype", None) if getattr(argument, "ndim", 0) == 1 else None
         kinds = {wp.float32: "Row[float]", wp.uint32: "Row[wp.uint32]"}
         return "bool" if argument in (bool, wp.bool) else kinds.get(element, "?")
-
-    def _check_names(self) -> None:
-        """Refuse an attribute or a function whose name is similar to a known one, because it would be ignored."""
-        known = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
-        names = [name for name in vars(self.definition) if not name.startswith(("_", GROUP_PREFIX))]
-        guesses = {name: closest(name, known, 1, 0.75) for name in names if name not in known}
-        missing = [name for name, function in self.functions.items() if function is None]
-        for name, value in vars(sys.modules[self.definition.__module__]).items():
-            if isinstance(value, wp.Function) and name not in (*FUNCTIONS, *self.terms.functions):
-                guesses[name] = closest(name, missing, 1, 0.85) if self.world in value.input_types.values() else []
-        for name, guess in guesses.items():
-            if guess:
-                raise ValueError(f"{name!r}: did you mean {guess[0]}?")
 
 
 def draws_noise(observer: wp.Function) -> bool:

@@ -8,8 +8,6 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from lyceum_warp.support.suggestions import did_you_mean
-
 quat = wp.vec4
 """A quaternion in MuJoCo's order w, x, y, z. Do not pass a ``quat`` to Warp's quaternion functions, which expect the
 order x, y, z, w."""
@@ -200,14 +198,11 @@ def describe(
         current = max(stages - {int(Stage.ACCELERATION)}, default=0)
         refresh, reset = Stage(0 if lagged else current), Stage(max(stages, default=0))
         snapshot = lagged or Stage.ACCELERATION in stages
-    elif name in DERIVED_FIELDS:
+    else:
         reset = DERIVED_FIELDS[name]
         lagged = lagged and reset < Stage.ACCELERATION
         snapshot = lagged or reset == Stage.ACCELERATION
         refresh = Stage.NONE if snapshot else reset
-    else:
-        hint = did_you_mean(name, DATA_FIELDS, f"the fields are {', '.join(sorted(DATA_FIELDS))}")
-        raise ValueError(f"there is no field {name!r}: {hint}")
     if cleared:
         if name == "sensordata" and not snapshot:
             raise ValueError(

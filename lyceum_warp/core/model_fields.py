@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.core.fields import ELEMENT_TYPES, element_type
+from lyceum_warp.core.fields import DATA_FIELDS, ELEMENT_TYPES, element_type, is_data_field
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import described
 
@@ -151,7 +151,8 @@ class ModelField:
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
     """Write values of model fields into a batch of states."""
     for name, value in values.items():
-        field = describe_model_field(model, name)  # refuse a misspelt name
+        check_field(name)
+        field = describe_model_field(model, name)
         if name not in columns:
             raise ValueError(
                 f"the model field {name!r} is the same in every world of this environment: make the environment with "
@@ -173,6 +174,13 @@ def is_model_field(name: str) -> bool:
     return name in VARYING_FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
+def check_field(name: str) -> None:
+    """Raise a ValueError unless MjData or MjModel has a field of this name."""
+    if not (is_data_field(name) or is_model_field(name)):
+        hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
+        raise ValueError(f"there is no field {name!r}: {hint}")
+
+
 def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
     """Describe a field of a model."""
     if not varies and name not in VARYING_FIELDS:
@@ -183,11 +191,8 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
             raise ValueError(f"the model field {name!r} cannot be read in World: {reason}")
         return ModelField(name, value.shape[:1], element_type(value.shape), Constants.NONE)
     if name not in VARYING_FIELDS:
-        if not isinstance(getattr(model, name, getattr(model.opt, name, None)), np.ndarray | float | int):
-            hint = did_you_mean(name, VARYING_FIELDS, f"those are {', '.join(sorted(VARYING_FIELDS))}")
-            raise ValueError(f"there is no model field {name!r} that can differ between worlds: {hint}")
-        reason = _REASONS.get(name, "the engines share it between all worlds")
-        raise ValueError(f"the model field {name!r} cannot differ between worlds: {reason}")
+        shared = "the engines share it between all worlds" if is_model_field(name) else "it is no field of MjModel"
+        raise ValueError(f"the field {name!r} cannot differ between worlds: {_REASONS.get(name, shared)}")
     constants = VARYING_FIELDS[name]
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES

@@ -13,11 +13,10 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
-from lyceum_warp.binding.functions import check_field_name
 from lyceum_warp.binding.registry import errors_of, find_task
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
-from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
+from lyceum_warp.core.model_fields import check_field, describe_model_field, is_model_field, put_rows
 from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOptions
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import Task
@@ -476,7 +475,7 @@ class Env:
             ValueError: The environment has no such field, or the model has no element of this name.
         """
         if name not in self._fields:
-            check_field_name(name)
+            check_field(name)
             (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
             kept = ", ".join(sorted(self._fields))
             raise ValueError(

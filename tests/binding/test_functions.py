@@ -40,7 +40,6 @@ MISTAKES = {
         CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
         "World must be a Warp struct: decorate it with @wp.struct",
     ),
-    "a misspelt attribute": (CLASS, f"{CLASS}\n    horzon = 10", "'horzon': did you mean horizon"),
 }  # fmt: skip
 
 

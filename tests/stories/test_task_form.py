@@ -159,9 +159,7 @@ def test_controls_of_a_task_are_clipped_to_their_ranges(engine: str) -> None:
 
 
 def test_invalid_dynamics_raise_an_error_and_change_nothing() -> None:
-    with pytest.raises(
-        ValueError, match="there is no model field 'body_mas' that can differ .*: did you mean body_mass"
-    ):
+    with pytest.raises(ValueError, match="there is no field 'body_mas': did you mean body_mass"):
         lw.make("hopper", dynamics=["body_mas"])
     env = lw.make("hopper", nworld=2, dynamics=["body_mass"])
     state = env.get_state()
@@ -170,7 +168,7 @@ def test_invalid_dynamics_raise_an_error_and_change_nothing() -> None:
         ({"body_mass": "heavy"}, "body_mass must be numbers of shape"),
         ({"body_mass": -torch.ones(2, 5)}, r"body_mass\[0\] of world 0 is -1 and must be 0 or more"),
         ({"body_mass": torch.full((5,), torch.nan)}, r"body_mass\[0\] of world 0 is nan"),
-        ({"body_mas": 1.0}, "there is no model field 'body_mas'"),
+        ({"body_mas": 1.0}, "there is no field 'body_mas'"),
         ({"geom_friction": 1.0}, r"the model field 'geom_friction' is the same in every world .*dynamics=\['geom_fric"),
     ):
         with pytest.raises(ValueError, match=message) as caught:
