@@ -164,7 +164,7 @@ def task_section(name: str) -> str:
     if (DOCS / picture).exists():
         lines += [f"![{name}](../{picture})", ""]
     lines += [about, "", markdown(body), "", *facts(task), ""]
-    for group, layout in task.obs_layouts.items():
+    for group, layout in task.layouts.obs.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
         lines += table((f"{title}, {count(sum(layout.values()), 'number')}", "size"),
                        [(f"`{part}`", size) for part, size in layout.items()])  # fmt: skip
@@ -208,7 +208,7 @@ def shortened(value: Any) -> str:
 
 def actions(task: BoundTask) -> list[str]:
     """Return a table of actions and bounds. Successive actions with equal bounds share a row."""
-    space = action_space(task.model, task.definition.action_range, task.actions)
+    space = action_space(task.model, task.definition.action_range, task.layouts.actions)
     assert space.low is not None and space.high is not None
     rows: list[tuple[list[str], int, str]] = []
     for part, columns in space.parts.items():

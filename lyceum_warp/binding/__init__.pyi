@@ -1,16 +1,15 @@
 from lyceum_warp.binding.functions import TaskSource as TaskSource
+from lyceum_warp.binding.layouts import layouts_of as layouts_of
 from lyceum_warp.binding.models import (
     compile_model as compile_model,
     find_model as find_model,
     task_spec as task_spec,
 )
-from lyceum_warp.binding.observations import obs_layouts as obs_layouts
 from lyceum_warp.binding.opened_files import (
     data_files as data_files,
     stamps as stamps,
 )
 from lyceum_warp.binding.parameters import defaults as defaults
-from lyceum_warp.binding.parts import length as length
 from lyceum_warp.binding.registry import (
     errors_of as errors_of,
     file_name as file_name,

@@ -6,11 +6,11 @@ from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding import models, parts
+from lyceum_warp.binding import models
 from lyceum_warp.binding.attributes import check_attributes
 from lyceum_warp.binding.codegen import kernels_of
 from lyceum_warp.binding.functions import TaskSource, draws_noise
-from lyceum_warp.binding.observations import obs_layouts, obs_slices
+from lyceum_warp.binding.layouts import layouts_of
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
@@ -75,6 +75,11 @@ class BoundTask:
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)
         """The state at which a reset starts, (integration_size,) float64."""
+        if self.model.nu == 0 and task.actions is None:
+            raise ValueError(
+                "the model has no actuators: add actuators, or give the task actions = {...} and a control function "
+                "that writes inputs"
+            )
         inputs = self.writes.get("control", frozenset())
         self.fields: list[Field] = [
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
@@ -83,15 +88,8 @@ class BoundTask:
         self._sort_model_fields(model_fields, dynamics)
 
         self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
-        self.actions = self._actions()
-        """The size of each part of an action, or None if the actions are MuJoCo's controls."""
-        self.obs_layouts, self.memory, self.shared = self._layouts()
-        """The layouts of the observation groups, of ``memory`` and ``lasting_memory``, and of ``Shared`` and ``Sums``.
-        """
-        self.observers = source.observers(self.obs_layouts)
-        source.check_bodies(self.observers)
-        structs = obs_slices(source, self.params) | self.shared
-        self.kernels = kernels_of(source, self.observers, self.memory, structs)
+        self.layouts = layouts_of(source, self.params)
+        self.kernels = kernels_of(source, self.layouts)
 
     @property
     def params(self) -> dict[str, Any]:
@@ -110,13 +108,7 @@ class BoundTask:
     @property
     def noisy_groups(self) -> list[str]:
         """The observation groups whose functions draw random numbers."""
-        return [group for group, function in self.observers.items() if draws_noise(function)]
-
-    def _layouts(self) -> tuple[dict[str, dict[str, int]], dict[str, parts.Layout], dict[str, parts.Layout]]:
-        source, params = self.source, self.params
-        memory = {name: parts.layout(source.world, name, params, "World") for name in MEMORIES}
-        shared = {name: parts.layout(kind, "obs", params, name) for name, kind in source.shared_structs.items()}
-        return obs_layouts(source, params), memory, shared
+        return [group for group, function in self.layouts.observers.items() if draws_noise(function)]
 
     def _sort_model_fields(self, names: list[str], dynamics: Collection[str]) -> None:
         drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
@@ -139,24 +131,11 @@ class BoundTask:
                 f"which MuJoCo computes {stale[0]}"
             )
 
-    def _actions(self) -> dict[str, int] | None:
-        if self.definition.actions is not None:
-            return {
-                name: parts.length(f"the size of the action {name!r}", size, self.params)
-                for name, size in self.definition.actions.items()
-            }
-        if self.model.nu == 0:
-            raise ValueError(
-                "the model has no actuators: add actuators, or give the task actions = {...} and a control function "
-                "that writes inputs"
-            )
-        return None
-
     def change_params(self, params: Mapping[str, Any]) -> None:
         """Change parameters."""
         previous, self.parameters = self.parameters, self.parameters.changed(params)
         try:
-            changes = self._layouts() != (self.obs_layouts, self.memory, self.shared)
+            changes = layouts_of(self.source, self.params) != self.layouts
         except ValueError:  # the size of a part would differ between worlds
             changes = True
         if changes:

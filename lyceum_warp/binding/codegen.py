@@ -6,15 +6,16 @@ generated as text, because Warp compiles functions from their source.
 
 import dataclasses
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource, draws_noise
-from lyceum_warp.binding.parts import Layout, view_lines
+from lyceum_warp.binding.layouts import Layouts
+from lyceum_warp.binding.parts import view_lines
 from lyceum_warp.binding.registry import kernel_name
 from lyceum_warp.binding.sources import free_module_name, run_source
 from lyceum_warp.core.fields import is_data_field
@@ -42,18 +43,14 @@ _kernels: dict[Any, task_kernels.Kernels] = {}
 _MAKING = threading.RLock()
 
 
-Groups: TypeAlias = Mapping[str, wp.Function]
-Layouts: TypeAlias = Mapping[str, Layout]
-
-
-def kernels_of(source: TaskSource, groups: Groups, memory: Layouts, structs: Layouts) -> task_kernels.Kernels:
+def kernels_of(source: TaskSource, layouts: Layouts) -> task_kernels.Kernels:
     """Return a task's kernels. Tasks with the same functions, structs and sizes share their kernels."""
-    layouts = tuple((name, *layout.items()) for name, layout in (*memory.items(), *structs.items()))
+    rows = tuple((name, *layout.items()) for name, layout in (*layouts.memory.items(), *layouts.structs.items()))
     terms = (source.terms.text, *source.terms.functions.items())
-    key = (source.world, source.params, *source.functions.values(), *groups.items(), layouts, terms)
+    key = (source.world, source.params, *source.functions.values(), *layouts.observers.items(), rows, terms)
     with _MAKING:
         if key not in _kernels:
-            scope = _Generator(source, groups, memory, structs).run()
+            scope = _Generator(source, layouts).run()
             names = [field.name for field in dataclasses.fields(TaskCode) if field.name in scope]
             _kernels[key] = task_kernels.make_kernels(TaskCode(**{name: scope[name] for name in names}))
         return _kernels[key]
@@ -64,13 +61,12 @@ class _Generator:
 
     Args:
         source: The task's structs and functions.
-        groups: The function of each observation group.
-        memory: The layouts of ``memory`` and ``lasting_memory``.
-        structs: The layouts of ``Shared``, ``Sums``, and the observation groups that are structs.
+        layouts: The layouts of memory and observations.
     """
 
-    def __init__(self, source: TaskSource, groups: Groups, memory: Layouts, structs: Layouts) -> None:
-        self._source, self._groups, self._memory, self._structs = source, groups, memory, structs
+    def __init__(self, source: TaskSource, layouts: Layouts) -> None:
+        self._source, self._groups = source, layouts.observers
+        self._memory, self._structs = layouts.memory, layouts.structs
         self._texts: list[str] = []
         self._scope = _HELPERS | {"World": source.world, "Params": source.params}
         self._scope |= source.shared_structs

@@ -4,15 +4,16 @@ import ast
 import dataclasses
 import functools
 import sys
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from lyceum_warp.binding.parts import parts_of
-from lyceum_warp.binding.sources import is_struct, overloads, source_of
+from lyceum_warp.binding.sources import is_struct, name_of, overloads, source_of
 from lyceum_warp.binding.task_terms import Terms
-from lyceum_warp.binding.variants import Variant, check_structs, merged, variant_of
+from lyceum_warp.binding.variants import Variant, merged, variant_of
 from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
 from lyceum_warp.core.fields import INITIAL, INPUTS, is_data_field
 from lyceum_warp.core.model_fields import is_model_field
@@ -47,6 +48,8 @@ class TaskSource:
         """The class whose attributes are the defaults of Params."""
         self.params: Any = self._with_functions(declared)
         self._variant = variant_of(self._owners, self.world, self.params, declared)
+        for function in self._variant.replacements if self._variant else ():
+            self._check_structs(function)
         self.memory: dict[str, Part] = parts_of(self.world, "World")
         self.shared_structs = self._shared_structs()
         """``Shared`` and ``Sums`` by name, or nothing."""
@@ -56,7 +59,20 @@ class TaskSource:
         """The functions of ``FUNCTIONS`` that the task defines. Others are None."""
         if self.functions["observe"] is None:
             raise ValueError("there is no observe(s, p, obs), which every task needs")
+        self.observers = self._observers()
+        """The functions that write observation groups, by group name. Not every group is in ``obs``."""
+        rights = self._rights()
         self.terms = Terms(definition, self._term, self.functions, self.world, self.params)
+        functions = self.functions | {observer_name(group): function for group, function in self.observers.items()}
+        bodies = [(name, function, rights) for name, function in functions.items() if function is not None]
+        for name, term in self.terms.functions.items():
+            for overload in overloads(term):
+                bodies.append((name, overload, rights | {name: dict.fromkeys(overload.input_types, ())}))
+        for body in bodies:
+            check_writes(*body)
+        for name in _BEFORE_FORWARD:
+            if (function := functions[name]) is not None:
+                check_reads(name, function)
 
     @functools.cached_property
     def written(self) -> dict[str, frozenset[str]]:
@@ -69,41 +85,13 @@ class TaskSource:
         trained = frozenset[str]().union(*(fields for name, fields in self.written.items() if name != "startup"))
         return tuple(name for name in self._lasting() if name in trained)
 
-    def check_bodies(self, observers: Mapping[str, wp.Function]) -> None:
-        """Raise a ValueError if a function reads or writes what it must not.
-
-        ``observers`` are the functions of the observation groups, by group name.
-        """
-        rights = {name: self._rights_of(form) for name, form in FUNCTIONS.items()}
-        rights |= {observer_name(group): rights["observe"] for group in observers}
-        functions = {name: function for name, function in self.functions.items() if function is not None}
-        functions |= {observer_name(group): function for group, function in observers.items()}
-        for name, function in functions.items():
-            check_writes(name, function, rights)
-        for name in _BEFORE_FORWARD & functions.keys():
-            check_reads(name, functions[name])
-        for name, term in self.terms.functions.items():
-            for overload in overloads(term):
-                none = {name: dict.fromkeys(overload.input_types, ())}
-                check_writes(name, overload, rights | none)
-
-    def observers(self, groups: Collection[str]) -> dict[str, wp.Function]:
-        """Return the functions that write observation groups, by group name."""
-        observers = {}
-        for group in groups:
-            form = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
-            observer = self._function(form)
-            if observer is None:
-                raise ValueError(f"no function writes the group {group!r} of observations: add {form.signature}")
-            observers[group] = observer
-        return observers
-
-    def group_structs(self) -> dict[str, Any]:
-        """Return the structs into which functions write observation groups, by group name."""
+    def _observers(self) -> dict[str, wp.Function]:
         scopes = [scope for owner in reversed(self._owners) for scope in (owner.scope, vars(owner))]
         names = dict.fromkeys(name for scope in scopes for name in scope if name.startswith(GROUP_PREFIX))
-        observers = self.observers(["policy", *(n.removeprefix(GROUP_PREFIX) for n in names if self._observes(n))])
-        return {group: list(observer.input_types.values())[2] for group, observer in observers.items()}
+        groups = [name.removeprefix(GROUP_PREFIX) for name in names if self._observes(name)]
+        forms = {g: dataclasses.replace(FUNCTIONS["observe"], name=observer_name(g)) for g in ("policy", *groups)}
+        functions = {group: self._function(form) for group, form in forms.items()}
+        return {group: function for group, function in functions.items() if function is not None}
 
     def _observes(self, name: str) -> bool:
         """Whether a function has the arguments of ``observe``. Others are helpers, or belong to another task."""
@@ -187,18 +175,20 @@ class TaskSource:
 
     # functions
 
-    def _rights_of(self, form: TaskFunction) -> Rights:
-        """Return which fields of each argument a function may write."""
+    def _rights(self) -> dict[str, Rights]:
+        """Return which fields of each argument each function may write."""
         model = [name for name in self.types if is_model_field(name)]
-        groups = {
+        fields = {
             "inputs": INPUTS,
             "memory": tuple(self.memory),
             "lasting": (*self._lasting(), *model),
             "start": (*INITIAL, *self.memory, *model),
         }
-        return {
-            name: None if name in RESULTS else groups.get(form.writes.get(name, ""), ()) for name in form.argument_names
+        rights: dict[str, Rights] = {
+            name: {a: None if a in RESULTS else fields.get(form.writes.get(a, ""), ()) for a in form.argument_names}
+            for name, form in FUNCTIONS.items()
         }
+        return rights | {observer_name(group): rights["observe"] for group in self.observers}
 
     def _lasting(self) -> list[str]:
         return [name for name, part in self.memory.items() if part.kind == "lasting_memory"]
@@ -218,7 +208,7 @@ class TaskSource:
         returns = any(isinstance(node, ast.Return) for node in ast.walk(source_of(function).tree))
         if form.result is not None and not returns:
             raise ValueError(f"{name} has no return: write it as {form.signature}")
-        check_structs(function, {self.world: self.world.cls, self.params: self.defaults})
+        self._check_structs(function)
         kinds = tuple(map(self._kind, types))
         returned = function.adj.arg_types.get("return")
         if kinds not in (form.kinds, form.all_kinds) or returned not in (None, form.result):
@@ -227,6 +217,20 @@ class TaskSource:
                 more = f"{more}; to write the struct {structs[2].key}, remove obs from the class"
             raise ValueError(f"{name} must be written as {form.signature}{more}")
         return function
+
+    def _check_structs(self, function: wp.Function) -> None:
+        """Raise a ValueError if a function takes another World or Params than the task uses."""
+        declared = {"World": self.world.cls, "Params": self.defaults}
+        for kind in filter(is_struct, function.input_types.values()):
+            name = kind.key.rpartition(".")[2]
+            if kind not in (self.world, self.params) and (cls := declared.get(name)) is not None:
+                bases = [base for base in cls.__bases__ if base is not object and not issubclass(kind.cls, base)]
+                named = ", ".join(f"{Path(_file(base)).stem}.{base.__name__}" for base in (*bases, kind.cls))
+                raise ValueError(
+                    f"{name_of(function)} takes {name} from {_file(kind.cls)}, but the task uses {name} from "
+                    f"{_file(cls)}: import World and Params from the same file, write the task's struct as class "
+                    f"{name}({named}), or rewrite {name_of(function)}"
+                )
 
     def _kind(self, argument: Any) -> str:
         """Return an argument's type as ``FUNCTIONS`` writes it, such as "World" or "Row[float]"."""
@@ -243,3 +247,7 @@ class TaskSource:
 def draws_noise(observer: wp.Function) -> bool:
     """Whether the function of an observation group takes a random stream."""
     return len(observer.input_types) > len(FUNCTIONS["observe"].kinds)
+
+
+def _file(cls: type) -> str:
+    return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)

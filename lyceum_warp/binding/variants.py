@@ -11,12 +11,11 @@ import itertools
 import sys
 import types
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
-from lyceum_warp.binding.sources import has_source, is_struct, name_of, overloads
+from lyceum_warp.binding.sources import has_source, is_struct, overloads
 from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, Task
 
 
@@ -50,6 +49,8 @@ class Variant:
             self._copies[function] = self._copy(function, scopes[home], homes[home])
         for name, scope in scopes.items():
             scope |= {key: self.seen(value, name) for key, value in scope.items()}
+        self.replacements = [self.seen(function, _home(function)) for function in replacements.values()]
+        """The copies of the functions that replace others."""
 
     def seen(self, value: Any, viewer: str = "") -> Any:
         """Return the replacement of a function, a struct or a module of the family.
@@ -112,10 +113,7 @@ def variant_of(owners: Sequence[type[Task]], world: Any, params: Any, declared: 
         return None
     key = (tuple(modules), tuple(functions), tuple(structs.items()), tuple(replacements.items()))
     if key not in _variants:
-        variant = _variants[key] = Variant(modules, functions, structs, replacements)
-        for replacement in replacements.values():
-            copy = variant.seen(replacement, _home(replacement))
-            check_structs(copy, {world: world.cls, params: declared.cls})
+        _variants[key] = Variant(modules, functions, structs, replacements)
     return _variants[key]
 
 
@@ -217,24 +215,3 @@ def _names(module: types.ModuleType, structs: set[Any]) -> bool:
         and any(is_struct(kind) and kind in structs for f in overloads(value) for kind in f.input_types.values())
         for value in vars(module).values()
     )  # fmt: skip
-
-
-def check_structs(function: wp.Function, declared: Mapping[Any, type]) -> None:
-    """Raise a ValueError if a function takes another World or Params than its task uses.
-
-    ``declared`` maps the World and the Params that the task's functions take to the classes that the task declares.
-    """
-    for kind in filter(is_struct, function.input_types.values()):
-        for name, cls in zip(("World", "Params"), declared.values(), strict=True):
-            if kind not in declared and kind.key.rpartition(".")[2] == name:
-                bases = [base for base in cls.__bases__ if base is not object and not issubclass(kind.cls, base)]
-                named = ", ".join(f"{Path(_file(base)).stem}.{base.__name__}" for base in (*bases, kind.cls))
-                raise ValueError(
-                    f"{name_of(function)} takes {name} from {_file(kind.cls)}, but the task uses "
-                    f"{name} from {_file(cls)}: import World and Params from the same file, write the task's struct as "
-                    f"class {name}({named}), or rewrite {name_of(function)}"
-                )
-
-
-def _file(cls: type) -> str:
-    return str(getattr(sys.modules.get(cls.__module__), "__file__", None) or cls.__module__)

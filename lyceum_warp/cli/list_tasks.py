@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.binding import TaskSource, defaults, find_model, find_task, length, obs_layouts, task_names, task_spec
+from lyceum_warp.binding import TaskSource, defaults, find_model, find_task, layouts_of, task_names, task_spec
 from lyceum_warp.cli.display import console
 from lyceum_warp.core import ModelFile, Task
 
@@ -46,13 +46,13 @@ class Tasks:
             note = ""
             source = TaskSource(task)
             params = defaults(source.params, source.defaults)
-            obs = sum(obs_layouts(source, params)["policy"].values())
+            layouts = layouts_of(source, params)
+            obs = sum(layouts.obs["policy"].values())
             actions = step = "-"
             try:
                 spec = task_spec(task)
                 step = f"{spec.option.timestep * task.frame_skip:g} s"
-                sizes = [length(f"the size of {part}", size, params) for part, size in (task.actions or {}).items()]
-                actions = str(sum(sizes) or len(spec.actuators))
+                actions = str(len(spec.actuators) if layouts.actions is None else sum(layouts.actions.values()))
             except (ImportError, OSError, ValueError) as error:  # the package with the model is missing
                 note = str(error)
             about, model = texts[name]

@@ -23,14 +23,14 @@ def own_bytes_per_world(task: BoundTask) -> int:
     snapshots = [field for field in task.fields if field.snapshot]
     state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
     copies = sum(field.size for field in task.fields)
-    observations = sum(sum(layout.values()) for layout in task.obs_layouts.values())
+    observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
     return 4 * copies + 8 * state_size + 8 * observations + 300
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, except for the counters."""
     form, found = task.definition, dict[str, int]()
-    for layout in task.memory.values():
+    for layout in task.layouts.memory.values():
         found |= sizes(layout)
     own = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
     return found | {name: size for name, size in own.items() if size}
@@ -38,7 +38,7 @@ def own_parts(task: BoundTask) -> dict[str, int]:
 
 def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
     """Get the columns of ``memory`` and ``lasting_memory`` in a state."""
-    ends = {name: [space.parts[part] for part in layout] for name, layout in task.memory.items() if layout}
+    ends = {name: [space.parts[part] for part in layout] for name, layout in task.layouts.memory.items() if layout}
     return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
 
 
@@ -59,7 +59,7 @@ class WorldArrays:
     def _allocate_fields(self) -> None:
         n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels
         self.memory, self.lasting_memory, self._lasting_before = (
-            wp.zeros((n, sum(sizes(self.task.memory[name]).values())), dtype=float)
+            wp.zeros((n, sum(sizes(self.task.layouts.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
         self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
@@ -91,12 +91,12 @@ class WorldArrays:
         self.params = self.task.parameters.array(self.device)
         self.weights = self.task.parameters.weights(self.device)
         self.transition.params, self.transition.weights = self.params, self.weights
-        self.action_space = action_space(model, task.action_range, self.task.actions)
-        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.obs_layouts.items()}
+        self.action_space = action_space(model, task.action_range, self.task.layouts.actions)
+        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.layouts.obs.items()}
         self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
     def _allocate_shared(self) -> None:
-        layouts = self.task.shared
+        layouts = self.task.layouts.shared
         shared, sums = (sum(sizes(layouts.get(name, {})).values()) for name in ("Shared", "Sums"))
         self.shared, self.sums = wp.zeros((1, shared), dtype=float), wp.zeros(sums, dtype=wp.int64)
         """``shared`` has shape (1, size of Shared). ``sums`` has shape (size of Sums,). It stores 1.0 as ``UNIT``."""

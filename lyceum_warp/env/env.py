@@ -214,10 +214,10 @@ class Env:
                 self.episode_metric_sums = torch_view(worlds.episode_metrics)
                 memory = torch_view(worlds.shared)[0]
                 self.shared = {name: memory[part.start : part.start + part.size]
-                               for name, part in self.task.shared.get("Shared", {}).items()}  # fmt: skip
+                               for name, part in self.task.layouts.shared.get("Shared", {}).items()}  # fmt: skip
                 lasting = torch_view(worlds.lasting_memory)
                 self.lasting = {name: lasting[:, part.start : part.start + part.size]
-                                for name, part in self.task.memory["lasting_memory"].items()}  # fmt: skip
+                                for name, part in self.task.layouts.memory["lasting_memory"].items()}  # fmt: skip
                 self.reward_space = self.eval_space = Space()
                 self._fields = {name: torch_view(array) for name, array in worlds.fields.items()}
                 self.time, self.episode_step = self._fields["time"], torch_view(worlds.counters.step)

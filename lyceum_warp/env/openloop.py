@@ -112,7 +112,7 @@ class OpenLoop:
             self._rows.action = self._actions.reshape((-1, nact))
             self._rows.counters = self._last.counters = self.worlds.counters
             batches = (self._rows.before, self._rows.after, self._last.after)
-            if task.shared:
+            if task.layouts.shared:
                 for batch in batches:
                     batch.shared = self.worlds.shared
             constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}

@@ -101,7 +101,7 @@ class Probe:
         """Raise a ValueError if a function leaves an element of an observation unwritten, or writes NaN."""
         run = _Run(self._worlds, self._world, _GUARDS[0])
         list(run.judge())
-        for group, layout in self._task.obs_layouts.items():
+        for group, layout in self._task.layouts.obs.items():
             rows, columns = run.groups[group], np.array(Space.of(layout).columns)
             function = observer_name(group)
             if (unwritten := rows.unwritten()).any():
@@ -125,7 +125,7 @@ class _Run:
             before = self._rows((1, *array.shape[1:]), array.dtype, array) if name in MEMORIES else self._fields[name]
             setattr(self._transition.before, name, before.array)
         self._observations, self.groups = task.kernels.Observations(), dict[str, GuardedRows]()
-        for group, layout in task.obs_layouts.items():
+        for group, layout in task.layouts.obs.items():
             self.groups[group] = self._rows((1, sum(layout.values())))
             setattr(self._observations, group, self.groups[group].array)
         self._action = self._rows((1, worlds.action.shape[1]), values=self._one(worlds.action))
@@ -201,7 +201,7 @@ class _Run:
 
     def _written_fields(self, function: str) -> Results:
         for name in sorted(self._task.writes.get(function, ())):
-            rows, layout = self._fields[name], self._task.memory.get(name)
+            rows, layout = self._fields[name], self._task.layouts.memory.get(name)
             if not layout:
                 yield self._checked(function, rows, name, f"the model has {rows.size}")
             else:  # an index outside of the row most likely leaves its first or its last part

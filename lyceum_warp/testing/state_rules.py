@@ -132,7 +132,7 @@ def check_determinism(ctx: Context) -> None:
 
 def _physics(env: Env, state: torch.Tensor) -> torch.Tensor:
     """Select the parts of an initial state that do not depend on earlier episodes."""
-    names = [n for n in env.state_space.parts if n not in (*COUNTERS, *env.task.memory["lasting_memory"])]
+    names = [n for n in env.state_space.parts if n not in (*COUNTERS, *env.task.layouts.memory["lasting_memory"])]
     return torch.cat([state[:, env.state_space.parts[name]] for name in names], dim=1)
 
 
@@ -140,7 +140,7 @@ def _lasting_columns(env: Env) -> list[slice]:
     """Return the state columns of ``lasting_memory`` and of model fields that no reset randomizes."""
     names = [field.name for field in env.task.dynamics if field.name not in env.task.reset_dynamics]
     parts = env.state_space.parts
-    return [parts[name] for name in (*env.task.memory["lasting_memory"], *names)]
+    return [parts[name] for name in (*env.task.layouts.memory["lasting_memory"], *names)]
 
 
 def check_reset(ctx: Context) -> None:

@@ -66,7 +66,7 @@ def test_new_task_observes_the_state_and_its_sensors(folder: Path) -> None:
 def test_observations_of_a_new_task_have_the_sizes_of_the_model(model: str, folder: Path) -> None:
     task = BoundTask(find_task(new("walk", model)))
     sizes = {"position": task.model.nq, "velocity": task.model.nv, "activation": task.model.na}
-    layout = dict(task.obs_layouts["policy"])
+    layout = dict(task.layouts.obs["policy"])
     assert layout.pop("sensors", 0) <= task.model.nsensordata
     assert all(sizes[part] == size for part, size in layout.items())
     assert task.timestep == pytest.approx(0.02)
