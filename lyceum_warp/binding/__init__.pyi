@@ -2,7 +2,6 @@ from lyceum_warp.binding.functions import TaskSource as TaskSource
 from lyceum_warp.binding.layouts import layouts_of as layouts_of
 from lyceum_warp.binding.models import (
     compile_model as compile_model,
-    find_model as find_model,
     task_spec as task_spec,
 )
 from lyceum_warp.binding.opened_files import (

@@ -2,15 +2,16 @@
 
 import math
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import warp as wp
 
 from lyceum_warp.binding.functions import TaskSource
-from lyceum_warp.core.model_fields import check_field
+from lyceum_warp.core.fields import DATA_FIELDS, is_data_field
+from lyceum_warp.core.model_fields import VARYING_FIELDS, is_model_field
 from lyceum_warp.core.task import FUNCTIONS, GROUP_PREFIX, MEMORIES, Task
-from lyceum_warp.support.suggestions import closest
+from lyceum_warp.support.suggestions import closest, did_you_mean
 
 _LOWEST = {"frame_skip": 1, "draws": 1, "settle": 0, "horizon": 0, "success_steps": 1}
 """Attributes that are whole numbers, each with its smallest value."""
@@ -26,9 +27,16 @@ def check_attributes(source: TaskSource, fields: Collection[str] = ()) -> None:
             raise ValueError(f"{name!r}: did you mean {guess[0]}?")
     for problem in _problems(source.definition, source):
         raise ValueError(problem)
-    for name in (*source.types, *fields):
-        if name not in MEMORIES:
-            check_field(name)
+    check_fields(name for name in (*source.types, *fields) if name not in MEMORIES)
+
+
+def check_fields(names: Iterable[str]) -> None:
+    """Raise a ValueError unless MjData or MjModel has a field of each name."""
+    for name in names:
+        if not (is_data_field(name) or is_model_field(name)):
+            known = [*DATA_FIELDS, *VARYING_FIELDS]
+            hint = did_you_mean(name, known, "fields have MuJoCo's names, of MjData and MjModel")
+            raise ValueError(f"there is no field {name!r}: {hint}")
 
 
 def _new_names(source: TaskSource) -> dict[str, tuple[Collection[str], float]]:
@@ -67,6 +75,13 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
         for name in getattr(task, attribute):
             if name not in source.world.vars:
                 yield f"{attribute} has {name!r}: make it a field of World, too"
+    written = frozenset[str]().union(*(source.writes.get(name, ()) for name in ("initialize", "randomize", "event")))
+    if both := [
+        name
+        for name in source.types
+        if is_model_field(name) and name in written & source.writes.get("startup", frozenset())
+    ]:
+        yield f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"
     metrics = source.terms.metrics
     for name in metrics:
         if not name.isprintable() or not set(name).isdisjoint(",'\""):

@@ -1,5 +1,6 @@
 """Bind a task to its model and its parameters, and make its kernels."""
 
+import functools
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
 from lyceum_warp.core.model_fields import describe_model_field
-from lyceum_warp.core.options import ModelSource, PhysicsOptions
+from lyceum_warp.core.model_files import ModelSource, read_task_spec
+from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.core.task import MEMORIES, Task
 
 _SPELLED = {
@@ -48,21 +50,17 @@ class BoundTask:
         self.definition = task
         """The task's class."""
         self.nworld = nworld
-        self.name = task_name(task)
         self.source = source = TaskSource(task)
         check_attributes(source, (*fields, *dynamics))
         self.functions, self.types = source.functions, source.types
         self.metrics, self.curriculum = source.terms.metrics, source.curriculum
-        self.writes = {
-            name: frozenset(source.memory[field].kind if field in source.memory else field for field in fields)
-            for name, fields in source.written.items()
-        }
+        self.writes = source.writes
         """What each function writes: fields of World and rows of memory."""
         names = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         data_fields = [name for name in names if is_data_field(name)]
         model_fields = [name for name in names if not is_data_field(name)]
 
-        self.spec = models.read_task_spec(task, model)
+        self.spec = read_task_spec(task, model)
         """The model before ``edit_model``."""
         edited = models.edited(task, self.spec)
         try:
@@ -85,11 +83,35 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*data_fields, "time", "ctrl"])
         ]
-        self._sort_model_fields(model_fields, dynamics)
+        drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
+        between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
+        self.reset_dynamics = [name for name in model_fields if name in between]
+        """The model fields that resets or events write. A reset first restores their nominal values."""
+        varied = frozenset().union(dynamics, *drawn.values())
+        self.dynamics = [
+            describe_model_field(self.model, name)
+            for name in dict.fromkeys([*model_fields, *dynamics])
+            if name in varied
+        ]
+        self.constants = [
+            describe_model_field(self.model, name, varies=False) for name in model_fields if name not in varied
+        ]
+        """The model fields that functions read and that have the same value in all worlds."""
+        bases = [field.name for field in self.dynamics if field.constants]
+        if bases and (stale := [field.name for field in self.constants if field.follows]):
+            raise ValueError(
+                f"World.{stale[0]} stays the same when a world changes {bases[0]!r}: read the fields from which MuJoCo "
+                f"computes {stale[0]}"
+            )
 
         self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
         self.layouts = layouts_of(source, self.params)
         self.kernels = kernels_of(source, self.layouts)
+
+    @functools.cached_property
+    def name(self) -> str:
+        """The task's name."""
+        return task_name(self.definition)
 
     @property
     def params(self) -> dict[str, Any]:
@@ -109,27 +131,6 @@ class BoundTask:
     def noisy_groups(self) -> list[str]:
         """The observation groups whose functions draw random numbers."""
         return [group for group, function in self.layouts.observers.items() if draws_noise(function)]
-
-    def _sort_model_fields(self, names: list[str], dynamics: Collection[str]) -> None:
-        drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
-        between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
-        self.reset_dynamics = [name for name in names if name in between]
-        """The model fields that resets or events write. A reset first restores their nominal values."""
-        if both := [name for name in self.reset_dynamics if name in drawn["startup"]]:
-            raise ValueError(
-                f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"
-            )
-        written = frozenset().union(dynamics, *drawn.values())
-        varied = [name for name in dict.fromkeys([*names, *dynamics]) if name in written]
-        self.dynamics = [describe_model_field(self.model, name) for name in varied]
-        self.constants = [describe_model_field(self.model, name, varies=False) for name in names if name not in varied]
-        """The model fields that functions read and that have the same value in all worlds."""
-        drawn_constants = [field.name for field in self.dynamics if field.constants]
-        if drawn_constants and (stale := [field.name for field in self.constants if field.follows]):
-            raise ValueError(
-                f"World.{stale[0]} stays the same when a world changes {drawn_constants[0]!r}: read the fields from "
-                f"which MuJoCo computes {stale[0]}"
-            )
 
     def change_params(self, params: Mapping[str, Any]) -> None:
         """Change parameters."""

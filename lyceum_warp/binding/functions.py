@@ -75,6 +75,12 @@ class TaskSource:
                 check_reads(name, function)
 
     @functools.cached_property
+    def writes(self) -> dict[str, frozenset[str]]:
+        """The fields of World and the kinds of memory that each function writes."""
+        kinds = {name: part.kind for name, part in self.memory.items()}
+        return {name: frozenset(kinds.get(field, field) for field in fields) for name, fields in self.written.items()}
+
+    @functools.cached_property
     def written(self) -> dict[str, frozenset[str]]:
         """The fields and the parts of memory that each function writes."""
         return {name: written_fields(function) for name, function in self.functions.items() if function is not None}

@@ -1,12 +1,8 @@
-"""Load a task's model, and edit it before compilation, so that both engines simulate the same physics."""
+"""Edit and compile a task's model, so that both engines simulate the same physics."""
 
 import logging
-import os
-import sys
-import textwrap
 import warnings
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -14,22 +10,12 @@ import numpy as np
 
 from lyceum_warp.core.fields import ON_DEMAND, SENSED
 from lyceum_warp.core.model_fields import MOVED_INERTIA
-from lyceum_warp.core.model_files import ModelFile, gymnasium_model, read_spec
-from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS, ModelSource, PhysicsOptions
+from lyceum_warp.core.model_files import ModelSource, read_task_spec
+from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS, PhysicsOptions
 from lyceum_warp.core.task import Task
 from lyceum_warp.support.mujoco_log import quiet
-from lyceum_warp.support.suggestions import did_you_mean
 
 log = logging.getLogger(__name__)
-
-
-def read_task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
-    """Load a task's model, or the given model, as an MjSpec without ``edit_model``."""
-    if model is not None:
-        return load_spec(model)
-    if not hasattr(task, "model"):
-        raise ValueError('there is no model: add one to the class, such as model = "robot.xml"')
-    return load_spec(task.model() if callable(task.model) else task.model, task)
 
 
 def task_spec(task: type[Task], model: ModelSource | None = None) -> mujoco.MjSpec:
@@ -58,55 +44,6 @@ def edited(task: type[Task], spec: mujoco.MjSpec) -> mujoco.MjSpec:
                 f"edit_model returns {type(result).__name__}: it must change the spec in place and return None"
             )
     return copy
-
-
-def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
-    """Load a model as an MjSpec that does not depend on the working directory.
-
-    Args:
-        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec. An MjSpec is copied.
-        owner: The task class that declares the model. Relative paths start at the folder of this class. If None, they
-            start at the current folder.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: MuJoCo can't read the file, or the source is a compiled model or a string of XML.
-    """
-    if isinstance(source, mujoco.MjModel):
-        raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
-    if isinstance(source, mujoco.MjSpec):
-        spec = source.copy()
-        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to modelfiledir
-        return spec
-    if isinstance(source, ModelFile):
-        return source.spec()
-    found = find_model(source, owner)
-    return found.spec() if isinstance(found, ModelFile) else read_spec(found)
-
-
-def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
-    """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``."""
-    if isinstance(source, str) and source.lstrip().startswith("<"):
-        start = textwrap.shorten(source, 24, placeholder=" ...")
-        raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
-    folder = Path()
-    if owner is not None:  # the path may be inherited from a class in another folder
-        owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
-    if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
-        folder = Path(file).parent
-    path = (folder / os.path.expanduser(source)).absolute()
-    if path.is_file():
-        return path
-    if Path(source).name != str(source):
-        raise FileNotFoundError(f"there is no model file {str(source)!r}")
-    shipped = gymnasium_model(str(source))
-    try:
-        shipped.path()
-    except FileNotFoundError as error:
-        hint = did_you_mean(path.name, [file.name for file in path.parent.glob("*.xml")])
-        hint = f" ({hint})" if hint else ""
-        raise FileNotFoundError(f"there is no model file {path}{hint}; among Gymnasium's models, {error}") from None
-    return shipped
 
 
 def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.binding import TaskSource, defaults, find_model, find_task, layouts_of, task_names, task_spec
+from lyceum_warp.binding import TaskSource, defaults, find_task, layouts_of, task_names, task_spec
 from lyceum_warp.cli.display import console
-from lyceum_warp.core import ModelFile, Task
+from lyceum_warp.core import ModelFile, Task, find_model
 
 _LEGEND = """
 obs, act: numbers in an observation and an action; skip: substeps in a step; dt: seconds in a step.

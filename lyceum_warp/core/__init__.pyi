@@ -15,6 +15,7 @@ from lyceum_warp.core.gate import (
 from lyceum_warp.core.mirror import Mirror as Mirror
 from lyceum_warp.core.model_files import (
     ModelFile as ModelFile,
+    find_model as find_model,
     gymnasium_model as gymnasium_model,
     gymnasium_robotics_model as gymnasium_robotics_model,
     menagerie_model as menagerie_model,

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.core.fields import DATA_FIELDS, ELEMENT_TYPES, element_type, is_data_field
-from lyceum_warp.support.suggestions import did_you_mean
+from lyceum_warp.core.fields import ELEMENT_TYPES, element_type
 from lyceum_warp.support.validate import described
 
 
@@ -151,7 +150,6 @@ class ModelField:
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
     """Write values of model fields into a batch of states."""
     for name, value in values.items():
-        check_field(name)
         field = describe_model_field(model, name)
         if name not in columns:
             raise ValueError(
@@ -172,13 +170,6 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 def is_model_field(name: str) -> bool:
     """Return whether MjModel or MjModel.opt has an attribute of this name."""
     return name in VARYING_FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
-
-
-def check_field(name: str) -> None:
-    """Raise a ValueError unless MjData or MjModel has a field of this name."""
-    if not (is_data_field(name) or is_model_field(name)):
-        hint = did_you_mean(name, [*DATA_FIELDS, *VARYING_FIELDS], "fields have MuJoCo's names, of MjData and MjModel")
-        raise ValueError(f"there is no field {name!r}: {hint}")
 
 
 def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:

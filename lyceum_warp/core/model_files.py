@@ -1,4 +1,4 @@
-"""Refer to model files in other packages or in a local folder, and find them on demand."""
+"""Refer to model files in other packages or in a local folder, find them on demand, and load them."""
 
 import dataclasses
 import importlib
@@ -6,14 +6,15 @@ import importlib.util
 import logging
 import os
 import sys
+import textwrap
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 
-from lyceum_warp.support.suggestions import closest
+from lyceum_warp.support.suggestions import closest, did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -204,3 +205,64 @@ def read_spec(path: Path) -> mujoco.MjSpec:
         raise ValueError(f"the path of the model {str(path)!r} is not UTF-8: rename it") from error
     except RuntimeError as error:  # MuJoCo's parser does not say which C++ exception it caught
         raise ValueError(f"MuJoCo can't read the model {path}: is one of its sizes too large? ({error})") from error
+
+
+ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
+
+
+def read_task_spec(task: Any, model: ModelSource | None = None) -> mujoco.MjSpec:
+    """Load a task's model, or the given model, as an MjSpec without ``edit_model``."""
+    if model is not None:
+        return load_spec(model)
+    if not hasattr(task, "model"):
+        raise ValueError('there is no model: add one to the class, such as model = "robot.xml"')
+    return load_spec(task.model() if callable(task.model) else task.model, task)
+
+
+def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
+    """Load a model as an MjSpec that does not depend on the working directory.
+
+    Args:
+        source: A path, the name of a model that gymnasium ships, a ModelFile, or an MjSpec. An MjSpec is copied.
+        owner: The task class that declares the model. Relative paths start at the folder of this class. If None, they
+            start at the current folder.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: MuJoCo can't read the file, or the source is a compiled model or a string of XML.
+    """
+    if isinstance(source, mujoco.MjModel):
+        raise ValueError("a task's model must be a file or an MjSpec, not a compiled MjModel: give its MjSpec")
+    if isinstance(source, mujoco.MjSpec):
+        spec = source.copy()
+        spec.modelfiledir = str(Path(spec.modelfiledir).absolute())  # mesh paths are relative to modelfiledir
+        return spec
+    if isinstance(source, ModelFile):
+        return source.spec()
+    found = find_model(source, owner)
+    return found.spec() if isinstance(found, ModelFile) else read_spec(found)
+
+
+def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
+    """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``."""
+    if isinstance(source, str) and source.lstrip().startswith("<"):
+        start = textwrap.shorten(source, 24, placeholder=" ...")
+        raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
+    folder = Path()
+    if owner is not None:  # the path may be inherited from a class in another folder
+        owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
+    if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
+        folder = Path(file).parent
+    path = (folder / os.path.expanduser(source)).absolute()
+    if path.is_file():
+        return path
+    if Path(source).name != str(source):
+        raise FileNotFoundError(f"there is no model file {str(source)!r}")
+    shipped = gymnasium_model(str(source))
+    try:
+        shipped.path()
+    except FileNotFoundError as error:
+        hint = did_you_mean(path.name, [file.name for file in path.parent.glob("*.xml")])
+        hint = f" ({hint})" if hint else ""
+        raise FileNotFoundError(f"there is no model file {path}{hint}; among Gymnasium's models, {error}") from None
+    return shipped

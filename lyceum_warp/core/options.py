@@ -6,12 +6,11 @@ command line. To add an option, add a field to one of these classes.
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
-from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import mujoco
 
-from lyceum_warp.core.model_files import ModelFile
+from lyceum_warp.core.model_files import ModelSource
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
 from lyceum_warp.support.validate import (
@@ -23,8 +22,6 @@ from lyceum_warp.support.validate import (
     positive_number,
     whole_number,
 )
-
-ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 
 CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 INTEGRATORS = {

@@ -20,8 +20,8 @@ from lyceum_warp.support.validate import check_tensor
 
 def own_bytes_per_world(task: BoundTask) -> int:
     """Estimate the bytes that each world needs outside the engine's arrays."""
-    snapshots = [field for field in task.fields if field.snapshot]
-    state_size = state_space(task.model, snapshots, task.dynamics, own_parts(task)).size
+    own, snapshots = own_parts(task), [field for field in task.fields if field.snapshot]
+    state_size = state_space(task.model, snapshots, task.dynamics, own).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
     return 4 * copies + 8 * state_size + 8 * observations + 300

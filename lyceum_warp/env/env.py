@@ -11,13 +11,15 @@ import numpy as np
 import torch
 import warp as wp
 
+from lyceum_warp.binding.attributes import check_fields
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.registry import errors_of, find_task
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
-from lyceum_warp.core.model_fields import check_field, describe_model_field, is_model_field, put_rows
-from lyceum_warp.core.options import OPTIONS, EnvOptions, ModelSource, PhysicsOptions
+from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
+from lyceum_warp.core.model_files import ModelSource
+from lyceum_warp.core.options import OPTIONS, EnvOptions, PhysicsOptions
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import Engine
@@ -188,12 +190,11 @@ class Env:
         with errors_of(task):
             self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
             self.nworld = options.nworld
-            self.device = find_device(options.device)
             self.task = BoundTask(
                 task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
                 physics=options.physics, params=params,
             )  # fmt: skip
-            self.timestep = self.task.timestep
+            self.timestep, self.device = self.task.timestep, find_device(options.device)
             self.engine = open_engine(
                 options.engine, self.task.model, self.nworld, self.device, self.task.fields,
                 dynamics=self.task.dynamics, initial=self.task.initial, reserved=own_bytes_per_world(self.task),
@@ -228,7 +229,7 @@ class Env:
                 Probe(worlds).check_bounds()  # a write out of range would damage the environment's own arrays
                 self.rand_reset(options.seed)
                 if self.task.dynamics and not _replica:  # after construction, invalid values are faults
-                    self._check_dynamics(self.get_state(), [field.name for field in self.task.dynamics])
+                    self._check_dynamics(self._fields)
                 Probe(worlds).check_observations()
             except Exception as error:
                 if (clear := explained(error, self.task)) is error:
@@ -475,7 +476,7 @@ class Env:
             ValueError: The environment has no such field, or the model has no element of this name.
         """
         if name not in self._fields:
-            check_field(name)
+            check_fields([name])
             (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
             kept = ", ".join(sorted(self._fields))
             raise ValueError(
@@ -504,16 +505,20 @@ class Env:
             ValueError: A field is not a model field that differs between worlds, or a value is invalid.
         """
         state = self.get_state()
+        columns = self.state_space.split(state)
         with errors_of(self.task.definition):
-            put_rows(self.task.model, fields, self.state_space.split(state))
-            self._check_dynamics(state, fields)
+            check_fields(fields)
+            put_rows(self.task.model, fields, columns)
+            self._check_dynamics({name: columns[name] for name in fields})
         self.set_state(state, mask)
 
-    def _check_dynamics(self, state: torch.Tensor, names: Collection[str]) -> None:
-        columns = self.state_space.split(state)
+    def _check_dynamics(self, rows: Mapping[str, torch.Tensor]) -> None:
+        """Raise a ValueError for the first invalid value of model fields, each (nworld, ...)."""
         for field in self.task.dynamics:
-            if field.name in names and (problem := field.problem(self.task.model, columns[field.name].cpu().numpy())):
-                raise ValueError(problem)
+            if field.name in rows:
+                values = rows[field.name].reshape(self.nworld, -1).cpu().numpy()
+                if problem := field.problem(self.task.model, values):
+                    raise ValueError(problem)
 
     # shared memory
 

@@ -56,14 +56,17 @@ class Worlds(Resets):
         self.horizon, self.autoreset = horizon, autoreset
         key = (horizon, autoreset, graphs)
         if key not in self._programs:
+            reset, rand_reset = self.reset_phases(randomly=False), self.reset_phases(randomly=True)
+            read, restore = self.read_phases(), self.restore_phases()
+            step = self.step_phases(skip=graphs and self.engine.capturable)
             capture = Graphs(self.device, enabled=graphs, capture_engine=self.engine.capturable, workers=self._workers)
             self._programs[key] = Programs(
                 capture,
-                step=capture.sequence(self.step_phases(skip=graphs and self.engine.capturable)),
-                reset=capture.sequence(self.reset_phases(randomly=False)),
-                rand_reset=capture.sequence(self.reset_phases(randomly=True)),
-                read_state=capture.sequence(self.read_phases()),
-                restore_state=capture.sequence(self.restore_phases()),
+                step=capture.sequence(step),
+                reset=capture.sequence(reset),
+                rand_reset=capture.sequence(rand_reset),
+                read_state=capture.sequence(read),
+                restore_state=capture.sequence(restore),
             )
         self.programs = self._programs[key]
 
@@ -84,18 +87,16 @@ class Worlds(Resets):
             phases = [phase for part in parts for phase in part]
             return [self._merged(mask, phases)] if skip and phases else phases
 
-        restarting = self.restarting
+        restarting, observe = self.restarting, self._observe_phases()
         restart, refresh = self.restart_phases(restarting, randomly=True), self.refresh_phases(restarting)
         if (kernel := self.task.kernels.run_events) is None:
-            return [*self.transition_phases(substeps), *only(restarting, restart, refresh, self._observe_phases())]
-        return [
-            *self.transition_phases(substeps),
-            *only(restarting, restart),
-            Phase("event", partial(self._event, kernel)),
-            *only(self._physics_changed, self._moved_phases()),
-            *only(restarting, refresh),
-            *self._observe_phases(),
-        ]
+            episodes = only(restarting, restart, refresh, observe)
+        else:
+            events = [
+                Phase("event", partial(self._event, kernel)), *only(self._physics_changed, self._moved_phases()),
+            ]  # fmt: skip
+            episodes = [*only(restarting, restart), *events, *only(restarting, refresh), *observe]
+        return [*self.transition_phases(substeps), *episodes]
 
     def _merged(self, mask: wp.array, phases: list[Phase]) -> Phase:
         """Merge phases into one that is skipped if the mask is empty."""

@@ -6,8 +6,8 @@ import tiny_task
 
 import lyceum_warp as lw
 from lyceum_warp.binding import compile_model, find_task
-from lyceum_warp.binding.models import load_spec
 from lyceum_warp.core import PhysicsOptions
+from lyceum_warp.core.model_files import load_spec
 
 BALL = (
     '<mujoco model="ball"><option {option}/><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>'

@@ -3,7 +3,7 @@ import pytest
 import warp as wp
 
 from lyceum_warp.core import gymnasium_model, vec10
-from lyceum_warp.core.model_fields import Constants, check_field, describe_model_field
+from lyceum_warp.core.model_fields import Constants, describe_model_field
 
 ANT = gymnasium_model("ant.xml").spec().compile()
 
@@ -24,11 +24,6 @@ def test_model_field_has_the_type_of_its_elements(name: str, shape: tuple[int, .
     field = describe_model_field(ANT, name)
     assert (field.shape, field.dtype, field.size) == (shape, dtype, size)
     assert field.value(ANT).size == size
-
-
-def test_error_of_an_unknown_model_field_suggests_similar_names() -> None:
-    with pytest.raises(ValueError, match="no field 'body_mas': did you mean body_mass"):
-        check_field("body_mas")
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from lyceum_warp.binding import data_files, find_model, package_task_names, source_files, stamps
-from lyceum_warp.core import EnvOptions, ModelFile, Task, read_spec
+from lyceum_warp.binding import data_files, package_task_names, source_files, stamps
+from lyceum_warp.core import EnvOptions, ModelFile, Task, find_model, read_spec
 from lyceum_warp.env import Env
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.trust import is_trusted, remember
