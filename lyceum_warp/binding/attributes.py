@@ -75,12 +75,8 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
         for name in getattr(task, attribute):
             if name not in source.world.vars:
                 yield f"{attribute} has {name!r}: make it a field of World, too"
-    written = frozenset[str]().union(*(source.writes.get(name, ()) for name in ("initialize", "randomize", "event")))
-    if both := [
-        name
-        for name in source.types
-        if is_model_field(name) and name in written & source.writes.get("startup", frozenset())
-    ]:
+    twice = source.drawn_between_steps & source.writes["startup"]
+    if both := [name for name in source.types if is_model_field(name) and name in twice]:
         yield f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"
     metrics = source.terms.metrics
     for name in metrics:

@@ -78,16 +78,15 @@ class BoundTask:
                 "the model has no actuators: add actuators, or give the task actions = {...} and a control function "
                 "that writes inputs"
             )
-        inputs = self.writes.get("control", frozenset())
+        inputs = self.writes["control"]
         self.fields: list[Field] = [
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*data_fields, "time", "ctrl"])
         ]
-        drawn = {name: self.writes.get(name, frozenset()) for name in ("startup", "initialize", "randomize", "event")}
-        between = drawn["initialize"] | drawn["randomize"] | drawn["event"]
-        self.reset_dynamics = [name for name in model_fields if name in between]
+        drawn = source.drawn_between_steps
+        self.reset_dynamics = [name for name in model_fields if name in drawn]
         """The model fields that resets or events write. A reset first restores their nominal values."""
-        varied = frozenset().union(dynamics, *drawn.values())
+        varied = drawn | self.writes["startup"] | frozenset(dynamics)
         self.dynamics = [
             describe_model_field(self.model, name)
             for name in dict.fromkeys([*model_fields, *dynamics])

@@ -83,7 +83,12 @@ class TaskSource:
     @functools.cached_property
     def written(self) -> dict[str, frozenset[str]]:
         """The fields and the parts of memory that each function writes."""
-        return {name: written_fields(function) for name, function in self.functions.items() if function is not None}
+        return {name: written_fields(f) if f is not None else frozenset() for name, f in self.functions.items()}
+
+    @property
+    def drawn_between_steps(self) -> frozenset[str]:
+        """The fields of World and the kinds of memory that resets and events write."""
+        return self.writes["initialize"] | self.writes["randomize"] | self.writes["event"]
 
     @property
     def curriculum(self) -> tuple[str, ...]:
@@ -123,10 +128,8 @@ class TaskSource:
 
     def _struct(self, name: str) -> Any:
         struct = self._declared(name, self.definition)
-        if isinstance(struct, type):
-            raise ValueError(f"{name} must be a Warp struct: decorate it with @wp.struct")
         if not is_struct(struct):
-            raise ValueError(f"there is no {name}: add a @wp.struct of this name to the task's module")
+            raise ValueError(f"{name} must be a @wp.struct in the task's module, not {struct!r}")
         return struct
 
     def _declared(self, name: str, owner: type[Task]) -> Any:

@@ -41,22 +41,20 @@ class Parameters:
     ) -> None:
         self._struct, self._owner, self._weights = source.params, source.defaults, source.terms.weights
         self._model, self._nworld = model, nworld
-        struct = self._struct
+        self._names = (*self._struct.vars, *self._weights)
         self._sizes: dict[str, int] = {}
-        self.tables = {name: field.type for name, field in struct.vars.items() if hasattr(field.type, "ndim")}
+        self.tables = {name: field.type for name, field in self._struct.vars.items() if hasattr(field.type, "ndim")}
         self._arrays: dict[str, tuple[Any, Any]] = {}
         self._check_tables()
-        if taken := [name for name in (*struct.vars, *self._weights) if name in (*OPTIONS, "task", "options")]:
+        if taken := [name for name in self._names if name in (*OPTIONS, "task", "options")]:
             raise ValueError(
                 f"the parameter {taken[0]!r} has the name of an option of make(), so make() would set the option: "
                 "rename it in Params"
             )
-        initial = (
-            defaults(struct, self._owner) | self._weights | {"dt": timestep, "substep_dt": float(model.opt.timestep)}
-        )
+        times = {"dt": timestep, "substep_dt": float(model.opt.timestep)}
+        initial = defaults(self._struct, self._owner) | self._weights | times
         self._computed = {name for name, value in initial.items() if isinstance(value, FromModel)}
-        names = (*struct.vars, *self._weights)
-        self.values: dict[str, Any] = {name: initial[name] for name in names if name in initial}
+        self.values: dict[str, Any] = {name: initial[name] for name in self._names if name in initial}
         self.values = self.changed(values).values
         self._computed -= set(values)
 
@@ -67,18 +65,16 @@ class Parameters:
 
     def changed(self, values: Mapping[str, Any]) -> "Parameters":
         """Return a copy with some values replaced. The copy and the original share arrays."""
-        known = (*self._struct.vars, *self._weights)
-        names = sorted(set(known) - set(_FILLED_IN))
+        names = sorted(set(self._names) - set(_FILLED_IN))
         for name in values:
+            if name in OPTIONS:
+                raise ValueError(
+                    f"{name!r} is an option, not a parameter: make another environment with env.replicate({name}=...)"
+                )
             if name not in names:
-                if name in OPTIONS:
-                    raise ValueError(
-                        f"{name!r} is an option, not a parameter: make another environment with "
-                        f"env.replicate({name}=...)"
-                    )
                 hint = suggestion(name, names) or f"it has {', '.join(names) or 'none'}"
                 raise ValueError(f"there is no parameter {name!r}: {hint}")
-        if missing := [name for name in known if name not in self.values and name not in values]:
+        if missing := [name for name in self._names if name not in self.values and name not in values]:
             raise ValueError(f"it needs values for {', '.join(missing)}")
         other = copy.copy(self)
         other._computed = self._computed - set(values)
@@ -87,7 +83,7 @@ class Parameters:
             for name, value in {**self.values, **values}.items()
             if name not in other._computed
         }
-        for name in known:
+        for name in self._names:
             if name in other._computed:
                 other.values[name] = self._compute(name, other.values)
         return other

@@ -86,7 +86,7 @@ class WorldArrays:
         self._allocate_shared()
         self.fields = {**self.engine.arrays, **constant}
         """Arrays of all fields, (nworld, ...), by name."""
-        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes.get("event", ())]
+        drawn = [f.name for f in self.task.dynamics if f.name in self.task.writes["event"]]
         self._model_copies = {name: wp.zeros_like(self.engine.arrays[name]) for name in drawn}
         self.params = self.task.parameters.array(self.device)
         self.weights = self.task.parameters.weights(self.device)

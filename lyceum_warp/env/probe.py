@@ -200,7 +200,7 @@ class _Run:
             launch_worlds(kernel, 1, args, self._worlds.device)
 
     def _written_fields(self, function: str) -> Results:
-        for name in sorted(self._task.writes.get(function, ())):
+        for name in sorted(self._task.writes[function]):
             rows, layout = self._fields[name], self._task.layouts.memory.get(name)
             if not layout:
                 yield self._checked(function, rows, name, f"the model has {rows.size}")

@@ -115,7 +115,9 @@ class Worlds(Resets):
             Phase("judge", self._judge_step, by_world=True),
         ]
         if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
-            phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
+            args = [self.transition, self.outcome.done_reason, self._shares, self.sums]
+            tally = partial(launch_worlds, kernel, self.nworld, args, self.device)
+            phases.append(Phase("tally", tally))  # on a CPU, atomic additions need one thread
         return phases
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
@@ -186,8 +188,7 @@ class Worlds(Resets):
             launch_lanes(check_model, self.nworld, [self.after, self._action_fault], self.device)
 
     def _substep(self, kernel: wp.Kernel) -> None:
-        args = [self.after, self.params]
-        launch_worlds(kernel, self.nworld, args, self.device)
+        launch_worlds(kernel, self.nworld, [self.after, self.params], self.device)
 
     def _judge_step(self) -> None:
         self.engine.find_faults(self.everyone)
@@ -199,10 +200,6 @@ class Worlds(Resets):
         """Advance the task's memory by a step."""
         if (advance := self.task.kernels.advance_memory) is not None:
             launch_worlds(advance, self.nworld, [self.transition], self.device)
-
-    def _tally(self, kernel: wp.Kernel) -> None:
-        args = [self.transition, self.outcome.done_reason, self._shares, self.sums]
-        launch_worlds(kernel, self.nworld, args, self.device)
 
     def _judge(
         self, mask: wp.array, fault: wp.array, action_fault: wp.array, *, transition: bool, keep_reason: bool = False

@@ -83,7 +83,7 @@ def closer(
 
 def check_inputs(ctx: Context) -> None:
     """Inputs from ``control`` act in the same step and are part of the state. A reset clears them."""
-    written = [name for name in INPUTS if name in ctx.a.task.writes.get("control", ())]
+    written = [name for name in INPUTS if name in ctx.a.task.writes["control"]]
     if not written:
         return
     ctx = converged(ctx)
@@ -110,7 +110,7 @@ def check_inputs(ctx: Context) -> None:
         getattr(env, which)()
         state = env.get_state()
         for name in written:
-            if not any(name in env.task.writes.get(function, ()) for function in functions):
+            if not any(name in env.task.writes[function] for function in functions):
                 initial = torch.as_tensor(env.engine.initial[parts[name]], device=state.device)
                 wanted_row = initial.float().expand(env.nworld, -1).contiguous()
                 ctx.equal(state[:, parts[name]].float(), wanted_row, f"{name} after {which}")
@@ -172,7 +172,7 @@ def check_dynamics(ctx: Context) -> None:
     for name in varied:
         if name in once:
             ctx.equal(rows(a, name), first[:, parts[name]].float(), f"{name}, drawn once, after reset")
-        elif name not in a.task.writes.get("initialize", ()):
+        elif name not in a.task.writes["initialize"]:
             nominal = torch_view(flat(a.engine.nominal[name])).expand(a.nworld, -1).contiguous()
             ctx.equal(rows(a, name), nominal, f"{name} after reset")
 

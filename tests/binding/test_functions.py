@@ -38,7 +38,7 @@ MISTAKES = {
     "no observe": ("def observe", "def look", r"there is no observe\(s, p, obs\)"),
     "an ordinary class World": (
         CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
-        "World must be a Warp struct: decorate it with @wp.struct",
+        "World must be a @wp.struct in the task's module, not <class",
     ),
 }  # fmt: skip
 

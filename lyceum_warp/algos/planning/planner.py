@@ -187,7 +187,7 @@ class Planner:
         # `state_of` must return nominal values, not the random values that `startup` wrote
         for name, row in self.env.engine.nominal.items():
             self._initial[parts[name]] = torch_view(flat(row))[0].double()
-        if "lasting_memory" in self.env.task.writes.get("startup", ()):
+        if "lasting_memory" in self.env.task.writes["startup"]:
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
         with wp.ScopedDevice(self.env.device):
             self._keys = wp.zeros(nworld, dtype=wp.uint32)
@@ -202,7 +202,7 @@ class Planner:
     def _random_fields(self) -> list[str]:
         """List the model fields that the task's functions randomize; with one model, list none."""
         task = self.env.task
-        written = frozenset().union(*(task.writes.get(name, frozenset()) for name in _DRAWING))
+        written = frozenset().union(*(task.writes[name] for name in _DRAWING))
         names = [field.name for field in task.dynamics if field.name in written] if self.config.models > 1 else []
         if self.config.models > 1 and not names:
             raise ValueError(
