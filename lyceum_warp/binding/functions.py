@@ -98,6 +98,8 @@ class TaskSource:
 
     def _observers(self) -> dict[str, wp.Function]:
         scopes = [scope for owner in reversed(self._owners) for scope in (owner.scope, vars(owner))]
+        if hasattr(self.definition, "obs"):  # without obs, functions of later tasks in the module would add groups
+            scopes += [vars(sys.modules[owner.__module__]) for owner in self._owners]
         names = dict.fromkeys(name for scope in scopes for name in scope if name.startswith(GROUP_PREFIX))
         groups = [name.removeprefix(GROUP_PREFIX) for name in names if self._observes(name)]
         forms = {g: dataclasses.replace(FUNCTIONS["observe"], name=observer_name(g)) for g in ("policy", *groups)}

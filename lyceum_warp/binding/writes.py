@@ -113,11 +113,6 @@ def check_reads(name: str, function: wp.Function) -> None:
 
 
 def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
-    may = [field for fields in rights[name].values() for field in fields or ()]
-    results = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
-    own = f"{name} may write {', '.join(dict.fromkeys([*results, *may])) or 'nothing'}"
-    if write.field is None:
-        return own
     argument = list(rights[name])[write.position]
     if argument == "p":
         return "parameters are changed with env.set_params"
@@ -126,12 +121,10 @@ def _advice(write: Write, name: str, rights: Mapping[str, Rights]) -> str:
     ]
     if write.replaced and (writers or rights[name][argument] is None):
         return f"write its elements, as {write.target}[0] = ..."
-    if not writers:
-        return f"{own}, and no function may write {write.field}"
-    if name in writers:
-        written = [argument for argument, fields in rights[name].items() if fields and write.field in fields]
-        return f"{name} may write {write.field} of {', '.join(written)} only"
-    return f"{own}, and {write.field} is written by {' or '.join(writers)}"
+    targets = [argument for argument, fields in rights[name].items() if fields is None and argument != "rng"]
+    targets += [f"{argument}.{field}" for argument, fields in rights[name].items() for field in fields or ()]
+    others = f", and {write.field} is written by {' or '.join(writers)}" if writers and name not in writers else ""
+    return f"{name} may write {', '.join(targets) or 'nothing'}{others}"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -52,3 +52,9 @@ def test_invalid_struct_function_or_attribute_raises_an_error(old: str, new: str
 def test_annotations_may_be_text(tmp_path: Path) -> None:
     text = f"from __future__ import annotations\n{tiny_task.TINY}"
     assert source_of(tmp_path, text).functions["observe"] is not None
+
+
+def test_observation_group_may_be_written_by_a_function_after_the_class(tmp_path: Path) -> None:
+    text = tiny_task.changed(('obs = {"x": 1}', 'obs = {"policy": {"x": 1}, "critic": {"y": 1}}'))
+    after = "@wp.func\ndef observe_critic(s: World, p: Params, obs: Row[float]):\n    obs[0] = s.qpos[1]\n"
+    assert list(source_of(tmp_path, f"{text}\n\n{after}").observers) == ["policy", "critic"]
