@@ -22,9 +22,9 @@ def check_attributes(source: TaskSource, fields: Collection[str] = ()) -> None:
 
     ``fields`` are names of further fields of MjData and MjModel.
     """
-    for name, (known, similarity) in _new_names(source).items():
+    for name, known, similarity in _new_names(source):
         if guess := closest(name, known, 1, similarity):
-            raise ValueError(f"{name!r}: did you mean {guess[0]}?")
+            raise ValueError(f"the name {name!r} is unknown: did you mean {guess[0]}?")
     for problem in _problems(source.definition, source):
         raise ValueError(problem)
     check_fields(name for name in (*source.types, *fields) if name not in MEMORIES)
@@ -39,22 +39,20 @@ def check_fields(names: Iterable[str]) -> None:
             raise ValueError(f"there is no field {name!r}: {hint}")
 
 
-def _new_names(source: TaskSource) -> dict[str, tuple[Collection[str], float]]:
-    """List the names that would be ignored if they were misspelt, each with known names and the least similarity."""
+def _new_names(source: TaskSource) -> Iterator[tuple[str, Collection[str], float]]:
+    """Yield names that would have no effect if they were misspelt, with known names and the least similarity."""
     known = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
-    names = [name for name in vars(source.definition) if not name.startswith(("_", GROUP_PREFIX))]
+    for name in vars(source.definition):
+        if name not in known and not name.startswith(("_", GROUP_PREFIX)):
+            yield name, known, 0.75
+    for name in source.definition.params:
+        if name not in source.params.vars:
+            yield name, source.params.vars, 0.6
     missing = [name for name, function in source.functions.items() if function is None]
-    functions = [
-        name
-        for name, value in vars(sys.modules[source.definition.__module__]).items()
-        if isinstance(value, wp.Function) and source.world in value.input_types.values()
-    ]
-    ignored = [name for name in functions if name not in FUNCTIONS and name not in source.terms.functions]
-    return (
-        {name: (known, 0.75) for name in names if name not in known}
-        | dict.fromkeys(ignored, (missing, 0.85))
-        | {name: (source.params.vars, 0.6) for name in source.definition.params if name not in source.params.vars}
-    )
+    known = {*FUNCTIONS, *source.terms.functions}
+    for name, value in vars(sys.modules[source.definition.__module__]).items():
+        if isinstance(value, wp.Function) and name not in known and source.world in value.input_types.values():
+            yield name, missing, 0.85
 
 
 def _problems(task: Any, source: TaskSource) -> Iterator[str]:

@@ -114,7 +114,7 @@ def compile_model(
             warnings.simplefilter("always")
             model = spec.compile()
     except ValueError as error:
-        raise ValueError(f"MuJoCo refuses the model: {error}") from error
+        raise ValueError(f"MuJoCo refuses the model: {' '.join(str(error).split())}") from error
     try:
         model.names.decode()
     except UnicodeDecodeError as error:  # each later use of the name would raise it

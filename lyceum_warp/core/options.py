@@ -188,7 +188,9 @@ class EnvOptions:
         check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
-        check_kind("model", self.model, ModelSource | None, "a file or an MjSpec")
+        # if the model is an MjModel, binding the task raises a more specific error
+        if self.model is not None and not isinstance(self.model, mujoco.MjModel):
+            check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
         check_flag("autoreset", self.autoreset)
         check_flag("graphs", self.graphs)

@@ -19,7 +19,7 @@ def bound(file: Path, **options: Any) -> BoundTask:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("horzon = 10", "'horzon': did you mean horizon"),
+        ("horzon = 10", "'horzon' is unknown: did you mean horizon"),
         ("obs = 10", "obs is 10"),
         ("del model", "there is no model"),
         ("lagged = ('qvel',)", "lagged has 'qvel'"),
@@ -177,7 +177,7 @@ def test_params_of_a_class_replace_defaults_and_share_kernels(tmp_path: Path) ->
     tiny, fast = (bound(Path(f"{file}:{name}")) for name in ("Tiny", "Fast"))
     assert (tiny.params["gain"], fast.params["gain"]) == (1.0, 3.0) and fast.kernels is tiny.kernels
     file.write_text(file.read_text().replace('{"gain"', '{"gian"'))
-    with pytest.raises(ValueError, match="'gian': did you mean gain"):
+    with pytest.raises(ValueError, match="'gian' is unknown: did you mean gain"):
         bound(Path(f"{file}:Fast"))
 
 
