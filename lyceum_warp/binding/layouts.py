@@ -95,7 +95,7 @@ def _struct_groups(source: TaskSource, params: Mapping[str, Any]) -> dict[str, p
         struct: Any = list(observer.input_types.values())[2]
         if not is_struct(struct):
             raise ValueError(
-                f"there is no obs: add {_PARTS} to its class, or let {observer_name(group)} take a struct of parts"
+                f"there is no obs: add {_PARTS} to the class, or let {observer_name(group)} take a struct of parts"
             )
         layouts[group] = parts.layout(struct, "obs", params, struct.key)
         if without_size := [name for name in struct.vars if name not in layouts[group]]:

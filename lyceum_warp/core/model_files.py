@@ -72,6 +72,9 @@ class ModelFile:
         return read_spec(path)
 
 
+ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
+
+
 def _package_folder(package: str) -> Path | None:
     """Find an installed package's folder without importing the package."""
     found = importlib.util.find_spec(package)
@@ -200,14 +203,11 @@ def read_spec(path: Path) -> mujoco.MjSpec:
     try:
         return mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise ValueError(f"MuJoCo can't read the model {path}: {error}") from error
+        raise ValueError(f"MuJoCo can't read the model {path}: {' '.join(str(error).split())}") from error
     except TypeError as error:
         raise ValueError(f"the path of the model {str(path)!r} is not UTF-8: rename it") from error
     except RuntimeError as error:  # MuJoCo's parser does not say which C++ exception it caught
         raise ValueError(f"MuJoCo can't read the model {path}: is one of its sizes too large? ({error})") from error
-
-
-ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 
 
 def read_task_spec(task: Any, model: ModelSource | None = None) -> mujoco.MjSpec:
