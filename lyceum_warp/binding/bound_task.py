@@ -69,6 +69,8 @@ class BoundTask:
             origin: Any = task.model if model is None else model
             file = origin if isinstance(origin, str | Path) else getattr(origin, "file", None)
             raise ValueError(f"{file or 'the model'}: {error}") from error
+        if physics.timestep is not None or physics.integrator is not None:
+            models.warn_of_unstable_servos(self.model)
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
         self.timestep: float = self.model.opt.timestep * self.frame_skip
         self.initial = None if task.keyframe is None else models.keyframe_state(self.model, task.keyframe)

@@ -81,7 +81,7 @@ def _declared_groups(source: TaskSource, params: Mapping[str, Any]) -> dict[str,
             )
         if group not in source.observers:
             form = dataclasses.replace(FUNCTIONS["observe"], name=observer_name(group))
-            raise ValueError(f"no function writes the group {group!r} of observations: add {form.signature}")
+            raise ValueError(f"the group {group!r} of observations needs the function {form.signature}")
         if per_world := [part for part, size in sizes.items() if np.ndim(size)]:
             raise ValueError(f"obs has sizes that differ between worlds, {per_world}: give one size for all worlds")
         layouts[group] = {part: int(size) for part, size in sizes.items() if size}

@@ -13,6 +13,7 @@ from lyceum_warp.core.model_fields import MOVED_INERTIA
 from lyceum_warp.core.model_files import ModelSource, read_task_spec
 from lyceum_warp.core.options import CONES, INTEGRATORS, JACOBIANS, PhysicsOptions
 from lyceum_warp.core.task import Task
+from lyceum_warp.models.actuators import unstable_servos
 from lyceum_warp.support.mujoco_log import quiet
 
 log = logging.getLogger(__name__)
@@ -137,3 +138,15 @@ def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
                 " and ".join(sorted(geoms)),
             )
         known.add(geoms)
+
+
+def warn_of_unstable_servos(model: mujoco.MjModel) -> None:
+    """Log a warning if the model's substep is too long for one of its position servos."""
+    if limits := unstable_servos(model):
+        name = min(limits, key=lambda name: limits[name])
+        others = f" and {len(limits) - 1} more" if len(limits) > 1 else ""
+        log.warning(
+            "the servo %r%s is unstable in substeps of more than %.2g ms, and a substep has %.3g ms: use "
+            "integrator='discrete' or a shorter timestep",
+            name, others, 1e3 * limits[name], 1e3 * model.opt.timestep,
+        )  # fmt: skip

@@ -131,3 +131,11 @@ def test_bodies_with_a_randomized_inertial_frame_are_not_simple() -> None:
     assert compile_model(ball(), (), PHYSICS).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_mass"]).body_simple[1] == 1
     assert compile_model(ball(), (), PHYSICS, varied=["body_ipos"]).body_simple[1] == 0
+
+
+@pytest.mark.parametrize(("integrator", "warned"), [("euler", True), ("discrete", False)])
+def test_servo_that_is_unstable_in_the_substep_is_named(
+    integrator: str, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    lw.make("go1_velocity", integrator=integrator, timestep=0.02, frame_skip=1)
+    assert any("_calf" in message and "20 ms" in message for message in caplog.messages) == warned
