@@ -16,6 +16,15 @@ EVENT = wp.constant(-2)
 
 
 def make_step_kernels(task: TaskCode) -> None:
+    _make_keep_before(task)
+    _make_act(task)
+    _make_check_model(task)
+    _make_substep_memory(task)
+    _make_advance_memory(task)
+    _make_run_events(task)
+
+
+def _make_keep_before(task: TaskCode) -> None:
     @task.kernel(task.copy_state is not None)
     def keep_before(after: task.Batch, before_out: task.Batch, lanes: int, first: int):
         """Save the fields that a step changes; launched over (nworld, lanes)."""
@@ -23,6 +32,8 @@ def make_step_kernels(task: TaskCode) -> None:
         w = first + k
         task.copy_state(after, before_out, w, lane, lanes)
 
+
+def _make_act(task: TaskCode) -> None:
     @task.kernel()
     def act(
         t: task.Transition,
@@ -57,6 +68,8 @@ def make_step_kernels(task: TaskCode) -> None:
         fault_out[w] = fault
         t.counters.step[w] = t.counters.step[w] + 1
 
+
+def _make_check_model(task: TaskCode) -> None:
     @task.kernel(task.valid_model is not None)
     def check_model(batch: task.Batch, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the model fields that the task writes; launched over (nworld, lanes)."""
@@ -65,12 +78,16 @@ def make_step_kernels(task: TaskCode) -> None:
         if not task.valid_model(task.view(batch, w), lane, lanes):
             fault_inout[w] = fault_inout[w] | MODEL
 
+
+def _make_substep_memory(task: TaskCode) -> None:
     @task.kernel_for("substep")
     def substep_memory(batch: task.Batch, params: wp.array[task.Params], first: int):
         """Advance the task's memory by one substep; launched over (nworld,)."""
         w = first + wp.tid()
         task.functions.substep(task.view(batch, w), params[w % params.shape[0]])
 
+
+def _make_advance_memory(task: TaskCode) -> None:
     @task.kernel_for("advance")
     def advance_memory(t: task.Transition, first: int):
         """Advance the task's memory by one step; launched over (nworld,)."""
@@ -79,6 +96,8 @@ def make_step_kernels(task: TaskCode) -> None:
         s0, s1 = task.view(t.before, w), task.view(t.after, w)
         task.functions.advance(s0, t.action[w], s1, task.params_of(t, w), t.counters.rng[w])
 
+
+def _make_run_events(task: TaskCode) -> None:
     @task.kernel_for("event")
     def run_events(
         restarting_in: wp.array[bool],

@@ -20,6 +20,14 @@ OBSERVE_FIRST = wp.constant(3)
 
 
 def make_transition_kernels(task: TaskCode) -> None:
+    _make_check_memory(task)
+    _make_judge(task)
+    _make_conclude(task)
+    _make_observe_worlds(task)
+    _make_replace_observations(task)
+
+
+def _make_check_memory(task: TaskCode) -> None:
     @task.kernel(task.finite_memory is not None)
     def check_memory(mask_in: wp.array[bool], t: task.Transition, fault_inout: wp.array[int], lanes: int, first: int):
         """Find faults in the task's memory, in the masked worlds; launched over (nworld, lanes)."""
@@ -28,6 +36,8 @@ def make_transition_kernels(task: TaskCode) -> None:
         if mask_in[w] and not task.finite_memory(t.before, t.after, w, lane, lanes):
             fault_inout[w] = fault_inout[w] | NAN
 
+
+def _make_judge(task: TaskCode) -> None:
     @task.kernel()
     def judge(
         mask_in: wp.array[bool],
@@ -85,6 +95,8 @@ def make_transition_kernels(task: TaskCode) -> None:
                         found = OBSERVATION
             found_out.fault[part, w] = found
 
+
+def _make_conclude(task: TaskCode) -> None:
     @task.kernel()
     def conclude(
         mask_in: wp.array[bool],
@@ -177,6 +189,8 @@ def make_transition_kernels(task: TaskCode) -> None:
             if fault != 0:
                 faults.count_faults(fault, fault_count_inout[w])
 
+
+def _make_observe_worlds(task: TaskCode) -> None:
     @task.kernel()
     def observe_worlds(
         mask_in: wp.array[bool],
@@ -203,6 +217,8 @@ def make_transition_kernels(task: TaskCode) -> None:
             if parts == 1 and not valid:
                 task.copy_observations(good_in, obs_out, w, 0, 1)
 
+
+def _make_replace_observations(task: TaskCode) -> None:
     @task.kernel()
     def replace_observations(
         mask_in: wp.array[bool],
