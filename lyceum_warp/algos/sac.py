@@ -532,6 +532,7 @@ class SAC(Learner):
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
+        self._learn.forget()  # the graph contains the learning rate
         self._warms_up = state.get("warms_up", self._warms_up)  # missing in runs of release 0.2.0
 
 

@@ -110,6 +110,8 @@ class PassGate(Callback):
         if self._process is not None:
             self._process.kill()
             self._process.communicate()
+            if self._tested is not None and self._temporary is not None:
+                self._temporary.unlink(missing_ok=True)
 
 
 def serve(folder: Path) -> None:

@@ -72,6 +72,7 @@ def train(
         The run; ``run.rows()`` returns its metrics.
 
     Raises:
+        TypeError: With ``exact_from``, the learner's constructor has other arguments than ``Learner.enter`` passes.
         ValueError: The folder is not empty, an argument is out of range, the run does not fit the learner, or another
             process has locked the run.
         OSError: The folder cannot be written. The run can later be resumed from its last save.
@@ -87,6 +88,8 @@ def train(
     check_flag("take_over", take_over)
     if exact_from is None and isinstance(run, Run):
         exact_from = run.config.get("exact_from")
+    if exact_from is not None:
+        learner.check_enter()
     settings: dict[str, Any] = {
         "iterations": whole_number("iterations", iterations, low=1),
         "keep_every": whole_number("keep_every", keep_every, low=0),
@@ -149,8 +152,8 @@ def _learn(
         while learner.iteration < iterations and not ended:
             env = learner.env
             if learner.iteration >= exact_from and task_physics(env)[1] != EXACT:
-                place = {"seed": env.options.seed, "first_world": env.first_world}
-                learner.enter(env.replicate(physics=EXACT, **place))
+                same = {"seed": env.options.seed, "first_world": env.first_world, "horizon": env.options.horizon}
+                learner.enter(env.replicate(physics=EXACT, **same))
             iteration, error = next(learner), None
             with team.together():
                 saver.write(iteration)
@@ -181,7 +184,7 @@ def _load_checkpoint(run: Run, learner: Learner, iterations: int) -> None:
             f"the run in {run.folder} already has {done} iterations: ask for more iterations (--iterations {2 * done}, "
             f"or iterations={2 * done} in Python)"
         )
-    _check_equal(run, learner)
+    _check_equal(run, learner, done)
     if learner.team.leads:
         note_changes(run, learner.env)
     try:
@@ -205,13 +208,15 @@ def _changed_versions(run: Run) -> dict[str, Any]:
     return {"resumed": [*run.config.get("resumed", []), changed]}
 
 
-def _check_equal(run: Run, learner: Learner) -> None:
+def _check_equal(run: Run, learner: Learner, done: int) -> None:
     """Check that a learner has the settings of a run. Its device, threads and processes may differ."""
     before, after = _fixed_settings(run.config), _fixed_settings(json.loads(json.dumps(describe(learner))))
     before["task"], after["task"] = run.manifest.get("name", learner.env.task.name), learner.env.task.name
     for name, copy in table_copies(run).items():  # ``note_changes`` reports a changed table
         if after.get(f"params.{name}") == str(copy):
             after[f"params.{name}"] = run.config["params"][name]
+    if task_physics(learner.env)[1] == EXACT and (run.config.get("exact_from") or math.inf) <= done:
+        before = {name: value for name, value in before.items() if not name.startswith("physics.")}
     for name in before | after:
         value, other = before.get(name), after.get(name)
         # this release may have hyperparameters that an older run lacks

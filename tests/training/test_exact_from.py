@@ -48,6 +48,18 @@ def test_state_goes_on_in_exact_physics_and_resume_is_exact(kind: str, tmp_path:
     for iterations in (2, 3, 4):
         lw.train(learner(kind), lw.Run.open(parts.folder), iterations)
     assert metrics(parts.folder) == metrics(run.folder)
+    lw.train(whole, run, 5)  # the same learner, which is already in exact physics
+    assert len(run.rows()) == 5
+
+
+def test_learner_with_another_constructor_is_refused_before_the_run(tmp_path: Path) -> None:
+    class Narrow(lw.NPG):
+        def __init__(self, env: lw.Env) -> None:
+            super().__init__(env, config=LEARNERS["npg"][1])
+
+    with pytest.raises(TypeError, match="Narrow can't change to exact physics .* or override enter"):
+        lw.train(Narrow(learner("npg").env), tmp_path / "run", 3, exact_from=2)
+    assert not (tmp_path / "run").exists()
 
 
 def test_command_follows_the_task_and_names_the_physics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

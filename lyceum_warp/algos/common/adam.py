@@ -20,16 +20,16 @@ class Adam:
     Args:
         parameters: The parameters.
         rate: The learning rate; a tensor may change between steps.
-        numbers: Length of ``numbers``.
+        numbers: Length of the other numbers in ``sums``.
     """
 
     def __init__(self, parameters: Iterable[torch.Tensor], rate: float | torch.Tensor, *, numbers: int = 0) -> None:
         self.parameters, self.rate = list(parameters), rate
         size = sum(parameter.numel() for parameter in self.parameters)
         self.sums = torch.zeros(size + numbers, device=self.parameters[0].device)
-        """``gradient`` and ``numbers`` in one tensor, so that one all-reduce sums both over processes."""
-        self.gradient, self.numbers = self.sums[:size], self.sums[size:]
-        """The gradient of all parameters, one after the other, which ``step`` reads; and other numbers."""
+        """The gradient and other numbers in one tensor, so that one all-reduce sums both over processes."""
+        self.gradient = self.sums[:size]
+        """The gradient of all parameters, one after the other, which ``step`` reads."""
         self.first, self.second = torch.zeros_like(self.gradient), torch.zeros_like(self.gradient)
         """The moments."""
         self.count = torch.zeros((), device=self.gradient.device)

@@ -3,6 +3,7 @@
 import abc
 import copy
 import dataclasses
+import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -204,6 +205,18 @@ class Learner(abc.ABC):
         if replay is not None:
             self.replay, replay.env = replay, env
         self.load_state_dict(state)
+
+    def check_enter(self) -> None:
+        """Check that ``enter`` can call the constructor."""
+        if type(self).enter is Learner.enter:
+            kind = type(self)
+            try:
+                inspect.signature(kind).bind(self.env, None, None, self.config, seed=self.seed, team=self.team)
+            except TypeError as error:
+                raise TypeError(
+                    f"{kind.__name__} can't change to exact physics ({error}): give its constructor the arguments env, "
+                    "policy, value, config, seed and team, or override enter"
+                ) from error
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.

@@ -100,6 +100,7 @@ class ValueFit:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the optimizer's state on this device."""
         self.optimizer.load_state_dict(state)
+        self.captured = None  # the graph contains the learning rate
 
 
 class DenseSteps:

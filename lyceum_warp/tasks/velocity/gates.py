@@ -33,8 +33,7 @@ class Play:
         for _ in range(steps):
             env.step(act(env.obs))
             errors = env.metrics["velocity_error"].clone(), env.metrics["yaw_rate_error"].clone()
-            velocity = env.state_space.split(env.get_state())["qvel"].clone()
-            self._rows.append((*errors, env.terminated.clone(), env.action.clone(), velocity))
+            self._rows.append((*errors, env.terminated.clone(), env.action.clone(), env.field("qvel").clone()))
             if env.done.any():  # including faults
                 env.set_state(self.start, mask=env.done.clone())
 
