@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
-from lyceum_warp.algos.common.distributed import Team, unflatten
+from lyceum_warp.algos.common.distributed import Branch, Captured, Team
 from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, Activation
@@ -123,6 +123,9 @@ class PPOConfig:
     this has no effect if the task sets ``lw.Task.settle``."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
+    half: bool = True
+    """Whether networks on a GPU are updated in half precision, whose significand is as long as TensorFloat-32's. This
+    applies to the default networks with activation tanh, relu or elu, if tf32 is set."""
     mean_every: int = 20
     """Iterations between evaluations of the mean policy; 0 means no evaluations. A run with fewer iterations than
     ``mean_every`` has no best policy."""
@@ -238,21 +241,25 @@ class PPO(OnPolicyLearner):
         self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
         self._make_rollout(steps)
         self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
-        self._mean = torch.empty_like(self.rollout.action)
+        self._mean = torch.empty_like(env.action)
+        self._means = self.rollout.store_too(self._mean)
+        self._act = Captured(self._choose, team, device)
+        self._observe = Captured(self._update_normalizers, team, device)
 
         # the update
         log_std = self.policy.log_std
         self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
         self.std.requires_grad_(log_std.requires_grad)
         acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
-        self._learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
-        self._parameters = [p for group in self._learned for p in group]
+        learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
+        self._parameters = [p for group in learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = Adam(self._parameters, self.rate, numbers=4)
         self._sums = self.optimizer.sums
-        for parameter, part in zip(self._parameters, unflatten(self.optimizer.gradient, self._parameters), strict=True):
-            parameter.grad = part  # for clip_grad_norm_
+        sizes = [sum(p.numel() for p in group) for group in learned]
+        self._gradients = self.optimizer.gradient.split(sizes)
+        self._branch = Branch(device)
         self._losses = torch.zeros(3, device=device)
         self._entropy_coef = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
@@ -268,7 +275,7 @@ class PPO(OnPolicyLearner):
     def __next__(self) -> PPOIteration:
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
-        with precision(tf32=config.tf32 and self._cuda):
+        with precision(tf32=config.tf32 and self._cuda, half=config.half and config.tf32 and self._cuda):
             # 1. Collect samples.
             self.sample()
             self.env.update_shared(team.sum)
@@ -321,19 +328,27 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
+        rollout = self.rollout
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            noise = self.noise[:, self.own_worlds]
             rollout.begin()
-            for t in range(rollout.steps):
-                self._mean[t] = self.policy(env.obs)
-                torch.addcmul(self._mean[t], noise[t], std, out=env.action)
+            for _ in range(rollout.steps):
+                self._act()
                 rollout.store_inputs()
-                env.step()
+                self.env.step()
                 rollout.store_outputs()
-                self.policy.observe(env.obs, self.team, eps=_EPS)
-                self.value.observe(env.obs_groups[self.value.group], self.team, eps=_EPS)
+                self._observe()
+
+    @torch.no_grad()
+    def _choose(self) -> None:
+        """Draw actions from the policy."""
+        noise = self.noise.index_select(0, self.rollout.index)[0, self.own_worlds]
+        self._mean.copy_(self.policy(self.env.obs))
+        torch.addcmul(self._mean, noise, self.policy.log_std.exp(), out=self.env.action)
+
+    def _update_normalizers(self) -> None:
+        self.policy.observe(self.env.obs, self.team, eps=_EPS)
+        self.value.observe(self.env.obs_groups[self.value.group], self.team, eps=_EPS)
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
@@ -355,8 +370,8 @@ class PPO(OnPolicyLearner):
             advantage = advantage / (variance.sqrt() + 1e-8)
         self._old_log_std.copy_(self.policy.log_std)
         return {
-            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._mean,
-            "log_prob": log_density(rollout.action, self._mean, self._old_log_std), "value": value, "target": target,
+            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
+            "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip
 
@@ -383,17 +398,21 @@ class PPO(OnPolicyLearner):
         old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
+        with self._branch:
+            value = self.value(samples["value_obs"], samples["step"])
+            error = (value - samples["target"]).square()
+            if config.clip_value_loss:
+                clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
+                error = torch.max(error, (clipped - samples["target"]).square())
+            value_loss = (weight * error).sum()
         mean, log_std = self.policy(samples["obs"]), self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
-        value = self.value(samples["value_obs"], samples["step"])
-        error = (value - samples["target"]).square()
-        if config.clip_value_loss:
-            clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
-            error = torch.max(error, (clipped - samples["target"]).square())
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-        losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
+        surrogate_loss = (weight * surrogate).sum()
+        self._branch.join()
+        losses = torch.stack([value_loss, surrogate_loss, weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
         if config.symmetry == "loss":
             assert self._mirror is not None
@@ -409,8 +428,8 @@ class PPO(OnPolicyLearner):
             self.team.sum(self._sums)
             if config.schedule == "adaptive":
                 self._adapt(self._sums[-4])
-            for parameters in self._learned:
-                nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+            for part in self._gradients:
+                part *= (config.max_grad_norm / (torch.linalg.vector_norm(part) + 1e-6)).clamp_max(1.0)
             self.optimizer.step()
             self._losses += self._sums[-3:]
 
@@ -443,7 +462,7 @@ class PPO(OnPolicyLearner):
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
         """Compute the KL divergence from the old to the current policy, averaged over the samples."""
-        kl = divergence(self._mean, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
+        kl = divergence(self._means, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
