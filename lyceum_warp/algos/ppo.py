@@ -19,7 +19,7 @@ from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
 from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.common.networks import LIMIT, Activation
+from lyceum_warp.algos.common.networks import LIMIT, MLP, Activation
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
@@ -418,13 +418,15 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
+        scale = float(self.minibatches.batch) if MLP.in_half else 1.0
         # backward() accumulates on the CUDA stream of its first call
-        gradients = torch.autograd.grad(loss, self._parameters)
+        gradients = torch.autograd.grad(scale * loss, self._parameters)
 
         with torch.no_grad():
             # an image's old mean is not the policy's: KL divergences of images would measure the policy's asymmetry
             kl = (kl_weight * divergence(old_mean, self._old_log_std, mean[: len(old_mean)], log_std)).sum()
             torch.cat([*(part.flatten() for part in gradients), kl[None], losses], out=self._sums)
+            self.optimizer.gradient /= scale
             self.team.sum(self._sums)
             if config.schedule == "adaptive":
                 self._adapt(self._sums[-4])

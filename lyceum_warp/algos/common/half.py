@@ -2,8 +2,8 @@
 
 The significand of float16 is as long as that of TensorFloat-32, so matrix products are as exact as with
 ``torch.set_float32_matmul_precision("high")``. On a GPU, they take half the time, and activations half the memory
-traffic. Sums and outputs are float32. The gradient of the outputs is scaled by its largest entry (Micikevicius et al.
-2018, "Mixed Precision Training"), because the range of float16 is shorter.
+traffic. Sums and outputs are float32. The range of float16 is shorter, so a loss must be scaled (Micikevicius et al.
+2018, "Mixed Precision Training"): multiply a mean over samples by their number.
 """
 
 from collections.abc import Callable
@@ -73,8 +73,7 @@ class _HalfLayers(torch.autograd.Function):
     def backward(ctx: Any, *gradients: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         (gradient,), saved = gradients, ctx.saved_tensors
         weights, results = saved[: len(saved) // 2], saved[len(saved) // 2 :]
-        scale = torch.linalg.vector_norm(gradient, torch.inf).clamp_min(torch.finfo(torch.float32).tiny)
-        slope = (gradient / scale).to(weights[0].dtype)
+        slope = gradient.clamp(-_LARGEST, _LARGEST).to(weights[0].dtype)
         ones = slope.new_ones(_MULTIPLE, len(slope))
         parts: list[torch.Tensor] = []
         for i in reversed(range(len(weights))):
@@ -82,10 +81,12 @@ class _HalfLayers(torch.autograd.Function):
             parts += [_product(ones, slope)[0], _product(slope.t(), results[i])]
             if i:
                 slope = SLOPES[ctx.activation](torch.mm(slope, weights[i]), results[i])
-        torch._foreach_mul_(parts, scale)
         parts[-1] = parts[-1][:, : ctx.inputs]
         return None, None, *reversed(parts)
 
+
+_LARGEST = 1e4
+"""Limit of a sample's gradient with respect to the outputs. float16 leaves room for larger hidden gradients."""
 
 _MULTIPLE = 8
 """Tensor cores need rows whose length is a multiple of this."""
