@@ -53,7 +53,7 @@ class G1(walking.Biped):
 
 @lw.register
 class G1Velocity(gait.Gait, G1):
-    Params = GaitParams
+    Params, physics = GaitParams, walking.Velocity.physics
 
 
 @lw.register
