@@ -216,6 +216,21 @@ def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
     assert in_new_process(program) == "[]\n"
 
 
+def test_help_lists_and_errors_of_the_command_line_do_not_import_torch_or_warp() -> None:
+    program = """
+        import contextlib, io, sys
+        from lyceum_warp import cli
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            for arguments in (["train", "--help"], ["train", "--help-all"], ["tasks"], ["train", "--itertions", "3"]):
+                with contextlib.suppress(SystemExit):
+                    cli.main(arguments)
+        assert "--learning-rate" in out.getvalue() and "hopper" in out.getvalue() and "--iterations" in err.getvalue()
+        print([name for name in ("torch", "warp") if name in sys.modules])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
 @pytest.mark.long
 def test_warp_prints_nothing_if_a_task_file_imports_it_first() -> None:
     program = """

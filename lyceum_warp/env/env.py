@@ -33,7 +33,8 @@ from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.suggestions import Named, did_you_mean
-from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
+from lyceum_warp.support.tensors import check_tensor
+from lyceum_warp.support.validate import check_group, check_kind, whole_number
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
