@@ -140,7 +140,7 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"torch", "warp"} & set(loaded)
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
-    faces = {"lyceum_warp.support", "lyceum_warp.support.faces"}
+    faces = {"lyceum_warp.support", "lyceum_warp.support.collection", "lyceum_warp.support.faces"}
     rendering = {"lyceum_warp.viz", "lyceum_warp.viz.render"}
     messages = {"lyceum_warp.viewer.commands", "lyceum_warp.viewer.protocol"}
     assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *rendering, *faces, *window}

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lyceum_warp.support.collection import without_collection
+
 
 def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return ``__getattr__``, ``__dir__`` and ``__all__`` of a package whose names are listed in its ``__init__.pyi``.
@@ -20,7 +22,8 @@ def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], l
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         source, attribute = names[name]
-        value = importlib.import_module(source)
+        with without_collection():
+            value = importlib.import_module(source)
         if attribute is not None:
             value = getattr(value, attribute)
         setattr(module, name, value)
