@@ -8,7 +8,7 @@ import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env import Curriculum, Env, start_episodes
-from lyceum_warp.support.validate import memoryless_action
+from lyceum_warp.support.tensors import memoryless_action
 
 
 @torch.no_grad()

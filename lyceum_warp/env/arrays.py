@@ -15,7 +15,7 @@ from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
 from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, zeros_of
-from lyceum_warp.support.validate import check_tensor
+from lyceum_warp.support.tensors import check_tensor
 
 
 def own_bytes_per_world(task: BoundTask) -> int:

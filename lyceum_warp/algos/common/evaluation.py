@@ -13,7 +13,8 @@ from lyceum_warp.algos.common.policy import Policy, acting
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Curriculum, Env, start_episodes
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind, described, memoryless_action, whole_number
+from lyceum_warp.support.tensors import memoryless_action
+from lyceum_warp.support.validate import check_kind, described, whole_number
 
 _MEAN_SEED = 2**31 - 1
 _MEAN_STATISTICS = ("mean_return", "mean_length", "mean_terminal_reward", "mean_eval", "mean_success")

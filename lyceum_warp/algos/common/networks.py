@@ -4,7 +4,7 @@ import copy
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import torch
 import warp as wp
@@ -12,13 +12,12 @@ from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.half import activation_of, half_layers
+from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
 
 Module = TypeVar("Module", bound=nn.Module)
-
-Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,

@@ -7,7 +7,8 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, check_memory, mlp
+from lyceum_warp.algos.common.hyperparameters import Activation
+from lyceum_warp.algos.common.networks import LIMIT, Normalized, check_memory, mlp
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
