@@ -188,9 +188,9 @@ class _Reader:
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
-            name = node.value.id if isinstance(node.value, ast.Name) else None
-            owner = self._read(node.value) if name is None else self.places.get(name)
-            return owner.attribute(node.attr) if owner else self.places.get(f"{name}.{node.attr}")
+            local = node.value.id if isinstance(node.value, ast.Name) else None
+            owner = self._read(node.value) if local is None else self.places.get(local)
+            return owner.attribute(node.attr) if owner else self.places.get(f"{local}.{node.attr}")
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
