@@ -23,7 +23,6 @@ class T1Velocity(walking.Biped):
     model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
     edit_model = walking.playground_model_edit(FEET)
     training = lw.Training(
-        algorithm="ppo", iterations=600, physics="coarse", exact_from=500,
-        settings={"log_std": 0.0, "symmetry": "exact", "final_entropy_coef": 0.002, "entropy_decay": (200, 400)},
-    )  # fmt: skip
+        algorithm="ppo", settings={"log_std": -0.7, "symmetry": "exact"}, iterations=800, physics="coarse"
+    )
     rewards = walking.Biped.rewards | {"track_linear_velocity": 4.0, "action_rate_l2": -0.02, "single_stance": 1.0}
