@@ -53,7 +53,7 @@ class G1(walking.Biped):
 
 @lw.register
 class G1Velocity(gait.Gait, G1):
-    Params, physics = GaitParams, walking.Velocity.physics
+    Params = GaitParams
 
 
 @lw.register
