@@ -166,6 +166,9 @@ class Train:
     """
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
+    evaluate: bool = False
+    """Whether to evaluate the last and the best policy in 32 new episodes at the end, under exact physics on the C
+    engine. --video and --require-return do so, too."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: float | None = None
@@ -354,17 +357,10 @@ class Train:
         return learner, self.resume or self.out or Path("runs", name), entries
 
     def _report(self, run: "training.Run", learner: "algos.Learner") -> int:
-        env = learner.env
+        env, choice = learner.env, None
         console.print(curve_table(run.rows()))
-        options = {**engines.options_on_cores(), "physics": algos.EXACT}
-        judge = functools.partial(algos.evaluation_worlds, env, training.EPISODES, **options)
-        with LongWork("evaluating the mean policy", "steps", console) as work:
-            choice = training.choose_policy(run, judge, progress=work)
-        score = choice.score
-        say(f"mean policy, {training.EPISODES} new episodes on the C engine, exact physics: "
-            f"return {score.mean:.1f} ± {score.std:.1f} ({score.low:.1f} to {score.high:.1f})")  # fmt: skip
-        if len(choice.scores) > 1:
-            say(choice.text)
+        if self.evaluate or self.video or self.require_return is not None:
+            choice = self._choice(run, learner)
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
         if run.best.is_file():
             paths["best"] = str(run.best)
@@ -372,14 +368,29 @@ class Train:
             say(f"transfer: {json.loads(run.transfer.read_text())['line']}")
         if self.plot:
             paths["curve"] = tried(training.learning_curve, run)
-        if self.video:
+        if self.video and choice is not None:
             camera, path = viz.parsed_camera(self.camera), run.folder / "video.mp4"
             policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
         for name, place in paths.items():
             say(f"{name + ':':<12}{place}")
-        if self.require_return is not None and not score.mean > self.require_return:
+        if choice is None:
+            say(f"{'evaluate:':<12}lyceum-warp eval {run.folder}")
+        elif self.require_return is not None and not choice.score.mean > self.require_return:
             demand = f"--require-return demands more than {self.require_return:g}"
-            note(f"the {choice.which} policy returns {score.mean:.1f}; {demand}")
+            note(f"the {choice.which} policy returns {choice.score.mean:.1f}; {demand}")
             return 1
         return 0
+
+    def _choice(self, run: "training.Run", learner: "algos.Learner") -> "training.Choice":
+        """Evaluate the last and the best policy, and print the better one's returns."""
+        options = {**engines.options_on_cores(), "physics": algos.EXACT}
+        judge = functools.partial(algos.evaluation_worlds, learner.env, training.EPISODES, **options)
+        with LongWork("evaluating the mean policy", "steps", console) as work:
+            choice = training.choose_policy(run, judge, progress=work)
+        score = choice.score
+        say(f"mean policy, {training.EPISODES} new episodes on the C engine, exact physics: "
+            f"return {score.mean:.1f} ± {score.std:.1f} ({score.low:.1f} to {score.high:.1f})")  # fmt: skip
+        if len(choice.scores) > 1:
+            say(choice.text)
+        return choice

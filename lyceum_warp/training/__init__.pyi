@@ -15,6 +15,7 @@ from lyceum_warp.training.runs.checkpoints import (
 from lyceum_warp.training.runs.choice import (
     AUTO as AUTO,
     EPISODES as EPISODES,
+    Choice as Choice,
     choose_policy as choose_policy,
 )
 from lyceum_warp.training.runs.configuration import (
