@@ -46,7 +46,7 @@ class Resets(WorldArrays):
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         self.engine.reset(mask)
-        counts = [] if again else ["metric_sums", "success_counts"]
+        counts = [] if again else ["metrics", "success_steps"]
         self._clear(mask, "memory", *self.task.definition.cleared, *counts)
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
             backup, live = self._lasting_before, self.lasting_memory

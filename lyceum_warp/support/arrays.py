@@ -50,7 +50,8 @@ def zeros_of(struct: Any, shape: int = 0, /, **shapes: Any) -> Any:
     """Make an instance of a struct with arrays of zeros of the given shape. ``shapes`` has other shapes by name."""
     instance = struct()
     for name, field in struct.vars.items():
-        setattr(instance, name, wp.zeros(shapes.get(name, shape), dtype=field.type.dtype))
+        if hasattr(field.type, "dtype"):
+            setattr(instance, name, wp.zeros(shapes.get(name, shape), dtype=field.type.dtype))
     return instance
 
 
