@@ -13,7 +13,6 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.dm import TASKS
 
 DATA = Path(__file__).parent.parent / "data" / "envpool_suite.npz"
 Parts = Mapping[str, np.ndarray]
@@ -96,8 +95,8 @@ def test_a_step_has_envpools_observations_and_rewards(shared_env: SharedEnv, tas
     before, action, after, reward = (
         stored()[f"{task}/{name}"] for name in ("observation", "action", "next_observation", "reward")
     )
-    domain = TASKS[task].removeprefix("dm_")
     env = shared_env(task, nworld=len(before), autoreset=False)
+    domain = env.task.definition.__module__.rpartition(".dm_")[2]
     set_states(env, domain, before)
     touch = env.obs_space.parts.get("touch", slice(0))
     columns = np.delete(np.arange(env.obs_space.size), touch)  # touch sensors keep the values of the last substep
