@@ -60,7 +60,7 @@ def keep_warm_start(engine: MujocoEngine) -> None:
 
 
 def narrow_positions(worlds: Worlds) -> None:
-    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :-1]
+    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :0]
     del worlds._copies["qpos"]
 
 
