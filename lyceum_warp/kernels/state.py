@@ -31,22 +31,6 @@ def _casts(name: str, source: Any, target: Any) -> wp.Kernel:
     return wp.kernel(cast, enable_backward=False)
 
 
-def _fills(name: str, dtype: Any) -> wp.Kernel:
-    """Make a kernel that copies one row into all masked rows; launched over (nworld, lanes)."""
-
-    def fill(
-        mask_in: wp.array[bool], source_in: wp.array[dtype], target_out: wp.array2d[dtype], lanes: int, first: int
-    ):
-        k, lane = wp.tid()
-        w = first + k
-        if mask_in[w]:
-            for i in range(lane, target_out.shape[1], lanes):
-                target_out[w, i] = source_in[i]
-
-    fill.__qualname__ = name
-    return wp.kernel(fill, enable_backward=False)
-
-
 @wp.func
 def cast_row(source: wp.array2d[Any], target: wp.array2d[Any], w: int):
     for i in range(target.shape[1]):
@@ -87,8 +71,6 @@ narrow_four = _casts_four("narrow_four", wp.float64, wp.float32)
 widen = _casts("widen", wp.float32, wp.float64)
 widen_bool = _casts("widen_bool", wp.bool, wp.float64)
 widen_four = _casts_four("widen_four", wp.float32, wp.float64)
-fill_rows = _fills("fill_rows", wp.float32)
-fill_rows64 = _fills("fill_rows64", wp.float64)
 
 
 @wp.kernel(enable_backward=False)
