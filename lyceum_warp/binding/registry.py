@@ -87,7 +87,7 @@ def _package_modules() -> dict[str, str]:
         for module in pkgutil.iter_modules([str(folder)]):
             if module.ispkg:
                 tasks = importlib.import_module(f"{_PACKAGE}{module.name}").TASKS
-                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in tasks.items()}
+                found |= {task: f"{_PACKAGE}{module.name}.{file}" for file, names in tasks.items() for task in names}
             else:
                 found[module.name] = f"{_PACKAGE}{module.name}"
     return found

@@ -645,7 +645,7 @@ class Env:
     @property
     def fault_counts(self) -> dict[str, int]:
         """Count the faults of each kind since construction. This waits for the device."""
-        counts = self.worlds.fault_count.numpy().sum(axis=0)
+        counts = self.worlds.episodes.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 

@@ -1,7 +1,5 @@
 from lyceum_warp.training.callbacks import (
     Callback as Callback,
-    Minutes as Minutes,
-    TargetReturn as TargetReturn,
     TransferTest as TransferTest,
     Videos as Videos,
 )
@@ -39,5 +37,9 @@ from lyceum_warp.training.runs.task_copy import (
     note_changes as note_changes,
     run_env as run_env,
     task_copy as task_copy,
+)
+from lyceum_warp.training.stopping import (
+    Minutes as Minutes,
+    TargetReturn as TargetReturn,
 )
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
