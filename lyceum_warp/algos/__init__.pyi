@@ -40,6 +40,11 @@ from lyceum_warp.algos.common.value import (
     ValueFunction as ValueFunction,
     value_group as value_group,
 )
+from lyceum_warp.algos.distill import (
+    Demonstrations as Demonstrations,
+    Distill as Distill,
+    DistillConfig as DistillConfig,
+)
 from lyceum_warp.algos.npg import NPG as NPG, NPGConfig as NPGConfig
 from lyceum_warp.algos.planning.arguments import task_config as task_config
 from lyceum_warp.algos.planning.config import MPPIConfig as MPPIConfig

@@ -88,7 +88,8 @@ class Display(Callback):
         success = f"success {row['success']:.0%}" if "success" in row else ""
         bad = [counted(number, what) for column, what in _COUNTED.items() if (number := row.get(column))]
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
-        text = " ".join(filter(None, [result, *bad, mean, success, rate]))
+        loss = f"loss {row['loss']:.3g}" if "loss" in row else ""
+        text = " ".join(filter(None, [result, loss, *bad, mean, success, rate]))
         if self.console.is_terminal:
             text = textwrap.shorten(text, self.console.width - _BAR_WIDTH, placeholder="…")
             self.progress.update(self.bar, completed=it.iteration, text=text)
@@ -125,7 +126,7 @@ _COLUMNS = [
     ("iter", "iteration", ".0f"), ("samples", "samples", ",.0f"), ("reward\na step", "reward_mean", ".3g"),
     ("return", "return_mean", ".1f"), ("std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
-    ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
+    ("KL", "kl", ".3f"), ("loss", "loss", ".3g"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
 """Columns of the table: heading, name in metrics.csv, and format."""
 

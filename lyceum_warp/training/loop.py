@@ -15,6 +15,7 @@ from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.training.callbacks import Callback
+from lyceum_warp.training.runs.checkpoints import policy_content, write_content
 from lyceum_warp.training.runs.configuration import describe
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.lock import run_lock
@@ -121,6 +122,8 @@ def train(
                     undo.callback(shutil.rmtree, run.folder, ignore_errors=True)
                     run.check = stack.enter_context(run_lock(run.folder))
                     note_uncopied_data(learner.env)
+                    if learner.teacher is not None:
+                        write_content(run.teacher, policy_content(0, learner.teacher))
             for observer in observers:
                 stack.callback(observer.close)
                 observer.begin(run, learner, iterations)

@@ -3,6 +3,7 @@
 TASKS = {
     "go1_velocity": "go1",
     "go1_rough_velocity": "go1_rough",
+    "go1_student_velocity": "student",
     "spot_velocity": "spot",
     "g1_velocity": "g1",
     "g1_full_velocity": "g1",
