@@ -10,7 +10,7 @@ import copy
 import dataclasses
 from collections.abc import Iterable, Mapping
 from types import SimpleNamespace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -90,18 +90,6 @@ class DistillConfig:
             raise ValueError(f"gradient_length={self.gradient_length} must divide num_steps, which is {self.num_steps}")
 
 
-class Episode(Protocol):
-    """An episode to imitate, such as a ``lw.Trajectory``."""
-
-    @property
-    def obs(self) -> torch.Tensor:
-        """Observations, (steps + 1, nobs)."""
-
-    @property
-    def actions(self) -> torch.Tensor:
-        """Actions, (steps, nact)."""
-
-
 @document_attributes
 class Demonstrations(nn.Module):
     """Saved episodes of a policy or a planner as a teacher.
@@ -111,7 +99,8 @@ class Demonstrations(nn.Module):
         >>> learner = lw.Distill(env, teacher=lw.Demonstrations(episodes))
 
     Args:
-        episodes: The episodes, each with ``obs`` (steps + 1, nobs) and ``actions`` (steps, nact).
+        episodes: The episodes, ``lw.Trajectory`` or other objects with the tensors ``obs``, (steps + 1, nobs), and
+            ``actions``, (steps, nact).
 
     Raises:
         ValueError: There is no episode.
@@ -124,7 +113,7 @@ class Demonstrations(nn.Module):
     step: torch.Tensor
     """Number of steps since the episode's start, (steps,)."""
 
-    def __init__(self, episodes: Iterable[Episode]) -> None:
+    def __init__(self, episodes: Iterable[Any]) -> None:
         super().__init__()
         parts = [(each.obs[: len(each.actions)], each.actions, torch.arange(len(each.actions))) for each in episodes]
         if not parts:
@@ -244,6 +233,7 @@ class Distill(Learner):
         self._epoch = Captured(self.learn, team, device)
         self._evaluate_mean = MeanPolicyEvaluation(env, config, team)
         self.rollout.restart()
+        players = [self._player]
         if isinstance(teacher, Demonstrations):
             self._demonstrations = copy.deepcopy(teacher).to(device)
             places = torch.randint(len(teacher.obs), (nworld,), generator=torch.Generator().manual_seed(self.seed))
@@ -254,7 +244,9 @@ class Distill(Learner):
             with torch.no_grad():
                 Player(teacher, env).first(env.obs_groups[self.group])
             self._labels = Player(teacher, env)
+            players.append(self._labels)
             self.rollout.stagger(self.generator, team)
+        self._remembering = [player for player in players if player.state_size]
 
     def __next__(self) -> DistillIteration:
         config, rollout, team = self.config, self.rollout, self.team
@@ -351,17 +343,12 @@ class Distill(Learner):
         make(env, self.policy, self.config, teacher=self.teacher, seed=self.seed, team=self.team)
         self.load_state_dict(state)
 
-    def _memories(self) -> list[Player]:
-        """Return the student and the teacher as far as they have memory."""
-        players = [self._player] if self._clones else [self._player, self._labels]
-        return [player for player in players if player.state_size]
-
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
         state = {
             "optimizer": self._step.optimizer.state_dict(),
             "returns": self.team.gather(self.rollout.running_return),
-            "memory": [self.team.gather(player.state) for player in self._memories()],
+            "memory": [self.team.gather(player.state) for player in self._remembering],
         }
         return super().state_dict() | copy.deepcopy(state)
 
@@ -371,5 +358,5 @@ class Distill(Learner):
         self._step.optimizer.load_state_dict(state["optimizer"])
         self._epoch.forget()  # the graph contains the learning rate
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
-        for player, memory in zip(self._memories(), state["memory"], strict=True):
+        for player, memory in zip(self._remembering, state["memory"], strict=True):
             player.state = memory[self.own_worlds].to(self.env.obs.device)

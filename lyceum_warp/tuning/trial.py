@@ -74,14 +74,18 @@ class Trials:
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._starts: list[torch.Tensor] = []
         self._actions: list[torch.Tensor] = []
+        memories = []
         env.rand_reset(self.seed)
         for step in range(max(self.effort.recorded_at) + 1):
             if step in self.effort.recorded_at:
                 self._starts.append(env.get_state())
+                memories.append(None if self.player is None else self.player.state)
             env.rand_reset(mask=env.done)
             env.step(self._mixed(next(draw), policy_worlds))
-        for start in self._starts:
+        for start, memory in zip(self._starts, memories, strict=True):
             env.set_state(start)
+            if self.player is not None and memory is not None:
+                self.player.state = memory
             actions = []
             for _ in range(_ACTIONS):
                 actions.append(self._mixed(next(draw), policy_worlds))

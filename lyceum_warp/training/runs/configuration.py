@@ -7,19 +7,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos import (
-    LIMIT,
-    NPG,
-    PPO,
-    SAC,
-    Distill,
-    DistillConfig,
-    Learner,
-    NPGConfig,
-    PPOConfig,
-    SACConfig,
-    Team,
-)
+from lyceum_warp import algos
+from lyceum_warp.algos import LIMIT, Distill, Learner, Team
 from lyceum_warp.binding import spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
@@ -32,7 +21,8 @@ from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copies
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
-    "npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig), "distill": (Distill, DistillConfig),
+    "npg": (algos.NPG, algos.NPGConfig), "ppo": (algos.PPO, algos.PPOConfig), "sac": (algos.SAC, algos.SACConfig),
+    "distill": (Distill, algos.DistillConfig),
 }  # fmt: skip
 """Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
 
