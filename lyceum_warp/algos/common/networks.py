@@ -12,6 +12,7 @@ from torch import nn
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
+from lyceum_warp.support.warp_log import start_warp
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -29,6 +30,7 @@ def check_memory(sizes: Sequence[int], networks: int = 1) -> None:
     Raises:
         ValueError: The weights do not fit into memory.
     """
+    start_warp()
     bytes_each, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and (size := networks * bytes_each) > free:
         raise ValueError(
