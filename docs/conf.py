@@ -47,10 +47,10 @@ add_module_names, python_use_unqualified_type_names, python_maximum_signature_li
 autodoc_member_order, autodoc_typehints = "bysource", "none"
 
 CONTENTS = {
-    "Guide": "notebooks/first_task own_task warp_for_python task_form terms",
+    "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
     "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/control tasks/arms tasks/balance "
     "tasks/velocity velocity terrain dm_suite",
-    "Learning": "runs ppo sac policies learners deployment adapters notebooks/own_robot notebooks/deploy",
+    "Learning": "runs ppo sac memory policies learners deployment adapters notebooks/own_robot notebooks/deploy",
     "Planning": "planning notebooks/live_planner",
     "Viewer": "viewer",
     "Internals": "architecture physics Measurements</bench/README> /CONTRIBUTING /CHANGELOG",

@@ -11,6 +11,11 @@ from lyceum_warp.algos.common.squashed_policy import SquashedPolicy as SquashedP
 from lyceum_warp.algos.common.transfer import Transfer as Transfer, transfer as transfer
 from lyceum_warp.algos.common.twin_critic import TwinCritic as TwinCritic
 from lyceum_warp.algos.common.value import ValueFunction as ValueFunction
+from lyceum_warp.algos.distill import (
+    Demonstrations as Demonstrations,
+    Distill as Distill,
+    DistillConfig as DistillConfig,
+)
 from lyceum_warp.algos.npg import NPG as NPG, NPGConfig as NPGConfig
 from lyceum_warp.algos.planning.config import MPPIConfig as MPPIConfig
 from lyceum_warp.algos.planning.planner import (

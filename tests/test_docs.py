@@ -80,6 +80,8 @@ BLOCK = re.compile(r"^```(\w+)(?: title=(\S+))?\n(.*?)^```$", re.MULTILINE | re.
 QUICK = {
     "check": ["--nworld", "2", "--rule", "reset", "--rule", "restoring"],
     "train": ["--iterations", "2", *TINY, "--no-video"],
+    "train --teacher": shlex.split("--iterations 2 --nworld 4 --no-video --hidden 8 --mean-every 1 --mean-episodes 2"),
+    "train --demonstrations": shlex.split("--iterations 2 --nworld 4 --no-video --hidden 8 --mean-every 0"),
     "train --algorithm": shlex.split(
         "--iterations 2 --nworld 4 --horizon 32 --no-video --hidden 8 --value-hidden 8 --mean-every 1"
     ),
@@ -88,6 +90,9 @@ QUICK = {
     "tune": ["--nworld", "8", "--episodes", "4"],
     "plan": ["--steps", "3", "--samples", "4", "--no-video"],
 }
+
+
+KINDS = ("--resume", "--teacher", "--demonstrations", "--algorithm")
 
 
 class Walkthrough:
@@ -122,7 +127,7 @@ class Walkthrough:
             case ["lyceum-warp", command, *options]:
                 if self.quick and "warp" in options:
                     return
-                kinds = [f"{command} {option}" for option in ("--resume", "--algorithm") if option in options]
+                kinds = [f"{command} {option}" for option in KINDS if option in options]
                 kind = kinds[0] if kinds else command
                 more = QUICK.get(kind, []) if self.quick else []
                 assert cli.main([command, *options, *more]) == 0, command_line

@@ -38,7 +38,10 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
         ValueError: The task has no observation group for the value function.
     """
     config = config or PPOConfig()
+    group = value_group(env, config.value_group)
     network = {"class_name": "rsl_rl.models.MLPModel", "obs_normalization": config.normalize}
+    memory = {"class_name": "rsl_rl.models.RNNModel", "rnn_type": "gru", "rnn_hidden_dim": config.recurrent}
+    actor = network | memory if config.recurrent else network
     distribution = {
         "class_name": "rsl_rl.modules.GaussianDistribution", "std_type": config.std_type,
         "init_std": math.exp(config.log_std),
@@ -48,9 +51,9 @@ def runner_config(env: Env, config: PPOConfig | None = None) -> dict[str, Any]:
         "save_interval": 50,
         # rsl_rl's NaN check would wait for the device, and the environment already reports NaN as a fault
         "check_for_nan": False,
-        "obs_groups": {"actor": ["policy"], "critic": [value_group(env, config.value_group)]},
-        "actor": network | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
-        "critic": network | _layers(config.value_hidden, config.value_activation),
+        "obs_groups": {"actor": ["policy"], "critic": [group]},
+        "actor": actor | _layers(config.hidden, config.activation) | {"distribution_cfg": distribution},
+        "critic": (actor if group == "policy" else network) | _layers(config.value_hidden, config.value_activation),
         "algorithm": {theirs: getattr(config, ours) for ours, theirs in _PPO.items()} | {
             "class_name": "rsl_rl.algorithms.PPO", "optimizer": "adam", "rnd_cfg": None,
         },

@@ -8,7 +8,6 @@ from lyceum_warp.algos.common.evaluation import (
     evaluate as evaluate,
     evaluation_seed as evaluation_seed,
     evaluation_worlds as evaluation_worlds,
-    first_actions as first_actions,
 )
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (
@@ -16,15 +15,8 @@ from lyceum_warp.algos.common.learner import (
     Iteration as Iteration,
     Learner as Learner,
 )
-from lyceum_warp.algos.common.networks import (
-    LIMIT as LIMIT,
-    moved as moved,
-)
-from lyceum_warp.algos.common.policy import (
-    GaussianPolicy as GaussianPolicy,
-    Policy as Policy,
-    acting as acting,
-)
+from lyceum_warp.algos.common.networks import LIMIT as LIMIT
+from lyceum_warp.algos.common.policy import GaussianPolicy as GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_sizes as check_sizes
 from lyceum_warp.algos.common.policy_export import (
     check_export as check_export,
@@ -47,6 +39,11 @@ from lyceum_warp.algos.common.twin_critic import TwinCritic as TwinCritic
 from lyceum_warp.algos.common.value import (
     ValueFunction as ValueFunction,
     value_group as value_group,
+)
+from lyceum_warp.algos.distill import (
+    Demonstrations as Demonstrations,
+    Distill as Distill,
+    DistillConfig as DistillConfig,
 )
 from lyceum_warp.algos.npg import NPG as NPG, NPGConfig as NPGConfig
 from lyceum_warp.algos.planning.arguments import task_config as task_config

@@ -26,7 +26,7 @@ from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathe
 from lyceum_warp.algos.common.symmetry import apply_symmetry
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.common.value import ValueFunction
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env, Player
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import whole_number
@@ -47,6 +47,7 @@ _BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
+    "recurrent": 0,
 }  # fmt: skip
 
 
@@ -98,6 +99,10 @@ class PPOConfig:
     """Whether to normalise advantages within each mini-batch instead of over all samples."""
     hidden: tuple[int, ...] = (512, 256, 128)
     """Widths of the policy's hidden layers."""
+    recurrent: int = 0
+    """Units of a GRU before the policy's hidden layers, which gives the policy memory; 0 means no memory. The value
+    function gets a GRU of this size, too, if it uses the policy's observations. Mini-batches are then sequences: all
+    steps of some worlds."""
     activation: Activation = "elu"
     """Activation of the policy's hidden layers."""
     log_std: float = 0.0
@@ -223,19 +228,26 @@ class PPO(OnPolicyLearner):
         super().__init__(env, policy, value, config, seed=seed, team=team)
         config, team, device = self.config, self.team, env.obs.device
         steps, nworld = config.num_steps, env.nworld * team.size
-        if config.minibatches > (count := steps * nworld):
+        # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
+        limit = math.inf if config.normalize else LIMIT
+        self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
+        self._recurrent = self.policy.state_size + self.value.state_size > 0
+        if self._recurrent and config.symmetry != "none":
             raise ValueError(
-                f"{config.minibatches} mini-batches need at least {config.minibatches} samples, not {count}: use more "
+                f"symmetry={config.symmetry!r} needs a policy without memory: use symmetry='none' (--symmetry none)"
+            )
+        self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
+        count, items = steps * nworld // self._length, "worlds" if self._recurrent else "samples"
+        if config.minibatches > count:
+            raise ValueError(
+                f"{config.minibatches} mini-batches need at least {config.minibatches} {items}, not {count}: use more "
                 "worlds or fewer mini-batches"
             )
         if (excess := count % config.minibatches) and team.leads:
             log.warning(
-                "%d mini-batches of equal size hold only %d of %d samples: make the number of mini-batches divide %d",
-                config.minibatches, count - excess, count, count,
+                "%d mini-batches of equal size hold only %d of %d %s: make the number of mini-batches divide %d",
+                config.minibatches, count - excess, count, items, count,
             )  # fmt: skip
-        # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
-        limit = math.inf if config.normalize else LIMIT
-        self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         if self.policy.mirror is not None:
             config = self.config = dataclasses.replace(config, symmetry="exact")
         self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
@@ -245,6 +257,9 @@ class PPO(OnPolicyLearner):
         self._means = self.rollout.store_too(self._mean)
         self._act = Captured(self._choose, team, device)
         self._observe = Captured(self._update_normalizers, team, device)
+        self._player = Player(self.policy, env)
+        self._first = torch.zeros_like(self._player.state)  # the policy's states before the rollout
+        self._value_state = torch.zeros(env.nworld, self.value.state_size, device=device)
 
         # the update
         log_std = self.policy.log_std
@@ -264,8 +279,9 @@ class PPO(OnPolicyLearner):
         self._entropy_coef = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
         self.minibatches = Minibatches(
-            self.learn, steps=steps, nworld=env.nworld, count=config.minibatches, team=team, device=device
-        )
+            self.learn, steps=steps // self._length, nworld=env.nworld, count=config.minibatches, team=team,
+            device=device,
+        )  # fmt: skip
 
         self._recent: collections.deque[float] = collections.deque(maxlen=RECENT)
         self.rollout.restart()
@@ -332,6 +348,7 @@ class PPO(OnPolicyLearner):
         with one_thread():
             self.noise.normal_(generator=self.generator)
             rollout.begin()
+            self._first.copy_(self._player.state)
             for _ in range(rollout.steps):
                 self._act()
                 rollout.store_inputs()
@@ -343,7 +360,7 @@ class PPO(OnPolicyLearner):
     def _choose(self) -> None:
         """Draw actions from the policy."""
         noise = self.noise.index_select(0, self.rollout.index)[0, self.own_worlds]
-        self._mean.copy_(self.policy(self.env.obs))
+        self._mean.copy_(self._player(self.env.obs))
         torch.addcmul(self._mean, noise, self.policy.log_std.exp(), out=self.env.action)
 
     def _update_normalizers(self) -> None:
@@ -352,7 +369,7 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
-        """Compute the inputs of the update, each (steps, nworld, ...).
+        """Compute the inputs of the update, each (steps, nworld, ...), or (1, nworld, ...) for states.
 
         The value function's targets are its predictions plus the advantages. Advantages bootstrap from the observation
         right after a step, before events such as a push or a new command. Advantages thus exclude the effects of
@@ -361,7 +378,9 @@ class PPO(OnPolicyLearner):
         """
         rollout, config, team = self.rollout, self.config, self.team
         obs, final_obs = rollout.obs_groups[self.value.group], rollout.final_obs_groups[self.value.group]
-        value, next_value = self.value(obs, rollout.step), self.value(final_obs, rollout.step + 1.0)
+        before = self._value_state
+        value, states = self.value.unrolled(obs, rollout.step, before, rollout.step == 0.0)
+        next_value, self._value_state = self.value(final_obs, rollout.step + 1.0, states), states[-1]
         advantage, _ = self._estimate(rollout.reward, value, next_value)
         target = value + advantage
         if not config.whiten_minibatches:
@@ -369,21 +388,25 @@ class PPO(OnPolicyLearner):
             variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
             advantage = advantage / (variance.sqrt() + 1e-8)
         self._old_log_std.copy_(self.policy.log_std)
-        return {
+        samples = {
             "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
             "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip
+        return samples | {"state": self._first[None], "value_state": before[None]} if self._recurrent else samples
 
     def update(self, samples: Samples) -> None:
         """Run the epochs of mini-batches."""
-        config, team = self.config, self.team
+        config, team, length = self.config, self.team, self._length
+        if self._recurrent:  # for the mini-batches, a sequence is one sample
+            samples = {name: part.transpose(0, 1)[None] for name, part in samples.items()}
         parts = self.minibatches.shuffle(samples, self.generator)
         if config.whiten_minibatches:
-            advantage, weight = parts["advantage"], self.minibatches.weight
+            advantage = parts["advantage"].flatten(1)
+            weight = self.minibatches.weight.repeat_interleave(length, 1) / length
             advantage -= team.sum((weight * advantage).sum(1, keepdim=True))
             variance = team.sum((weight * advantage.square()).sum(1, keepdim=True))
-            batch = self.minibatches.batch
+            batch = self.minibatches.batch * length
             advantage /= (variance * (batch / max(batch - 1, 1))).sqrt() + 1e-8
         self._entropy_coef.fill_(config.entropy_weight(self.iteration + 1))
         self._losses.zero_()
@@ -395,17 +418,20 @@ class PPO(OnPolicyLearner):
     def learn(self, samples: Samples, weight: torch.Tensor) -> None:
         """Make one step of Adam on a mini-batch."""
         config, clip = self.config, self.config.clip
+        if self._recurrent:
+            samples = {name: part.transpose(0, 1) for name, part in samples.items()}
+            weight = (weight / self._length).expand(self._length, -1)
         old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
         with self._branch:
-            value = self.value(samples["value_obs"], samples["step"])
+            value = self._value_of(samples)
             error = (value - samples["target"]).square()
             if config.clip_value_loss:
                 clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
                 error = torch.max(error, (clipped - samples["target"]).square())
             value_loss = (weight * error).sum()
-        mean, log_std = self.policy(samples["obs"]), self._log_std()
+        mean, log_std = self._mean_of(samples), self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
@@ -418,7 +444,7 @@ class PPO(OnPolicyLearner):
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
-        scale = float(self.minibatches.batch) if MLP.in_half else 1.0
+        scale = float(self.minibatches.batch * self._length) if MLP.in_half else 1.0
         # backward() accumulates on the CUDA stream of its first call
         gradients = torch.autograd.grad(scale * loss, self._parameters)
 
@@ -434,6 +460,21 @@ class PPO(OnPolicyLearner):
                 part *= (config.max_grad_norm / (torch.linalg.vector_norm(part) + 1e-6)).clamp_max(1.0)
             self.optimizer.step()
             self._losses += self._sums[-3:]
+
+    def _mean_of(self, samples: Samples) -> torch.Tensor:
+        """Compute the mean actions of a mini-batch."""
+        if not self._recurrent:
+            return self.policy(samples["obs"])
+        mean, _ = self.policy.unrolled(samples["obs"], samples["state"][0], samples["step"] == 0.0)
+        return mean
+
+    def _value_of(self, samples: Samples) -> torch.Tensor:
+        """Predict the values of a mini-batch."""
+        obs, step = samples["value_obs"], samples["step"]
+        if not self._recurrent:
+            return self.value(obs, step)
+        value, _ = self.value.unrolled(obs, step, samples["value_state"][0], step == 0.0)
+        return value
 
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples; an image has the same density as its original."""
@@ -464,7 +505,9 @@ class PPO(OnPolicyLearner):
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
         """Compute the KL divergence from the old to the current policy, averaged over the samples."""
-        kl = divergence(self._means, self._old_log_std, self.policy(self.rollout.obs), self.policy.log_std).mean()
+        rollout, policy = self.rollout, self.policy
+        mean, _ = policy.unrolled(rollout.obs, self._first, rollout.step == 0.0)
+        kl = divergence(self._means, self._old_log_std, mean, policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
@@ -476,6 +519,8 @@ class PPO(OnPolicyLearner):
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
         state = {"optimizer": self.optimizer.state_dict(), "std": self.std.detach(), "recent": list(self._recent)}
+        if self._recurrent:
+            state["memory"] = [self.team.gather(part) for part in (self._player.state, self._value_state)]
         return super().state_dict() | copy.deepcopy(state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -486,3 +531,7 @@ class PPO(OnPolicyLearner):
             self.std.copy_(state["std"])
         self._recent.clear()
         self._recent.extend(state["recent"])
+        if self._recurrent:
+            parts = [part[self.own_worlds].to(self.env.obs.device) for part in state["memory"]]
+            self._player.state.copy_(parts[0])
+            self._value_state = parts[1]

@@ -46,7 +46,7 @@ _COLUMNS = [
     ("iter", "iteration", ".0f"), ("samples", "samples", ",.0f"), ("reward\na step", "reward_mean", ".3g"),
     ("return", "return_mean", ".1f"), ("std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
-    ("KL", "kl", ".3f"), ("samples/s", "samples_per_second", ",.0f"),
+    ("KL", "kl", ".3f"), ("loss", "loss", ".3g"), ("samples/s", "samples_per_second", ",.0f"),
 ]  # fmt: skip
 """Columns of the table: heading, name in metrics.csv, and format."""
 

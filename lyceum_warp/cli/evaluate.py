@@ -11,9 +11,7 @@ import tyro
 from lyceum_warp.algos import (
     EXACT,
     Episodes,
-    Policy,
     Transfer,
-    acting,
     check_sizes,
     evaluate,
     evaluation_seed,
@@ -27,7 +25,7 @@ from lyceum_warp.cli.display import console, say, table, tried
 from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import options_for_few_worlds, options_on_cores
-from lyceum_warp.env import Curriculum, Env
+from lyceum_warp.env import Curriculum, Env, Policy
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training import (
@@ -280,7 +278,7 @@ def _save_episodes(
     controller = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
     with LongWork("running the episodes that are saved", "steps", console) as work:
         episodes = policy_episodes(
-            env.replicate(autoreset=False), acting(policy), options.episodes, seed=evaluation_seed(options.seed),
+            env.replicate(autoreset=False), policy, options.episodes, seed=evaluation_seed(options.seed),
             curriculum=curriculum, controller=controller, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):

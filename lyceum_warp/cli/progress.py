@@ -70,7 +70,8 @@ class Display(Callback):
         success = f"success {row['success']:.0%}" if "success" in row else ""
         bad = [counted(number, what) for column, what in COUNTED.items() if (number := row.get(column))]
         rate = f"{row['samples_per_second'] / 1000:.3g}k samples/s" if "samples_per_second" in row else ""
-        text = " ".join(filter(None, [result, *bad, mean, success, rate]))
+        loss = f"loss {row['loss']:.3g}" if "loss" in row else ""
+        text = " ".join(filter(None, [result, loss, *bad, mean, success, rate]))
         if self.console.is_terminal:
             text = textwrap.shorten(text, self.console.width - _BAR_WIDTH, placeholder="…")
             self.progress.update(self.bar, completed=it.iteration, text=text)

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp import algos, binding, core, engines, training, viz  # each name loads at its first use
+from lyceum_warp import algos, binding, controllers, core, engines, training, viz  # each name loads at its first use
 from lyceum_warp.cli.arguments import (
     CameraWords,
     EnvFlags,
@@ -28,7 +28,10 @@ from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.outlines import outline
 
-_CONFIGS = {name: outline("lyceum_warp.algos", f"{name.upper()}Config") for name in ("npg", "ppo", "sac")}
+_CONFIGS = {
+    name.removesuffix("Config").lower(): outline("lyceum_warp.algos", name)
+    for name in ("NPGConfig", "PPOConfig", "SACConfig", "DistillConfig")
+}
 """The hyperparameters of each of ``training.ALGORITHMS``. Their own classes come with torch."""
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
@@ -36,7 +39,8 @@ _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboa
 """Settings that --resume may change, with their default values."""
 
 _RUN_FLAGS = {
-    "from_run": "--from", "algorithm": "--algorithm", "seed": "--seed", "threads": "--threads", "out": "--out",
+    "from_run": "--from", "algorithm": "--algorithm", "teacher": "--teacher", "demonstrations": "--demonstrations",
+    "seed": "--seed", "threads": "--threads", "out": "--out",
 }  # fmt: skip
 """Flags that --resume refuses, because a run keeps these settings."""
 
@@ -74,7 +78,7 @@ class Hyperparameters(OptionFlags, options=[*_CONFIGS.values()], defaults=_defau
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Train:
-    """Train a policy on a task, with the natural policy gradient, PPO or SAC.
+    """Train a policy on a task, with the natural policy gradient, PPO or SAC, or by imitation of a teacher.
 
     The command writes config.json, metrics.csv (one row per iteration), policy.pt, best.pt, checkpoint.pt and curve.png
     into the run's folder. Ctrl-C saves and ends the run after the current iteration. A second Ctrl-C ends
@@ -88,6 +92,8 @@ class Train:
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
+    $ lyceum-warp train go1_student_velocity --teacher go1_velocity --recurrent 256 --device cuda
+    $ lyceum-warp train hopper --algorithm distill --demonstrations runs/hopper-episodes
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
@@ -102,10 +108,17 @@ class Train:
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
     --resume, it replaces the file of the run's own task.
     """
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
-    """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). The default is the
-    algorithm that the task suggests: ppo for walking robots, npg for others.
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac|distill")] = None
+    """npg (the natural policy gradient), ppo, sac (soft actor-critic with a replay buffer), or distill (imitation of
+    --teacher or --demonstrations). The default is the algorithm that the task suggests: ppo for walking robots, npg for
+    others.
     """
+    teacher: Annotated[str | None, tyro.conf.arg(metavar="RUN|FILE|TASK")] = None
+    """The policy that distill imitates: a run's folder (its last policy), a policy's file in this folder, or the name
+    of a task with a pretrained policy. The new run stores the policy in teacher.pt.
+    """
+    demonstrations: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE...")] = None
+    """The episodes that distill imitates instead, as written by eval --episodes-to or plan: files or folders."""
     iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
     suggests, or 100.
@@ -332,6 +345,7 @@ class Train:
             training.Run.check_free(self.out)
         policy = value = None
         entries: dict[str, Any] = {}
+        teacher, parts = self._teacher(configuration.algorithm, source)
         if source is not None:
             policy, value, iteration = training.saved_networks(source, self.which if self.resume is None else None)
             algorithm = configuration.algorithm
@@ -342,7 +356,16 @@ class Train:
                 )
             if self.resume is None:
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
-        learner = configuration.learner(team, run=source, networks=(policy, value), task=self.task)
+        learner = configuration.learner(team, run=source, networks=(policy, value), teacher=teacher, task=self.task)
+        if parts is not None:
+            group = getattr(learner, "group", "policy")
+            if parts != (known := learner.env.obs_spaces[group].parts):
+                raise ValueError(
+                    f"the teacher's observations are {', '.join(parts)}, but the group {group!r} of the task "
+                    f"{learner.env.task.name!r} has {', '.join(known)}: the parts and their sizes must be the same"
+                )
+            words = [self.teacher] if self.teacher else list(map(str, self.demonstrations or ()))
+            entries["teacher"] = [str(Path(word).resolve()) if Path(word).exists() else word for word in words]
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
             for name, value in given(self.hyperparameters).items():
@@ -355,6 +378,31 @@ class Train:
             training.note_changes(source, learner.env)
         name = f"{binding.file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
+
+    def _teacher(self, algorithm: str, source: "training.Run | None") -> "tuple[Any, Mapping[str, slice] | None]":
+        """Load what distill imitates, and the parts of its observations if they are to be checked."""
+        if self.teacher is not None and self.demonstrations is not None:
+            raise ValueError("--teacher and --demonstrations are two teachers: omit one of them")
+        if algorithm != "distill":
+            if self.teacher is not None or self.demonstrations is not None:
+                raise ValueError("--teacher and --demonstrations need --algorithm distill")
+            return None, None
+        if self.demonstrations is not None:
+            episodes = list(controllers.load_episodes(self.demonstrations).values())
+            return algos.Demonstrations(episodes), {
+                name: slice(*place) for name, place in episodes[0].obs_parts.items()
+            }
+        if self.teacher is None:
+            if source is None or not source.teacher.is_file():
+                raise ValueError("distill needs a teacher: give --teacher RUN, or --demonstrations FILE...")
+            return training.load(source.teacher), None
+        from lyceum_warp.cli.evaluate import run_worlds
+
+        path = Path(self.teacher)
+        if not path.exists() and self.teacher in training.pretrained_tasks():
+            path = training.pretrained_run(self.teacher)
+        run = training.Run.open(path.parent if path.is_file() else path)
+        return training.load(path), run_worlds(run, engines.options_on_cores(), {}, nworld=1).obs_space.parts
 
     def _report(self, run: "training.Run", learner: "algos.Learner") -> int:
         env, choice = learner.env, None

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos import MPPI, Policy, check_sizes, task_config
+from lyceum_warp.algos import MPPI, check_sizes, task_config
 from lyceum_warp.binding import task_names
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, given, parameters
 from lyceum_warp.cli.display import note
@@ -15,7 +15,7 @@ from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers import episode_env, load_episodes
 from lyceum_warp.core import EnvOptions
-from lyceum_warp.env import Env, start_episodes
+from lyceum_warp.env import Env, Policy, start_episodes
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.training import AUTO, Run, load, load_curriculum, pretrained_run, pretrained_text, runs_in
 from lyceum_warp.viewer import Follower, Watcher, view

@@ -7,14 +7,13 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
-from lyceum_warp.env import Curriculum, Env, start_episodes
-from lyceum_warp.support.tensors import memoryless_action
+from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
 
 
 @torch.no_grad()
 def policy_episodes(
     env: Env,
-    policy: Callable[[torch.Tensor], torch.Tensor],
+    policy: Policy,
     episodes: int,
     *,
     seed: int | None = None,
@@ -33,6 +32,7 @@ def policy_episodes(
     Yields:
         The first episode of each world, then the second episode of each world, and so on.
     """
+    player = Player(policy, env)
     named = {"name": type(policy).__name__, **(controller or {})}
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)
@@ -50,7 +50,7 @@ def policy_episodes(
         start = time.perf_counter()
         while not (lengths > 0).all():
             called = time.perf_counter()
-            env.action.copy_(policy(env.obs) if number or actions else memoryless_action(policy, env.obs))
+            env.action.copy_(player(env.obs) if number or actions else player.first(env.obs))
             actions.append(env.action.cpu().clone())
             applied = time.perf_counter()
             env.step()

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.controllers.controller import Controller
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env, Player
 from lyceum_warp.support.validate import described, positive_number
 
 
@@ -17,6 +17,8 @@ class CheckedController:
     """Calls a controller, checks its actions, and selects a plan's action for each step of the plant."""
 
     def __init__(self, controller: Controller, env: Env) -> None:
+        if hasattr(controller, "act"):
+            controller = _PolicyController(controller, env)
         _check_call(controller)
         if getattr(controller, "env", None) is env:
             raise ValueError(
@@ -113,6 +115,16 @@ class CheckedController:
             number, name = plan[tuple(where)].item(), self._names[where[-1]]
             raise ValueError(f"the controller's action {name!r} at step {step} must be finite, not {number}")
         return plan
+
+
+class _PolicyController:
+    """Calls a policy, which acts in all worlds, as a controller of one world."""
+
+    def __init__(self, policy: Any, env: Env) -> None:
+        self.__name__, self._player = type(policy).__name__, Player(policy, env)
+
+    def __call__(self, state: torch.Tensor, obs: torch.Tensor) -> torch.Tensor:
+        return self._player(obs[None])[0]
 
 
 def _steps(plant: float, plan: float) -> tuple[int, int]:

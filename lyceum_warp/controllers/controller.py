@@ -11,8 +11,8 @@ from lyceum_warp.env.env import Env
 class Controller(Protocol):
     """A function that computes an action from the plant's state and observation.
 
-    The plant is an environment of one world. Plain functions and ``lw.MPPI`` are controllers. To control with a policy,
-    pass ``lambda state, obs: policy(obs)``. ``PlanningController`` lists optional attributes and methods.
+    The plant is an environment of one world. Plain functions and ``lw.MPPI`` are controllers. Control loops also accept
+    a policy, a module with the method ``act``. ``PlanningController`` lists optional attributes and methods.
     """
 
     def __call__(self, state: torch.Tensor, obs: torch.Tensor, /) -> torch.Tensor:

@@ -58,7 +58,8 @@ class Gate(abc.ABC):
         Args:
             worlds: ``worlds(nworld, **params)`` makes an environment on the C engine under exact physics. Its episodes
                 have begun at the curriculum of the policy, and have no time limit.
-            act: Maps observations, (nworld, nobs), to actions without noise, (nworld, nact).
+            act: Maps observations, (nworld, nobs), to actions without noise, (nworld, nact). It acts in the environment
+                that ``worlds`` made last.
         """
 
 

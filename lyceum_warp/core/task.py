@@ -264,10 +264,10 @@ class Training:
     """
 
     algorithm: str = "npg"
-    """Name of the algorithm: npg, ppo or sac."""
+    """Name of the algorithm: npg, ppo, sac or distill."""
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Hyperparameters of the algorithm, by their names in ``lw.NPGConfig``, ``lw.PPOConfig`` or ``lw.SACConfig``. They
-    are ignored if a flag chooses another algorithm."""
+    """Hyperparameters of the algorithm, by their names in ``lw.NPGConfig``, ``lw.PPOConfig``, ``lw.SACConfig`` or
+    ``lw.DistillConfig``. They are ignored if a flag chooses another algorithm."""
     iterations: int = 100
     """Number of iterations."""
     physics: str | None = None

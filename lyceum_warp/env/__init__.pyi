@@ -8,5 +8,10 @@ from lyceum_warp.env.env import (
     make as make,
 )
 from lyceum_warp.env.openloop import OpenLoop as OpenLoop
+from lyceum_warp.env.player import (
+    Player as Player,
+    Policy as Policy,
+    moved as moved,
+)
 from lyceum_warp.env.probe import Probe as Probe
 from lyceum_warp.env.worlds import Worlds as Worlds

@@ -16,22 +16,27 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
         raise ValueError(f"{name} must be on {like.device}, not on {value.device}: move it with .to()")
 
 
-def memoryless_action(act: Callable[[torch.Tensor], Any], obs: torch.Tensor) -> Any:
-    """Call a policy, and check that its actions do not depend on earlier calls.
+def repeatable(act: Callable[..., Any], obs: torch.Tensor, *state: torch.Tensor) -> tuple[Any, ...]:
+    """Call a policy, and check that its actions do not depend on earlier calls. Return its outputs.
 
-    Memory would leak from one episode into the next. Policies may draw from torch's global random generators.
+    Hidden memory would leak from one episode into the next. Policies may draw from torch's global random generators.
 
     Raises:
-        ValueError: After a call with other observations, the policy gives other actions for the same observations.
+        ValueError: After a call with other observations, the policy gives other actions for the same arguments.
     """
+
+    def outputs(obs: torch.Tensor) -> tuple[Any, ...]:
+        result = act(obs, *state)
+        return result if isinstance(result, tuple) else (result,)
+
     with torch.random.fork_rng([obs.device] if obs.is_cuda else []):
-        first = act(obs)
+        first = outputs(obs)[0]
         first = first.clone() if isinstance(first, torch.Tensor) else None  # a policy may return a buffer
-        act(obs + 0.1)
-    action = act(obs)
-    if first is not None and not torch.equal(first.nan_to_num(), action.nan_to_num()):
+        outputs(obs + 0.1)
+    found = outputs(obs)
+    if first is not None and not torch.equal(first.nan_to_num(), found[0].nan_to_num()):
         raise ValueError(
-            "the policy gives different actions for the same observations: it has memory, which no reset clears, or a "
-            "random generator of its own, and must have neither"
+            "the policy gives different actions for the same observations: it must have no random generator of its "
+            "own, and no memory, unless it has state_size and act(obs, state) returns the actions and the next state"
         )
-    return action
+    return found

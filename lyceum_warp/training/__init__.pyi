@@ -30,6 +30,7 @@ from lyceum_warp.training.runs.folder import (
 )
 from lyceum_warp.training.runs.pretrained_runs import (
     pretrained_run as pretrained_run,
+    pretrained_tasks as pretrained_tasks,
     pretrained_text as pretrained_text,
 )
 from lyceum_warp.training.runs.task_copy import (

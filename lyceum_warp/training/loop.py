@@ -15,6 +15,7 @@ from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.training.callbacks import Callback
+from lyceum_warp.training.runs.checkpoints import policy_content, write_content
 from lyceum_warp.training.runs.configuration import describe
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.lock import run_lock
@@ -152,6 +153,8 @@ def _create(
     undo.callback(shutil.rmtree, folder, ignore_errors=True)
     run.check = stack.enter_context(run_lock(folder))
     note_uncopied_data(learner.env)
+    if learner.teacher is not None:
+        write_content(run.teacher, policy_content(0, learner.teacher))
     return run
 
 

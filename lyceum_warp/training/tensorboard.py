@@ -23,7 +23,7 @@ step."""
 _TAGS = {
     # names that rsl_rl uses
     "return_mean": "Train/mean_reward", "length_mean": "Train/mean_episode_length", "std_mean": "Policy/mean_std",
-    "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy",
+    "value_loss": "Loss/value", "surrogate_loss": "Loss/surrogate", "entropy": "Loss/entropy", "loss": "Loss/behavior",
     "learning_rate": "Loss/learning_rate", "total_fps": "Perf/total_fps", "time_sample": "Perf/collection_time",
     "time_update": "Perf/learning_time",
     # columns whose group does not follow from a prefix in _GROUPS

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos import acting, check_sizes
+from lyceum_warp.algos import check_sizes
 from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
@@ -126,7 +126,7 @@ def tune(
             on_gpu = str(env_options.device).startswith("cuda")
             env_options = env_options.changed({"nworld": GPU_NWORLD if on_gpu else NWORLD})
         env_options = env_options.changed({"autoreset": False})
-        act = digest = None
+        policy = digest = None
         if run is None:
             env = Env(kind, env_options, params)
         else:
@@ -138,9 +138,9 @@ def tune(
             env = Env(kind, env_options, {**Configuration.of(source).params, **params})
             policy = load(source, which=which, device=env.obs.device)
             check_sizes(policy, env, f"the policy of {run}")
-            act, digest = acting(policy), hashlib.sha256(source.policy_file(which).read_bytes()).hexdigest()[:16]
+            digest = hashlib.sha256(source.policy_file(which).read_bytes()).hexdigest()[:16]
         measured["policy"] = digest
-        trials = Trials(env, act, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
+        trials = Trials(env, policy, effort=SHORT if short else FULL, seed=seed, episodes=episodes)
     name = f"{file_name(task_name(kind))}{'-planning' * planning}.jsonl"
     file = RowFile(Path("tune", name) if out is None else Path(out), identity(trials.reference, **measured))
     return _search(trials, file, tolerance, progress)

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import warp as wp
 
 from lyceum_warp.algos import ENDLESS_STEPS, action_bounds
 from lyceum_warp.core import FAULTS
-from lyceum_warp.env import Env
+from lyceum_warp.env import Env, Player, Policy
 from lyceum_warp.tuning.candidates import Setting
 from lyceum_warp.tuning.judgement import TOLERANCES, buys, difference, episodes_needed, failures
 
@@ -20,8 +20,6 @@ _ACTIONS = 50
 """Number of recorded actions that follow each recorded state."""
 _HALF_WIDTHS = {"returns": TOLERANCES["strict"] / 2, "clearly_worse": TOLERANCES["strict"]}
 """Target half-widths of the confidence intervals. They determine the number of episodes."""
-
-Policy = Callable[[torch.Tensor], torch.Tensor]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Trials:
     def __init__(
         self, reference: Env, policy: Policy | None, *, effort: Effort, seed: int = 0, episodes: int | None = None
     ) -> None:
-        self.reference, self.policy = reference, policy
+        self.reference, self.player = reference, None if policy is None else Player(policy, reference)
         self.effort, self.seed = effort, seed
         self.batches = None if episodes is None else math.ceil(episodes / reference.nworld)
         # failures that end episodes change the returns of many episodes, so the mean return shows them
@@ -76,14 +74,18 @@ class Trials:
         policy_worlds = torch.arange(env.nworld, device=env.obs.device)[:, None] % 2 == 1
         self._starts: list[torch.Tensor] = []
         self._actions: list[torch.Tensor] = []
+        memories = []
         env.rand_reset(self.seed)
         for step in range(max(self.effort.recorded_at) + 1):
             if step in self.effort.recorded_at:
                 self._starts.append(env.get_state())
+                memories.append(None if self.player is None else self.player.state.clone())
             env.rand_reset(mask=env.done)
             env.step(self._mixed(next(draw), policy_worlds))
-        for start in self._starts:
+        for start, memory in zip(self._starts, memories, strict=True):
             env.set_state(start)
+            if self.player is not None and memory is not None:
+                self.player.state.copy_(memory)
             actions = []
             for _ in range(_ACTIONS):
                 actions.append(self._mixed(next(draw), policy_worlds))
@@ -93,9 +95,9 @@ class Trials:
         self._block = max(1, round(self.effort.block_seconds / self._seconds(env, 0)))
 
     def _mixed(self, random: torch.Tensor, policy_worlds: torch.Tensor) -> torch.Tensor:
-        if self.policy is None:
+        if self.player is None:
             return random
-        return torch.where(policy_worlds, self.policy(self.reference.obs), random)
+        return torch.where(policy_worlds, self.player(self.reference.obs), random)
 
     # one setting
 
@@ -183,12 +185,13 @@ class Trials:
         if env is not self.reference:
             env.set_state(self.reference.get_state())
         draw, policy = random_actions(env, seed), self.sources[source]
+        player = None if policy is None else Player(policy, env)
         total = torch.zeros(env.nworld, dtype=torch.float64, device=env.obs.device)
         alive = torch.ones(env.nworld, dtype=torch.bool, device=env.obs.device)
         faults = torch.zeros((), dtype=torch.int64, device=env.obs.device)
         steps = torch.zeros_like(faults)
         for step in range(self.steps):
-            env.step(next(draw) if policy is None else policy(env.obs))
+            env.step(next(draw) if player is None else player(env.obs))
             total += torch.where(alive, env.reward, 0.0)
             steps += alive.sum()
             faults += (alive & (env.done_reason & int(FAULTS) != 0)).sum()

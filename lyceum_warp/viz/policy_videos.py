@@ -6,11 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeAlias
 
-import torch
-
-from lyceum_warp.algos import Policy, acting, evaluation_worlds, moved
+from lyceum_warp.algos import evaluation_worlds
 from lyceum_warp.controllers import policy_episodes
-from lyceum_warp.env import Curriculum, Env
+from lyceum_warp.env import Curriculum, Env, Policy
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.viz.cameras import CameraChoice
 from lyceum_warp.viz.video import Progress, write_video
@@ -29,15 +27,12 @@ def policy_video(
     """
     curriculum = curriculum or Curriculum.of(env)
     one = evaluation_worlds(env, 1, autoreset=False)
-    policy = moved(policy, one) if isinstance(policy, torch.nn.Module) else policy
     with contextlib.ExitStack() as stack:
         if progress is None:
             running: Progress = stack.enter_context(LongWork("running an episode for the video", "steps"))
         else:
             running = functools.partial(progress, "running an episode", "steps")
-        (episode,) = policy_episodes(
-            one, acting(policy), 1, seed=seed, curriculum=curriculum, progress=running
-        )  # fmt: skip
+        (episode,) = policy_episodes(one, policy, 1, seed=seed, curriculum=curriculum, progress=running)
     rendering = None if progress is None else functools.partial(progress, "rendering the video", "frames")
     return write_video(one, episode.states, path, camera=camera, progress=rendering)
 

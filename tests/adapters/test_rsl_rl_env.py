@@ -1,5 +1,6 @@
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -122,14 +123,14 @@ def test_rsl_rl_writer_receives_the_metrics(env: lw.Env, tmp_path: Path) -> None
     assert {"metrics/forward", "metrics/effort", "faults/worlds", "Train/mean_reward"} <= set(found)
 
 
-@pytest.mark.parametrize(("std_type", "normalize"), [("scalar", True), ("log", True), ("scalar", False)])
+@pytest.mark.parametrize("changes", [{}, {"std_type": "log"}, {"normalize": False}, {"recurrent": 6}])
 def test_policy_of_a_checkpoint_of_rsl_rl_acts_as_in_rsl_rl(
-    std_type: str, normalize: bool, env: lw.Env, tmp_path: Path
+    changes: dict[str, Any], env: lw.Env, tmp_path: Path
 ) -> None:
     from rsl_rl.runners import OnPolicyRunner
 
     worlds, file = RslRlVecEnv(env), tmp_path / "model_1.pt"
-    config = lw.PPOConfig(hidden=(8, 4), value_hidden=(8,), num_steps=10, std_type=std_type, normalize=normalize)
+    config = lw.PPOConfig(hidden=(8, 4), value_hidden=(8,), num_steps=10, **changes)
     runner = OnPolicyRunner(worlds, runner_config(env, config), None, "cpu")
     runner.learn(1)
     runner.save(str(file))
@@ -141,7 +142,10 @@ def test_policy_of_a_checkpoint_of_rsl_rl_acts_as_in_rsl_rl(
     for values in obs.values():
         values.uniform_(-30.0, 30.0)  # a limit of 10 would clip some normalised observations
     actor = runner.alg.get_policy()
-    torch.testing.assert_close(policy(obs["policy"]), actor(obs), rtol=1e-6, atol=1e-6)
+    memory = torch.rand(4, policy.state_size)
+    actor.reset(hidden_state=memory[None].clone())
+    action = policy.act(obs["policy"], memory)[0] if policy.state_size else policy(obs["policy"])
+    torch.testing.assert_close(action, actor(obs), rtol=1e-6, atol=1e-6)
     actor(obs, stochastic_output=True)
     torch.testing.assert_close(policy.log_std.exp(), actor.output_std[0])
     assert next(lw.PPO(env, policy, config=config)).samples == 40  # training continues

@@ -76,6 +76,7 @@ KINDS = {
     "evaluation.json": Kind("run/evaluation.json", mutations.mutated_json, ("eval",)),
     "checkpoint.pt": Kind("run/checkpoint.pt", _checkpoint, ("resume alone",)),
     "previous.pt": Kind("run/previous.pt", _checkpoint, ("resume previous",), ("checkpoint.pt",)),
+    "teacher.pt": Kind("cloned/teacher.pt", _checkpoint, ("resume cloned",)),
     "episode.npz": Kind("episodes/episode-000.npz", _episode, ("episodes", "view episodes")),
     "kept model": Kind("kept/task/slide.xml", mutations.mutated_xml, ("eval kept",), ("the task 'tiny'",)),
     "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
@@ -109,6 +110,7 @@ READERS: dict[str, Callable[[], object]] = {
     "eval kept": lambda: command("eval", CASE / "kept", "--task", _COPY, "--episodes", 2),
     "view": lambda: command("view", CASE / "run", "--nworld", 1),
     "resume": lambda: _resume(CASE / "run"),
+    "resume cloned": lambda: _resume(CASE / "cloned"),
     "resume alone": lambda: _resume(CASE / "run"),
     "resume previous": lambda: _resume(CASE / "run"),
     "resume kept": lambda: _resume(CASE / "kept", _COPY),
@@ -236,6 +238,11 @@ def _make(folder: Path) -> None:
     episode = lw.control(plant, lambda state, obs: torch.zeros(2), seed=1)
     times = {name: torch.zeros_like(getattr(episode, name)) for name in ("times", "ages", "plan_times", "plan_starts")}
     dataclasses.replace(episode, wall_seconds=1.0, **times).save(folder / "episodes/episode-000.npz")
+    cloning = (
+        "--algorithm distill --nworld 2 --num-steps 12 --hidden 4 --mean-every 0 --iterations 2 --no-video --no-plot"
+    )
+    places = "--demonstrations", folder / "episodes", "--out", folder / "cloned"
+    command("train", "point_mass", *cloning.split(), *places)
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ def made(**changes: Any) -> lw.PPO:
 
 @pytest.mark.parametrize("changes", [
     {}, {"std_type": "log", "whiten_minibatches": True, "minibatches": 5, "clip_value_loss": False},
+    {"recurrent": 6}, {"recurrent": 6, "value_group": "policy", "whiten_minibatches": True, "minibatches": 5},
 ])  # fmt: skip
 def test_captured_epochs_equal_epochs_without_graphs(changes: dict[str, Any]) -> None:
     changes = {"schedule": "fixed", "final_entropy_coef": 0.1, "entropy_decay": (1, 4)} | changes
@@ -39,8 +40,9 @@ def test_learning_rate_adapts_within_a_graph() -> None:
         assert [next(ppo).learning_rate for _ in range(3)] == pytest.approx([rate] * 3)
 
 
-def test_an_iteration_waits_for_the_device_only_at_its_end() -> None:
-    ppo = made()
+@pytest.mark.parametrize("changes", [{}, {"recurrent": 6, "value_group": "policy"}])
+def test_an_iteration_waits_for_the_device_only_at_its_end(changes: dict[str, Any]) -> None:
+    ppo = made(**changes)
     for _ in range(2):  # the first call loads kernels, and the second call captures graphs
         next(ppo)
     with nothing_waits():

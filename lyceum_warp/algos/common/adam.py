@@ -1,5 +1,6 @@
 """Make steps of Adam (Kingma and Ba 2015, "Adam: A Method for Stochastic Optimization")."""
 
+import math
 from collections.abc import Iterable
 from typing import Any
 
@@ -67,10 +68,15 @@ class Adam:
 
 
 class GradientStep:
-    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes."""
+    """Makes Adam steps on the parameters that are not frozen, with gradients summed over all processes.
 
-    def __init__(self, parameters: Iterable[torch.Tensor], rate: float, team: Team) -> None:
-        self.parameters, self.team = [p for p in parameters if p.requires_grad], team
+    ``max_norm`` is the maximum Euclidean norm of the gradient.
+    """
+
+    def __init__(
+        self, parameters: Iterable[torch.Tensor], rate: float, team: Team, *, max_norm: float = math.inf
+    ) -> None:
+        self.parameters, self.team, self.max_norm = [p for p in parameters if p.requires_grad], team, max_norm
         self.optimizer = Adam(self.parameters, rate)
 
     def __call__(self, loss: torch.Tensor, *numbers: torch.Tensor) -> torch.Tensor:
@@ -80,5 +86,7 @@ class GradientStep:
         details = torch.stack([number.detach().float() for number in (loss, *numbers)])
         sums = self.team.sum(flatten(part.float() for part in (*gradients, details)))
         self.optimizer.gradient.copy_(sums[: -len(details)])
+        if self.max_norm < math.inf:  # as in torch.nn.utils.clip_grad_norm_
+            self.optimizer.gradient *= (self.max_norm / (self.optimizer.gradient.norm() + 1e-6)).clamp(max=1.0)
         self.optimizer.step()
         return sums[-len(details) :]

@@ -8,12 +8,9 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy, acting
 from lyceum_warp.engines.memory import check_fit
-from lyceum_warp.env import Curriculum, Env, start_episodes
+from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
 from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.tensors import memoryless_action
 from lyceum_warp.support.validate import check_kind, described, whole_number
 
 _MEAN_SEED = 2**31 - 1
@@ -86,7 +83,7 @@ def evaluate(
     Args:
         env: The environment; its worlds are reset.
         policy: A function that maps observations (nworld, nobs) to actions (nworld, nact), or a module whose method
-            ``act`` does this.
+            ``act`` does this. For a policy with memory, see docs/memory.md.
         episodes: Number of episodes, rounded up to a multiple of the number of worlds.
         seed: Seed of the initial states. ``evaluate`` and ``lw.make`` draw different initial states from the same seed.
             Without a seed, the worlds continue their random streams.
@@ -95,8 +92,8 @@ def evaluate(
         progress: Called every 50 steps with the number of steps so far and the maximum number.
 
     Raises:
-        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, the policy has memory,
-            or the policy or the curriculum does not fit the environment.
+        ValueError: The task has no horizon, the environment was made with ``autoreset=False``, the policy hides
+            memory, or the policy or the curriculum does not fit the environment.
     """
     check_kind("env of evaluate", env, Env, "as lw.make(...) makes it")
     if not callable(policy):
@@ -109,7 +106,7 @@ def evaluate(
         raise ValueError(
             "evaluate needs an environment that resets automatically: make the environment with autoreset=True"
         )
-    act, each = acting(policy), -(-episodes // env.nworld)
+    player, each = Player(policy, env), -(-episodes // env.nworld)
     check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     seed = None if seed is None else evaluation_seed(seed)
     rounds = each if env.task.curriculum else 1
@@ -122,7 +119,7 @@ def evaluate(
     for number, part in enumerate(results.chunk(rounds, 1)):
         start_episodes(env, seed, curriculum, first=number * env.nworld, total=each * env.nworld)
         starts.append({name: env.lasting[name].cpu().clone() for name in env.task.curriculum})
-        for t in _play(env, act, part):
+        for t in _play(env, player, part):
             if progress is not None:
                 progress(number * env.horizon + t, each * env.horizon)
     columns = results.flatten(1).cpu()
@@ -133,13 +130,13 @@ def evaluate(
     return Episodes(**dict(zip(names, columns[:6], strict=True)), metrics=metrics, curriculum=start)
 
 
-def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.Tensor) -> Iterator[int]:
+def _play(env: Env, player: Player, results: torch.Tensor) -> Iterator[int]:
     """Write the results of each world's first episodes into (numbers, episodes, nworld). Yield every 50 steps."""
     each, worlds = results.shape[1], torch.arange(env.nworld, device=env.obs.device)
     count, total = torch.zeros_like(worlds), torch.zeros_like(env.reward)
     for t in range(1, each * env.horizon + 1):
         length = env.episode_step + 1.0
-        env.action.copy_(first_actions(act, env) if t == 1 else act(env.obs))
+        env.action.copy_(player.first(env.obs) if t == 1 else player(env.obs))
         env.step()
         total += env.reward
         ends = (env.success.float(), env.terminated.float())
@@ -153,18 +150,6 @@ def _play(env: Env, act: Callable[[torch.Tensor], torch.Tensor], results: torch.
             yield t
             if bool((count >= each).all()):
                 return
-
-
-def first_actions(act: Callable[[torch.Tensor], torch.Tensor], env: Env) -> torch.Tensor:
-    """Call a policy, and check its actions and that it has no memory."""
-    try:
-        action = memoryless_action(act, env.obs)
-    except RuntimeError as error:
-        sizes = f"{described(env.obs)}, of the task {env.task.name!r}"
-        raise ValueError(f"policy cannot take the observations, {sizes}: {str(error).splitlines()[0]}") from error
-    if not isinstance(action, torch.Tensor) or action.shape != env.action.shape:
-        raise ValueError(f"policy must return {described(env.action)}, not {described(action)}")
-    return action
 
 
 ENDLESS_STEPS = 1000
@@ -197,9 +182,8 @@ class MeanPolicyEvaluation:
                     self._few = evaluation_worlds(self.env, self.episodes)
                 self._few.follow(self.env)
                 episodes = evaluate(
-                    self._few, moved(policy, self._few), self.episodes, seed=_MEAN_SEED,
-                    curriculum=Curriculum.of(self.env),
-                )  # fmt: skip
+                    self._few, policy, self.episodes, seed=_MEAN_SEED, curriculum=Curriculum.of(self.env)
+                )
                 parts = (episodes.returns, episodes.lengths, episodes.rewards, episodes.evals, episodes.success)
                 means.copy_(torch.stack([part.mean() for part in parts]))
             self.team.copy_leader([means])

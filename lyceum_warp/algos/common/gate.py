@@ -4,12 +4,11 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy, acting
 from lyceum_warp.core.gate import Verdict
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env.curriculum import Curriculum, start_episodes
 from lyceum_warp.env.env import Env
+from lyceum_warp.env.player import Player, Policy
 from lyceum_warp.support.validate import check_kind, whole_number
 
 
@@ -44,16 +43,18 @@ def gate(
         raise ValueError(f"the task {env.task.name!r} has no gate: set its attribute gate to a lw.Gate")
     curriculum = curriculum or Curriculum.of(env)
     options = {**options_on_cores(), "physics": "exact", "horizon": 0, "seed": seed, "nthread": nthread}
+    player: Player
 
     def worlds(nworld: int, **params: Any) -> Env:
         replica = env.replicate(nworld=nworld, **options, **params)
         start_episodes(replica, None, curriculum)
+        nonlocal player
+        player = Player(policy, replica)
         return replica
 
-    local = moved(policy, worlds(1)) if isinstance(policy, torch.nn.Module) else policy
     numbers: dict[str, float] = {}
     limits = {name: limit for name, limit in test.limits.items() if limit.range}
-    for part in test.measure(worlds, acting(local)):
+    for part in test.measure(worlds, lambda obs: player(obs)):
         numbers |= part
         fails = any(name in limits and not limits[name].allows(number) for name, number in part.items())
         if quick and (fails or limits.keys() <= numbers.keys()):

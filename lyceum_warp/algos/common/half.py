@@ -56,7 +56,7 @@ def half_layers(network: nn.Module, activation: type[nn.Module], x: torch.Tensor
 
 
 class _HalfLayers(torch.autograd.Function):
-    """Maps inputs, (rows, inputs), to outputs, (rows, outputs), without a gradient for the inputs."""
+    """Maps inputs, (rows, inputs), to outputs, (rows, outputs)."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor, activation: type[nn.Module], *parameters: torch.Tensor) -> torch.Tensor:
@@ -82,7 +82,8 @@ class _HalfLayers(torch.autograd.Function):
             if i:
                 slope = SLOPES[ctx.activation](torch.mm(slope, weights[i]), results[i])
         parts[-1] = parts[-1][:, : ctx.inputs]
-        return None, None, *reversed(parts)
+        inputs = _product(slope, weights[0])[:, : ctx.inputs] if ctx.needs_input_grad[0] else None
+        return inputs, None, *reversed(parts)
 
 
 _LARGEST = 1e4

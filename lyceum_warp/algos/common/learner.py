@@ -103,7 +103,8 @@ class Learner(abc.ABC):
     """The environment that provides the samples."""
     policy: torch.nn.Module
     """The policy after the last iteration. Its method ``act`` maps unnormalised observations (..., nobs) to actions
-    without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``."""
+    without noise (..., nact). The policy has the attributes ``nobs`` and ``nact``. A policy with memory has the
+    attribute ``state_size``, and ``act(obs, state)`` returns the actions and the next state."""
     value: torch.nn.Module | None = None
     """The value function after the last iteration; None for algorithms without a value function."""
     config: Any
@@ -117,6 +118,8 @@ class Learner(abc.ABC):
     replay: Replay | None = None
     """The replay buffer, if the algorithm has one. A run saves the buffer in separate files, not in ``state_dict``,
     because the buffer is large."""
+    teacher: torch.nn.Module | None = None
+    """What the policy imitates, if the algorithm has a teacher. A run saves it once, in ``teacher.pt``."""
     own_worlds: slice
     """Indices of this process's worlds among the worlds of all processes."""
     iteration: int

@@ -1,9 +1,8 @@
 """Build the networks and observation normalisers of policies and value functions."""
 
-import copy
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import torch
@@ -13,9 +12,9 @@ from torch import nn
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.half import activation_of, half_layers
 from lyceum_warp.algos.common.hyperparameters import Activation
-from lyceum_warp.env.env import Env
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
+from lyceum_warp.support.warp_log import start_warp
 
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -31,11 +30,12 @@ def check_memory(sizes: Sequence[int], networks: int = 1) -> None:
     Raises:
         ValueError: The weights do not fit into memory.
     """
+    start_warp()
     bytes_each, free = 4 * sum(n * m + m for n, m in itertools.pairwise(sizes)), free_memory(wp.get_device("cpu"))
     if free is not None and (size := networks * bytes_each) > free:
         raise ValueError(
             f"networks with layers of the sizes {list(sizes)} need {size / 1e9:.3g} GB, but only {free / 1e9:.3g} GB "
-            "are free: make hidden smaller"
+            "are free: make the layers smaller"
         )
 
 
@@ -81,6 +81,51 @@ def mlp(
     with torch.no_grad():
         linear.weight.mul_(last_scale)
     return MLP(*layers)
+
+
+class GRU(nn.Module):
+    """A network with memory: a gated recurrent unit (Cho et al. 2014) whose state is the input of another network.
+
+    Every network with memory maps (x, state), (n, size) and (n, state_size), to (y, next state).
+    """
+
+    def __init__(self, size: int, units: int, network: nn.Module, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        check_memory([size + units, 3 * units])
+        self.state_size, self.cell, self.network = units, nn.GRUCell(size, units), network
+        for parameter in self.cell.parameters():
+            nn.init.uniform_(parameter, -1.0 / math.sqrt(units), 1.0 / math.sqrt(units), generator=generator)
+
+    def forward(self, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the output and the next state."""
+        state = self.cell(x, state)
+        return self.network(state), state
+
+
+def unrolled(
+    network: Callable[..., Any], x: torch.Tensor, state: torch.Tensor, began: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Run a network with memory over sequences.
+
+    Args:
+        network: The network.
+        x: Inputs, (steps, n, size).
+        state: The states before the first step, (n, state_size).
+        began: Whether an episode begins at a step, so that the state before it is 0, (steps, n) bool.
+
+    Returns:
+        The outputs (steps, n, ...), and the states after each step, (steps, n, state_size).
+    """
+    if isinstance(network, GRU):  # after the cell, all steps are one batch
+        cell = network.cell
+        states, _ = unrolled(lambda x, state: 2 * (cell(x, state),), x, state, began)
+        return network.network(states), states
+    outputs, after = [], []
+    for x_now, starts in zip(x, began, strict=True):
+        output, state = network(x_now, state.masked_fill(starts.unsqueeze(-1), 0.0))
+        outputs.append(output)
+        after.append(state)
+    return torch.stack(outputs), torch.stack(after)
 
 
 @torch.no_grad()
@@ -187,6 +232,8 @@ class Normalized(nn.Module):
     """Base class of modules with an optional normaliser of observations."""
 
     normalizer: nn.Module
+    state_size: int = 0
+    """Number of floats that the module remembers in each world, from step to step; 0 means no memory."""
 
     def __init__(self, nobs: int, normalize: bool, limit: float) -> None:
         super().__init__()
@@ -205,14 +252,6 @@ class Normalized(nn.Module):
         """
         if isinstance(self.normalizer, Normalizer):
             self.normalizer.update(obs, team, eps=eps)
-
-
-def moved(module: Module, env: Env) -> Module:
-    """Return the module, or a copy of it, on the device of an environment's observations."""
-    device = env.obs.device
-    if all(parameter.device == device for parameter in module.parameters()):
-        return module
-    return copy.deepcopy(module).to(device)
 
 
 def trainable(module: Module) -> Module:

@@ -50,7 +50,7 @@ class OnPolicyLearner(Learner):
         check_kind(f"config of {type(self).__name__}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
         super().__init__(env, seed=seed, team=team)
         if value is not None:
-            check_value(trainable(value), env)
+            check_value(trainable(value), env, memory=not self.twice)
         if policy is not None:
             check_policy(trainable(policy), env, twice=self.twice)
         self.config = config or kind()
@@ -71,11 +71,12 @@ class OnPolicyLearner(Learner):
         init = torch.Generator().manual_seed(self.seed)
         options: dict[str, Any] = dict(normalize=config.normalize, limit=limit, generator=init)
         self.policy = policy or GaussianPolicy(
-            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std, **options
-        )
+            nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std,
+            recurrent=getattr(config, "recurrent", 0), **options,
+        )  # fmt: skip
         self.value = value or ValueFunction(
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
-            time_orders=time_orders, group=group, **options,
+            time_orders=time_orders, group=group, recurrent=self.policy.state_size * (group == "policy"), **options,
         )  # fmt: skip
         if as_torch and policy is None:
             initialize_as_torch(self.policy, init)
@@ -108,6 +109,7 @@ class OnPolicyLearner(Learner):
         settings = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
         settings |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
         settings["time_orders"] = value["time_orders"]
+        settings["recurrent"] = policy.get("recurrent", None if "own" in policy else 0)
         if self.config.value_group is not None or value["group"] != value_group(self.env, None):
             settings["value_group"] = value["group"]
         fields = {

@@ -1,14 +1,14 @@
 """Define Gaussian policies with a diagonal covariance and a network that computes the mean."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import nn
 
 from lyceum_warp.algos.common.hyperparameters import Activation
-from lyceum_warp.algos.common.networks import LIMIT, Normalized, check_memory, mlp
+from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
@@ -31,7 +31,9 @@ class GaussianPolicy(Normalized):
         hidden: Widths of the hidden layers.
         network: A module that replaces the default network. It maps float32 observations (..., nobs) to float32 mean
             actions (..., nact), independently for each observation. If ``normalize`` is set, its inputs are normalised.
-            For NPG, the network must be twice differentiable.
+            For NPG, the network must be twice differentiable. A network with memory has the attribute ``state_size``,
+            and maps observations (n, nobs) and states (n, state_size) to mean actions and the next states.
+        recurrent: Units of a GRU before the hidden layers, which gives the policy memory; 0 means no memory.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
@@ -53,6 +55,7 @@ class GaussianPolicy(Normalized):
         hidden: Sequence[int] = (64, 64),
         *,
         network: nn.Module | None = None,
+        recurrent: int = 0,
         activation: Activation = "tanh",
         log_std: float = -0.5,
         normalize: bool = False,
@@ -60,14 +63,19 @@ class GaussianPolicy(Normalized):
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
-        check_memory([nobs, *layer_sizes(hidden), nact])
+        recurrent = whole_number("recurrent", recurrent, low=0)
+        sizes = [recurrent or nobs, *layer_sizes(hidden), nact]
+        check_memory(sizes)
         super().__init__(nobs, normalize, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize, "limit": limit}
         if network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
             # make initial mean actions near zero (as in mjrl)
-            network = mlp([nobs, *hidden, nact], activation=activation, last_scale=1e-2, generator=generator)
+            network = mlp(sizes, activation=activation, last_scale=1e-2, generator=generator)
+            if recurrent:
+                self.shape["recurrent"] = recurrent
+                network = GRU(nobs, recurrent, network, generator)
         elif isinstance(network, nn.Module):
             self.shape["own"] = _class_name(network)
         else:
@@ -75,6 +83,7 @@ class GaussianPolicy(Normalized):
         if type(self) is not GaussianPolicy:
             self.shape["own"] = _class_name(self)
         self.network = network
+        self.state_size = whole_number("state_size of the network", getattr(network, "state_size", 0), low=0)
         log_std = finite_number("log_std", log_std, low=-_LARGEST, high=_LARGEST)
         self.log_std = nn.Parameter(torch.full((nact,), log_std))
         self.mirror: PolicyMirror | None = None
@@ -114,9 +123,25 @@ class GaussianPolicy(Normalized):
         mean: torch.Tensor = self.network(self.normalizer(obs))
         return mean
 
-    def act(self, obs: torch.Tensor) -> torch.Tensor:
-        """Compute actions without noise, (..., nact): the mean actions."""
-        return self(obs)
+    def act(self, obs: torch.Tensor, state: torch.Tensor | None = None) -> Any:
+        """Compute actions without noise, (..., nact): the mean actions.
+
+        A policy with memory also needs its state, (n, state_size), and returns the actions and the next state. The
+        state is 0 when an episode begins.
+        """
+        return self(obs) if state is None else self.network(self.normalizer(obs), state)
+
+    def unrolled(
+        self, obs: torch.Tensor, state: torch.Tensor, began: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute mean actions along sequences; see ``networks.unrolled``.
+
+        Returns:
+            The mean actions (steps, n, nact), and the states after each step, (steps, n, state_size).
+        """
+        if not self.state_size:
+            return self(obs), state.expand(len(obs), *state.shape)
+        return unrolled(self.network, self.normalizer(obs), state, began)
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
@@ -146,16 +171,6 @@ def divergence(
     """Compute the KL divergence from one diagonal Gaussian to another, (...,)."""
     square = (old_mean - mean).square() + torch.exp(2 * old_log_std)
     return (log_std - old_log_std + 0.5 * square * torch.exp(-2 * log_std) - 0.5).sum(-1)
-
-
-Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
-"""A module with the method ``act``, or a function from observations to actions."""
-
-
-def acting(policy: Policy) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return the policy's method ``act``, or the policy itself if it is a function."""
-    act: Callable[[torch.Tensor], torch.Tensor] = getattr(policy, "act", policy)
-    return act
 
 
 def _class_name(module: nn.Module) -> str:

@@ -5,11 +5,10 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.distributed import flatten
-from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.natural_gradient import FisherProduct
-from lyceum_warp.env.env import Env
+from lyceum_warp.env import Env, moved
 from lyceum_warp.support.validate import check_group, check_kind, described, first_sentence
 
 _ROWS = 4
@@ -29,6 +28,8 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
         kind = getattr(policy, "__name__", None) or type(policy).__name__
         fix = "lw.GaussianPolicy(nobs, nact, network=net) makes one from your own network"
         raise ValueError(f"policy must be a GaussianPolicy, not {kind}: {fix}")
+    if twice and policy.state_size:
+        raise ValueError("NPG cannot train a policy with memory: use lw.PPO, or a policy without memory")
     policy = moved(policy, env)
     check_sizes(policy, env)
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
@@ -74,24 +75,34 @@ def _check_output(policy: GaussianPolicy, obs: torch.Tensor) -> None:
 
 
 def _called(policy: GaussianPolicy, obs: torch.Tensor) -> torch.Tensor:
-    shape = (len(obs), policy.nact)
+    mean: torch.Tensor = _outputs(policy, obs)[0]
+    return mean
+
+
+def _outputs(policy: GaussianPolicy, obs: torch.Tensor) -> tuple[Any, ...]:
+    """Return the mean actions, and the next state of a policy with memory, for the state at an episode's start."""
+    size = policy.state_size
+    state = (obs.new_zeros(len(obs), size),) if size else ()
     try:
-        mean: object = policy(obs)
+        result = policy.act(obs, *state)
     except Exception as error:  # a user's network may raise any error
         reason = f"{type(error).__name__}: {first_sentence(error)}"
         raise ValueError(f"the policy fails for observations of shape {tuple(obs.shape)} ({reason})") from error
-    if not isinstance(mean, torch.Tensor) or mean.shape != shape or mean.dtype != obs.dtype:
-        example = described(obs.new_empty(shape))
-        output = described(mean) if isinstance(mean, torch.Tensor) else type(mean).__name__
-        raise ValueError(f"the policy must give {example} for observations of shape {tuple(obs.shape)}, not {output}")
-    return mean
+    outputs = result if isinstance(result, tuple) else (result,)
+    kinds = [described(x) if isinstance(x, torch.Tensor) else type(x).__name__ for x in outputs]
+    expected = [described(x) for x in (obs.new_empty(len(obs), policy.nact), *state)]
+    if kinds != expected:
+        texts = [" and ".join(each) for each in (expected, kinds)]
+        raise ValueError(
+            f"the policy must give {texts[0]} for observations of shape {tuple(obs.shape)}, not {texts[1]}"
+        )
+    return outputs
 
 
 def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool) -> None:
     named = [(name, p) for name, p in policy.named_parameters() if p.requires_grad and p is not policy.log_std]
     with torch.enable_grad():
-        mean = policy(obs)
-        sums = mean.sum()
+        sums = sum(output.sum() for output in _outputs(policy, obs))
         if not sums.requires_grad:
             raise ValueError("the policy's mean actions depend on no parameter: remove detach() and no_grad()")
         gradients = torch.autograd.grad(sums, [p for _, p in named], allow_unused=True)
@@ -115,14 +126,16 @@ def _check_derivatives(policy: GaussianPolicy, obs: torch.Tensor, *, twice: bool
         raise ValueError("the policy's derivatives are not finite")
 
 
-def check_value(value: ValueFunction, env: Env) -> None:
-    """Check that a value function fits an environment's observations.
+def check_value(value: ValueFunction, env: Env, *, memory: bool = False) -> None:
+    """Check that a value function fits an environment's observations, and has no memory unless ``memory`` is set.
 
     Raises:
         ValueError: The value function has the wrong type, its group or its input size does not fit, or a parameter is
             not finite.
     """
     check_kind("value", value, ValueFunction, "as lw.load_value(run) returns it for a run of NPG or PPO")
+    if value.state_size and not memory:
+        raise ValueError("only PPO can use a value function with memory: omit the value function")
     name = env.task.name
     check_group(value.group, env.obs_groups, name)
     size, space = value.shape["nobs"], env.obs_spaces[value.group]

@@ -17,7 +17,7 @@ from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.tensors import memoryless_action
+from lyceum_warp.support.tensors import repeatable
 from lyceum_warp.support.validate import described, first_sentence
 
 EXTRA = "pip install 'lyceum-warp[export]'"
@@ -36,6 +36,9 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     ``.pt2``     ``torch.export.load(path).module()(obs)``, needs only torch; also for C++ (AOTInductor)
     ===========  ======================================================================================
 
+    A policy with memory has a second input ``state`` (n, state_size), which is 0 when an episode begins, and a second
+    output ``next_state``.
+
     Example:
         >>> export_policy(load("runs/mine"), "policy.onnx")
         >>> session = onnxruntime.InferenceSession("policy.onnx")
@@ -52,22 +55,25 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
 
     Raises:
         ImportError: The extra ``export``, which ``.onnx`` requires, is not installed.
-        ValueError: The file has an unsupported suffix, or the policy has memory or cannot be exported.
+        ValueError: The file has an unsupported suffix, or the policy hides memory or cannot be exported.
     """
     if not (isinstance(policy, torch.nn.Module) and hasattr(policy, "act") and hasattr(policy, "nobs")):
         raise ValueError(f"policy must be a module with act and nobs, as lw.load(run) returns, not {described(policy)}")
     path = Path(path)
     check_export(path)
     nobs: Any = policy.nobs
-    alone = _Acting(copy.deepcopy(policy)).cpu().eval().requires_grad_(False)
-    example, shapes = (torch.zeros(2, nobs),), ({0: torch.export.Dim("batch")},)
+    size = getattr(policy, "state_size", 0)
+    alone = (_Remembering if size else _Acting)(copy.deepcopy(policy)).cpu().eval().requires_grad_(False)
+    inputs, outputs = (["obs", "state"], ["action", "next_state"]) if size else (["obs"], ["action"])
+    example = (torch.zeros(2, nobs), torch.zeros(2, size))[: len(inputs)]
+    shapes = len(inputs) * ({0: torch.export.Dim("batch")},)
     try:
         with _quiet():
-            memoryless_action(alone, *example)
+            repeatable(alone, *example)
             program: Any = torch.export.export(alone, example, dynamic_shapes=shapes)
             if path.suffix == ".onnx":
                 program = torch.onnx.export(
-                    program, input_names=["obs"], output_names=["action"], dynamo=True, verbose=False
+                    program, input_names=inputs, output_names=outputs, dynamo=True, verbose=False
                 )
                 if env is not None:
                     metadata = deployment_metadata(policy, env)
@@ -129,6 +135,12 @@ class _Acting(torch.nn.Module):
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         action: torch.Tensor = self.policy.act(obs)
         return action
+
+
+class _Remembering(_Acting):
+    def forward(self, obs: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # type: ignore[override]
+        outputs: tuple[torch.Tensor, torch.Tensor] = self.policy.act(obs, state)
+        return outputs
 
 
 def check_export(path: Path) -> None:

@@ -16,7 +16,7 @@ from lyceum_warp.support.docstrings import document_attributes
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SampledIteration(Iteration):
-    """Statistics of one iteration of NPG, PPO or SAC.
+    """Statistics of one iteration of NPG, PPO, SAC or Distill.
 
     Episode statistics cover the episodes that ended in the iteration; they are NaN if no episode ended.
     """
@@ -28,7 +28,7 @@ class SampledIteration(Iteration):
     time_mean: float
     """Seconds for evaluating the mean policy."""
     samples_per_second: float
-    """Samples per second during sampling. With SAC, the time of the updates counts too."""
+    """Samples per second during sampling. With SAC and Distill, the time of the updates counts too."""
 
     def row(self) -> dict[str, Any]:
         """Convert the statistics to a row of metrics.csv, including values that are None."""

@@ -10,11 +10,9 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.common.evaluation import Episodes, evaluate, evaluation_worlds
-from lyceum_warp.algos.common.networks import moved
-from lyceum_warp.algos.common.policy import Policy
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.engines.placement import options_on_cores
-from lyceum_warp.env import Curriculum, Env
+from lyceum_warp.env import Curriculum, Env, Policy
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.intervals import clear_losses, mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
@@ -181,9 +179,8 @@ def transfer(
     results: dict[str, tuple[Episodes, int]] = {}
     for number, (name, changes) in enumerate(simulations.items()):
         worlds = evaluation_worlds(env, episodes, **changes)
-        local = moved(policy, worlds) if isinstance(policy, torch.nn.Module) else policy
         report = functools.partial(_report, progress, number, len(simulations))
-        result = evaluate(worlds, local, episodes, seed=seed, curriculum=curriculum, progress=report)
+        result = evaluate(worlds, policy, episodes, seed=seed, curriculum=curriculum, progress=report)
         results[name] = result, sum(worlds.fault_counts.values())
         memory = result.curriculum.text
     exact = f"{EXACT} physics"

@@ -8,7 +8,7 @@ from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Activation
-from lyceum_warp.algos.common.networks import LIMIT, Normalized, check_memory, mlp
+from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
@@ -26,6 +26,7 @@ class ValueFunction(Normalized):
         time_orders: Highest power of the time features t, t^2, ... with t = step / 1000 (as in mjrl); 0 means no time
             features. Time features help if returns depend on the time that is left in the episode, and observations do
             not contain this time.
+        recurrent: Units of a GRU before the hidden layers, which gives the value function memory; 0 means no memory.
         normalize: Whether to normalise observations by their running mean and variance.
         limit: Normalised observations are clipped to [-limit, limit]; inf means no limit.
         discount: Discount factor of the predicted returns, if known.
@@ -54,6 +55,7 @@ class ValueFunction(Normalized):
         activation: Activation = "tanh",
         scale: float = 200.0,
         time_orders: int = 0,
+        recurrent: int = 0,
         normalize: bool = False,
         limit: float = LIMIT,
         discount: float | None = None,
@@ -61,7 +63,8 @@ class ValueFunction(Normalized):
         generator: torch.Generator | None = None,
     ) -> None:
         nobs, time_orders = whole_number("nobs", nobs, low=1), whole_number("time_orders", time_orders, low=0)
-        sizes = [nobs + time_orders, *layer_sizes(hidden), 1]
+        recurrent = whole_number("recurrent", recurrent, low=0)
+        sizes = [recurrent or nobs + time_orders, *layer_sizes(hidden), 1]
         check_memory(sizes)
         super().__init__(nobs, normalize, limit)
         scale = finite_number("scale", scale)
@@ -74,7 +77,10 @@ class ValueFunction(Normalized):
         }  # fmt: skip
         self.register_buffer("orders", torch.arange(1.0, time_orders + 1), persistent=False)
         # at first, predict the mean return
-        self.network = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
+        self.network: nn.Module = mlp(sizes, activation=activation, last_scale=0.0, generator=generator)
+        if recurrent:
+            self._shape["recurrent"] = self.state_size = recurrent
+            self.network = GRU(nobs + time_orders, recurrent, self.network, generator)
         self.register_buffer("shift", torch.zeros((), dtype=torch.float64))
         self.register_buffer("scale", torch.tensor(scale, dtype=torch.float64))
 
@@ -96,9 +102,30 @@ class ValueFunction(Normalized):
         time = (step.unsqueeze(-1) * 1e-3) ** self.orders
         return torch.cat([obs, time], dim=-1)
 
-    def forward(self, obs: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
-        """Predict discounted returns, (...,)."""
-        return self.network(self.features(obs, step)).squeeze(-1) * self.scale.float() + self.shift.float()
+    def forward(self, obs: torch.Tensor, step: torch.Tensor, state: torch.Tensor | None = None) -> torch.Tensor:
+        """Predict discounted returns, (...,). A value function with memory needs its state, (..., state_size)."""
+        x = self.features(obs, step)
+        if not self.state_size:
+            return self._scaled(self.network(x))
+        assert state is not None
+        output, _ = self.network(x.flatten(0, -2), state.flatten(0, -2))
+        return self._scaled(output).view(step.shape)
+
+    def _scaled(self, output: torch.Tensor) -> torch.Tensor:
+        return output.squeeze(-1) * self.scale.float() + self.shift.float()
+
+    def unrolled(
+        self, obs: torch.Tensor, step: torch.Tensor, state: torch.Tensor, began: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Predict discounted returns along sequences; see ``networks.unrolled``.
+
+        Returns:
+            The predictions (steps, n), and the states after each step, (steps, n, state_size).
+        """
+        if not self.state_size:
+            return self(obs, step), state.expand(len(obs), *state.shape)
+        output, states = unrolled(self.network, self.features(obs, step), state, began)
+        return self._scaled(output), states
 
     @torch.no_grad()
     def rescale(self, returns: torch.Tensor, *, first: bool = False, team: Team | None = None) -> None:
@@ -134,7 +161,7 @@ class ValueFunction(Normalized):
         scale = torch.where(std > 1e-6 * mean.abs(), torch.maximum(std, 1e-3 * mean.abs()), self.scale)
         limited = torch.minimum(torch.maximum(scale, self.scale / BOUND), self.scale * BOUND)
         scale = torch.where(new, scale, limited)
-        layer = self.network[-1]
+        layer = self.network[-1]  # type: ignore[index]
         assert isinstance(layer, nn.Linear)
         layer.weight.mul_(self.scale / scale)
         layer.bias.copy_((layer.bias * self.scale + self.shift - mean) / scale)

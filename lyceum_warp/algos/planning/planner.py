@@ -35,7 +35,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from lyceum_warp.algos.common.networks import moved
 from lyceum_warp.algos.common.policy_check import check_value
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.algos.planning.arguments import plain, planner_arguments, plant_seeds
@@ -45,7 +44,7 @@ from lyceum_warp.algos.planning.updates import CrossEntropy, PlanSamples, PlanUp
 from lyceum_warp.binding.registry import find_task
 from lyceum_warp.core import Done, EnvOptions, Task
 from lyceum_warp.engines.memory import NotEnoughMemoryError
-from lyceum_warp.env import Env, OpenLoop, memory_columns
+from lyceum_warp.env import Env, OpenLoop, memory_columns, moved
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning
 from lyceum_warp.support.arrays import flat, torch_view

@@ -121,7 +121,7 @@ def read_checkpoint(
         raise ValueError(
             f"the checkpoint {path} is damaged, or was not written by lyceum_warp ({first_sentence(error)}): {_FIX}"
         ) from error
-    if isinstance(content, dict) and "actor_state_dict" in content:
+    if isinstance(content, dict) and not content.keys().isdisjoint(("actor_state_dict", "student_state_dict")):
         content = _from_rsl_rl(content, path)
     if not isinstance(content, dict) or "lyceum_warp" not in content:
         entries = f" (it has {', '.join(map(repr, list(content)[:4]))})" if isinstance(content, dict) else ""
@@ -146,9 +146,14 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
 
 
 def _from_rsl_rl(saved: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Convert a checkpoint of rsl_rl 5 with an MLP actor to the content of a policy's file."""
-    actor = dict(saved["actor_state_dict"])
-    state = {name.replace("mlp.", "network."): actor.pop(name) for name in list(actor) if name.startswith("mlp.")}
+    """Convert a checkpoint of rsl_rl 5, with an actor or a student, to the content of a policy's file."""
+    actor = dict(saved.get("actor_state_dict") or saved["student_state_dict"])
+    rows, units = getattr(actor.get("rnn.rnn.weight_hh_l0"), "shape", (0, 0))
+    units = units if rows == 3 * units else 0  # an LSTM has more rows
+    layers, state = "network.network." if units else "network.", {}
+    for name in [name for name in actor if name.startswith(("mlp.", "rnn.") if units else "mlp.")]:
+        new = name.replace("mlp.", layers).replace("rnn.rnn.", "network.cell.").removesuffix("_l0")
+        state[new] = actor.pop(name)
     try:
         std = actor.pop("distribution.std_param", None)
         state["log_std"] = actor.pop("distribution.log_std_param") if std is None else std.log()
@@ -160,9 +165,12 @@ def _from_rsl_rl(saved: Mapping[str, Any], path: Path) -> dict[str, Any]:
             state |= {f"normalizer.{name}": part for name, part in parts.items()}
         if actor:
             raise KeyError(next(iter(actor)))
-        sizes = [state["network.0.weight"].shape[1], *(len(x) for name, x in state.items() if name.endswith(".bias"))]
+        first = state["network.cell.weight_ih" if units else "network.0.weight"]
+        sizes = [len(x) for name, x in state.items() if name.startswith(layers) and name.endswith(".bias")]
     except KeyError as error:
-        raise ValueError(f"{path} is from rsl_rl: only MLP actors with a Gaussian can be loaded ({error})") from error
-    more = ", normalize=True, limit=math.inf" if normalize else ""
-    like = f"lw.GaussianPolicy({sizes[0]}, {sizes[-1]}, {tuple(sizes[1:-1])}, activation='elu'{more})"
+        kinds = "MLP and GRU actors with a Gaussian"
+        raise ValueError(f"{path} is from rsl_rl: only {kinds} can be loaded ({error})") from error
+    more = f", recurrent={units}" if units else ""
+    more += ", normalize=True, limit=math.inf" if normalize else ""
+    like = f"lw.GaussianPolicy({first.shape[1]}, {sizes[-1]}, {tuple(sizes[:-1])}, activation='elu'{more})"
     return {"lyceum_warp": FORMAT, "iteration": saved["iter"], "policy": {"shape": None, "state": state, "like": like}}

@@ -7,7 +7,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos import LIMIT, NPG, PPO, SAC, Learner, NPGConfig, PPOConfig, SACConfig, Team
+from lyceum_warp import algos
+from lyceum_warp.algos import LIMIT, Distill, Learner, Team
 from lyceum_warp.binding import spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
@@ -19,7 +20,10 @@ from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copies
 
-ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
+ALGORITHMS: dict[str, tuple[Any, Any]] = {
+    "npg": (algos.NPG, algos.NPGConfig), "ppo": (algos.PPO, algos.PPOConfig), "sac": (algos.SAC, algos.SACConfig),
+    "distill": (Distill, algos.DistillConfig),
+}  # fmt: skip
 """Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
 
 
@@ -96,9 +100,10 @@ class Configuration:
         *,
         run: Run | None = None,
         networks: tuple[Any, Any] = (None, None),
+        teacher: Any = None,
         task: str | None = None,
     ) -> Learner:
-        """Make the learner of one of the processes.
+        """Make the learner of one of the processes; ``teacher`` is an argument of ``Distill``, which needs no value.
 
         With a run, the learner uses the run's task, unless ``task`` names another task. Without a run, it uses the task
         of this configuration. New networks are made if none are given.
@@ -121,6 +126,8 @@ class Configuration:
                 # only rank 0 checks trust, because other machines may have no record of the run
                 env = run_env(run, options, self.params, task=task, trust=not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
+            if teacher is not None:
+                return Distill(env, networks[0], self.hyperparameters, teacher=teacher, seed=seed, team=team)
             learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
             return learner
         except (ValueError, FileNotFoundError) as error:

@@ -68,6 +68,8 @@ class Run:
     """Path of ``checkpoint.pt``, with the complete state for an exact resume. It is saved with ``policy.pt``."""
     previous: Path
     """Path of ``previous.pt``, the previous checkpoint."""
+    teacher: Path
+    """Path of ``teacher.pt``: what the policy imitates, if the algorithm has a teacher."""
     replay: Path
     """Path of the folder ``replay``: the replay buffer of the checkpoint, if the algorithm has one."""
     transfer: Path
@@ -85,7 +87,7 @@ class Run:
         self.evaluation = folder / "evaluation.json"
         self.policy, self.best = folder / "policy.pt", folder / "best.pt"
         self.checkpoint, self.previous = folder / "checkpoint.pt", folder / "previous.pt"
-        self.replay, self.task_folder = folder / "replay", folder / _TASK
+        self.teacher, self.replay, self.task_folder = folder / "teacher.pt", folder / "replay", folder / _TASK
         self.check = lambda: None
 
     @property

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import torch
 
-from lyceum_warp.algos import Planner, Policy, acting, first_actions, moved
+from lyceum_warp.algos import Planner
 from lyceum_warp.controllers import CheckedController, accepts, signature_of
-from lyceum_warp.env import Env
+from lyceum_warp.env import Env, Player, Policy
 
 MOST_SAMPLES = 24
 """Maximum number of samples whose paths the viewer shows."""
@@ -43,16 +43,15 @@ class PolicyControl:
 
     def __init__(self, name: str, policy: Policy, env: Env) -> None:
         self.name, self.seconds = name, float("nan")
-        policy = moved(policy, env) if isinstance(policy, torch.nn.Module) else policy
-        self._policy, self._env = acting(policy), env
+        self._player, self._env = Player(policy, env), env
         with torch.no_grad():
-            first_actions(self._policy, env)
+            self._player.first(env.obs)
 
     def act(self) -> None:
         """Write the actions of all worlds."""
         start = time.perf_counter()
         try:
-            self._env.action.copy_(self._policy(self._env.obs))
+            self._env.action.copy_(self._player(self._env.obs))
         except Exception as error:
             raise ControllerError(self.name, error) from error
         self.seconds = time.perf_counter() - start
@@ -209,7 +208,8 @@ def controls(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
 
 
 def _is_policy(controller: Any) -> bool:
-    function = acting(controller)
-    if (signature := signature_of(function)) is None:
+    if hasattr(controller, "act"):
+        return True
+    if (signature := signature_of(controller)) is None:
         return False
-    return not accepts(signature, 2) or (isinstance(function, torch.nn.Module) and accepts(signature, 1))
+    return not accepts(signature, 2) or (isinstance(controller, torch.nn.Module) and accepts(signature, 1))

@@ -16,8 +16,9 @@ def network_and_inputs(activation: Activation, device: str) -> tuple[MLP, torch.
 @pytest.mark.parametrize("activation", ["elu", "tanh", "relu"])
 def test_float32_gradients_equal_autograd(activation: Activation) -> None:
     network, x, weight = network_and_inputs(activation, "cpu")
+    x.requires_grad_()  # as after a GRU
     outputs = [network(x), half_layers(network, type(network[1]), x)]
-    gradients = [torch.autograd.grad((y * weight).sum(), list(network.parameters())) for y in outputs]
+    gradients = [torch.autograd.grad((y * weight).sum(), [x, *network.parameters()]) for y in outputs]
     torch.testing.assert_close(*outputs)
     torch.testing.assert_close(*gradients, rtol=1e-5, atol=1e-4)
 

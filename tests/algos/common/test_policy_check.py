@@ -59,7 +59,7 @@ def frozen(module: nn.Module) -> nn.Module:
     [
         (Net(lambda mean: mean[..., :1]), r"must give a float32 tensor of shape \(4, 2\) .* not .* shape \(4, 1\)"),
         (Net(lambda mean: mean.double()), r"must give a float32 tensor of .* not a float64 tensor of shape \(4, 2\)"),
-        (Net(lambda mean: (mean, None)), r"must give a float32 tensor .* not tuple"),
+        (Net(lambda mean: (mean, None)), r"must give a float32 tensor .* not a float32 tensor .* and NoneType"),
         (Net(lambda mean: mean / 0.0), "mean actions are not finite"),
         (Net(lambda mean: mean.detach()), "depend on no parameter: remove detach"),
         (Net(lambda mean: mean + torch.ones(3)), r"fails for observations of shape \(4, 6\) \(RuntimeError: The size"),
