@@ -117,6 +117,7 @@ from lyceum_warp.kernels.rotations import (
 from lyceum_warp.kernels.velocities import body_velocity as body_velocity, local_velocity as local_velocity
 from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
+from lyceum_warp.motions.clips import Clips as Clips, load_clips as load_clips
 from lyceum_warp.training.callbacks import (
     Callback as Callback,
     Minutes as Minutes,
@@ -139,5 +140,6 @@ from lyceum_warp.viewer.show import view as view
 
 from . import terms as terms
 from .models import walkers as walkers
+from .motions import clip_tables as clip_tables
 
 __version__: str
