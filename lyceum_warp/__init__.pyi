@@ -1,5 +1,6 @@
 """Public names of the package; type checkers read this file, and __init__.py loads a name at its first use."""
 
+from lyceum_warp.algos.common.clip_evaluation import ClipResults as ClipResults, evaluate_clips as evaluate_clips
 from lyceum_warp.algos.common.evaluation import Episodes as Episodes, evaluate as evaluate
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import Iteration as Iteration, Learner as Learner

@@ -1,3 +1,4 @@
+from lyceum_warp.binding.bound_task import BoundTask as BoundTask
 from lyceum_warp.binding.functions import TaskSource as TaskSource
 from lyceum_warp.binding.layouts import layouts_of as layouts_of
 from lyceum_warp.binding.models import (

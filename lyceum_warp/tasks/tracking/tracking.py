@@ -591,13 +591,13 @@ class Tracking(lw.Task):
     """A robot that follows clips."""
 
     frame_skip, horizon = 4, 500
-    # gate = gates.Tracks()
+    gate = gates.Tracks()
     physics = {
         "coarse": lw.PhysicsOptions(
             integrator="discrete", frame_skip=2, timestep=0.01, solver={"iterations": 4, "ls_iterations": 8}
         )
     }
-    training = lw.Training(algorithm="ppo", settings={"entropy": 0.005}, iterations=3000, physics="coarse")
+    training = lw.Training(algorithm="ppo", settings={"entropy_coef": 0.005}, iterations=3000, physics="coarse")
     actions = {"joint_position": "joints"}
     rewards = {
         "anchor_position": 0.5,
@@ -615,5 +615,5 @@ class Tracking(lw.Task):
         "mpkpe", "r_mpkpe", "joint_position_error", "joint_velocity_error", "end_position_error", "end_rotation_error",
         "base_height_error", "base_tilt_error",
     )  # fmt: skip
-    deployment = staticmethod(deployment)
+    deployment, ghost = staticmethod(deployment), staticmethod(ghost)
     cleared = ("sensordata",)  # a reset clears the forces
