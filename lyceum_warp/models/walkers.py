@@ -420,10 +420,10 @@ def add_self_contact(spec: mujoco.MjSpec, name: str) -> None:
     """Add a sensor of the largest contact force between parts of the robot, three numbers in the contact's axes (N).
 
     Args:
-        spec: The model, which is changed in place. Its first body is the robot's base.
+        spec: The model, which is changed in place. Its first joint is the free joint of the robot's base.
         name: The name of the sensor.
     """
-    body = spec.worldbody.first_body()
+    body = spec.joints[0].parent
     body.name = body.name or "base"
     tree = mujoco.mjtObj.mjOBJ_XBODY
     spec.add_sensor(

@@ -9,11 +9,19 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from lyceum_warp.models import walkers
 from lyceum_warp.motions import kinematics
 
 BINS = (256, 2048)
 """Numbers of bins. Kernels are compiled for a number of bins, so few numbers mean few compilations. With more bins, the
 sums over all worlds would take a noticeable part of a step."""
+
+
+def standing(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Make a clip of one second in which the robot stands in its default pose."""
+    times, qpos = np.arange(round(1.0 / p.dt) + 1)[:, None] * p.dt, walkers.home_qpos(model).copy()
+    qpos[p.joint_qpos] = p.default_pose
+    return np.hstack([times, np.ones_like(times), np.tile(qpos, (len(times), 1))])
 
 
 def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
@@ -83,10 +91,10 @@ def bins(model: mujoco.MjModel, p: Any) -> np.ndarray:
     return np.array(rows + (number - len(rows)) * [(0, len(p.clips), 0)])
 
 
-def bin_shares(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the fraction of episodes that begin in each bin if no episode fails, (bins,).
+def bin_starts(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Get the probability that an episode begins in a bin or in an earlier one if no episode fails, (bins,).
 
-    The fraction is proportional to the bin's length and to the clip's weight.
+    The probability of a bin is proportional to its length and to the clip's weight.
     """
-    shares = p.bins[:, 2] * p.clips[p.ranges[p.bins[:, 0], 0], 1]
-    return shares / shares.sum()
+    shares = np.cumsum(p.bins[:, 2] * p.clips[p.ranges[p.bins[:, 0], 0], 1], dtype=float)
+    return shares / shares[-1]

@@ -13,6 +13,7 @@ import warp as wp
 from lyceum_warp.motions import checks, kinematics, rotations
 from lyceum_warp.motions.readers import READERS, Motion, read_motion
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.files import replaced
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number, positive_number, whole_number
@@ -110,6 +111,32 @@ class Clips:
             )
             looped.append(copies.join(blend=blend))
         return dataclasses.replace(self, qpos=tuple(clip.qpos[0] for clip in looped))
+
+    def save(self, path: str | Path, model: mujoco.MjModel) -> Path:
+        """Write one clip in BeyondMimic's format, with the names of joints and bodies, and return the path.
+
+        The npz file has joint positions and velocities, (frames, joints), and the bodies' positions, rotations (w, x,
+        y, z), velocities and angular velocities in the world's axes, (frames, bodies, ...).
+
+        Raises:
+            ValueError: There is more than one clip.
+        """
+        if len(self) != 1:
+            raise ValueError(f"a file has one clip, not {len(self)}: select one, as clips[0].save(...)")
+        qpos, names = self.qpos[0], ("joint_names", "body_names")
+        qvel = kinematics.joint_velocities(qpos, 1.0 / self.rate)
+        poses = *kinematics.body_poses(model, qpos), *kinematics.body_velocities(model, qpos, qvel)
+        parts = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
+        elements = (
+            (model.joint(i).name for i in range(1, model.njnt)),
+            (model.body(i).name for i in range(1, model.nbody)),
+        )
+        content = {"fps": np.array([self.rate]), "joint_pos": qpos[:, 7:], "joint_vel": qvel[:, 6:]}
+        content |= {part: pose[:, 1:].astype(np.float32) for part, pose in zip(parts, poses, strict=True)}
+        content |= {kind: np.array(list(each)) for kind, each in zip(names, elements, strict=True)}
+        with replaced(Path(path)) as temporary, temporary.open("wb") as file:
+            np.savez(file, **content)  # type: ignore[arg-type]
+        return Path(path)
 
 
 def load_clips(

@@ -199,7 +199,8 @@ def test_clips_of_any_length_share_one_policy(tmp_path: Path) -> None:
 
 def test_failures_move_starts_to_their_bins() -> None:
     env = lw.make("go1_tracking", nworld=32, horizon=30, bin_seconds=0.5, height_limit=0.05)
-    bins, shares = env.task.params["bins"], env.task.params["bin_shares"]
+    bins = env.task.params["bins"]
+    shares = np.diff(env.task.params["bin_starts"], prepend=0.0)
     used = bins[:, 2] > 0
     assert used.sum() == 32 and len(bins) == 256 and shares.sum() == pytest.approx(1.0)
     counts, total = np.zeros(256), 0.0

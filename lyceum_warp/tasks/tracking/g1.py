@@ -28,7 +28,7 @@ FREQUENCY, DAMPING_RATIO = 2.0 * math.pi * 10.0, 2.0  # of the servos: rad/s
 class Params(tracking.Params):
     joints: wp.array[int] = lw.joints(*JOINTS)
     bodies: wp.array[int] = lw.bodies("torso_link", *ENDS, "pelvis", *OTHERS)
-    feet: wp.array[int] = lw.geoms(*(f"{foot}{i}_collision" for foot in FEET for i in (1, 2, 3)))
+    feet: wp.array[int] = lw.sites(*FEET)
     imu: wp.vec3 = wp.vec3(0.04525, 0.0, -0.08339)
     clips: wp.array2d[float] = str(Path(__file__).with_name("g1.npy"))
 

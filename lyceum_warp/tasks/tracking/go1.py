@@ -19,7 +19,8 @@ FEET = [f"{leg}_foot" for leg in LEGS]
 class Params(tracking.Params):
     joints: wp.array[int] = lw.joints(*(f"{leg}_{joint}" for leg in LEGS for joint in ("hip", "thigh", "calf")))
     bodies: wp.array[int] = lw.bodies("trunk", *(f"{leg}_{part}" for part in ("calf", "thigh", "hip") for leg in LEGS))
-    feet: wp.array[int] = lw.geoms(*FEET)
+    feet: wp.array[int] = lw.sites(*FEET)
+    foot_geoms: wp.array[int] = lw.geoms(*FEET)
     imu: wp.vec3 = wp.vec3(-0.01592, -0.06659, -0.00617)
     default_pose: wp.array[float] = 2 * [0.1, 0.9, -1.8, -0.1, 0.9, -1.8]
     clips: wp.array2d[float] = str(Path(__file__).with_name("go1.npy"))

@@ -68,7 +68,7 @@ class Params:
     joints: wp.array[int] = lw.joints()  # the actuated joints, in the order of actions and observations
     bodies: wp.array[int] = lw.bodies()  # the tracked bodies: first the anchor, then the end effectors, then others
     ends: int = 4  # number of end effectors
-    feet: wp.array[int] = lw.geoms()  # geoms of the feet
+    feet: wp.array[int] = lw.sites()  # a site at each foot
     imu: wp.vec3 = wp.vec3(0.0)  # the velocimeter's position on the base, m
     base: int = lw.from_model(walkers.base)  # the body of the free joint
     joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)  # indices of the joints in qpos
@@ -76,9 +76,10 @@ class Params:
     controls: wp.array[int] = lw.from_model(walkers.controls)  # indices of the joints' servos in ctrl
     default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # the servos' targets under the action 0, rad
     action_scale: wp.array[float] = lw.from_model(walkers.quarter_of_force)  # rad for an action of 1
+    foot_geoms: wp.array[int] = lw.from_model(walkers.foot_geoms)  # geoms of the feet that can touch the ground
     self_contact: int = lw.sensor("self_contact")  # index of the force in sensordata
     # clips
-    clips: wp.array2d[float] = [[0.0]]  # lw.load_clips: time, weight and coordinates in each row
+    clips: wp.array2d[float] = lw.from_model(clip_tables.standing)  # lw.load_clips: time, weight and coordinates
     ranges: wp.array2d[int] = lw.from_model(clip_tables.ranges)  # first row and number of rows of each clip
     reference_qvel: wp.array2d[float] = lw.from_model(clip_tables.qvel)  # of each row
     reference_position: wp.array2d[wp.vec3] = lw.from_model(clip_tables.positions)  # of the bodies in each row, m
@@ -90,7 +91,7 @@ class Params:
     # where episodes begin
     bin_seconds: float = 1.0  # length of a bin; longer if there would be more than 2,048, s
     bins: wp.array2d[int] = lw.from_model(clip_tables.bins)  # clip, first row and number of rows of each bin
-    bin_shares: wp.array[float] = lw.from_model(clip_tables.bin_shares)  # fractions of episodes without failures
+    bin_starts: wp.array[float] = lw.from_model(clip_tables.bin_starts)  # as Shared.starts, without failures
     failure_weight: float = 1.0  # weight of failures per episode; 0 for uniform starts
     uniform_weight: float = 0.01  # weight of uniform starts
     forgetting: float = 0.024  # fraction of old failures that an update forgets; mjlab's 0.001 per step, for 24 steps
@@ -449,16 +450,17 @@ def event(s: World, p: Params, rng: Row[wp.uint32]):
 @wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
     sliding = lw.uniform(rng, p.friction[0], p.friction[1])
-    for i in range(p.feet.shape[0]):
-        nominal = s.geom_friction[p.feet[i]][0]
-        s.geom_friction[p.feet[i]][0] = nominal + p.randomness * (sliding - nominal)
+    for i in range(p.foot_geoms.shape[0]):
+        nominal = s.geom_friction[p.foot_geoms[i]][0]
+        s.geom_friction[p.foot_geoms[i]][0] = nominal + p.randomness * (sliding - nominal)
     terms.shift_center_of_mass(s.body_ipos, p.bodies[0], p.randomness * p.anchor_offset, rng)
     terms.draw_row(s.encoder_bias, -p.randomness * p.encoder_bias, p.randomness * p.encoder_bias, rng)
 
 
 @wp.func
-def put_reference(s: World, p: Params, clip: int, row: int):
-    """Put the robot into a row of a clip."""
+def put_reference(s: World, p: Params, clip: int, frame: int):
+    """Put the robot into a frame of a clip, but not into the last one."""
+    row = p.ranges[clip, 0] + wp.clamp(frame, 0, p.ranges[clip, 1] - 2)
     s.clip[0] = float(clip)
     s.frame[0] = float(row)
     for i in range(s.qpos.shape[0]):
@@ -468,41 +470,34 @@ def put_reference(s: World, p: Params, clip: int, row: int):
 
 @wp.func
 def initialize(s: World, p: Params):
-    clip = wp.max(p.start_clip, 0)
-    put_reference(s, p, clip, p.ranges[clip, 0] + wp.max(p.start_frame, 0))
+    put_reference(s, p, wp.clamp(p.start_clip, 0, p.ranges.shape[0] - 1), p.start_frame)
 
 
 @wp.func
 def drawn_bin(s: World, p: Params, rng: Row[wp.uint32]) -> int:
-    """Draw a bin from the shared probabilities, or from ``bin_shares`` before the first update."""
-    u, b = lw.uniform(rng, 0.0, 1.0), int(0)
-    last = p.bins.shape[0] - 1
-    if s.shared.starts[last] > 0.0:
-        high = int(last)
-        while b < high:
-            middle = (b + high) // 2
-            if s.shared.starts[middle] > u:
-                high = middle
-            else:
-                b = middle + 1
-    else:
-        total = float(p.bin_shares[0])
-        while total <= u and b < last and p.bins[wp.min(b + 1, last), 2] > 0:
-            b += 1
-            total += p.bin_shares[b]
-    return b
+    """Draw a bin from the shared probabilities, or without failures before the first update."""
+    u, low, high = lw.uniform(rng, 0.0, 1.0), int(0), p.bins.shape[0] - 1
+    learned = s.shared.starts[high] > 0.0
+    while low < high:
+        middle = (low + high) // 2
+        if wp.where(learned, s.shared.starts[middle], p.bin_starts[middle]) > u:
+            high = middle
+        else:
+            low = middle + 1
+    return low
 
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
     b = drawn_bin(s, p, rng)
-    clip, row = int(p.bins[b, 0]), p.bins[b, 1] + terms.uniform_int(rng, 0, p.bins[b, 2] - 1)
+    clip = int(p.bins[b, 0])
+    frame = p.bins[b, 1] - p.ranges[clip, 0] + terms.uniform_int(rng, 0, p.bins[b, 2] - 1)
     if p.start_clip >= 0:
-        clip = int(p.start_clip)
-        row = p.ranges[clip, 0] + terms.uniform_int(rng, 0, p.ranges[clip, 1] - 2)
+        clip = wp.min(p.start_clip, p.ranges.shape[0] - 1)
+        frame = terms.uniform_int(rng, 0, p.ranges[clip, 1] - 2)
     if p.start_frame >= 0:
-        row = p.ranges[clip, 0] + wp.min(p.start_frame, p.ranges[clip, 1] - 2)
-    put_reference(s, p, clip, row)
+        frame = int(p.start_frame)
+    put_reference(s, p, clip, frame)
     r = p.randomness
     offset = lw.uniform(rng, -r * p.start_position, r * p.start_position)
     for i in range(3):
@@ -558,14 +553,21 @@ def share(shared: Shared, sums: Sums, p: Params):
             norm += factor
             factor *= p.earlier_decay
         if p.bins[b, 2] > 0:
+            share = p.bin_starts[b] - wp.where(b > 0, p.bin_starts[wp.max(b - 1, 0)], 0.0)
             rate = p.clips[p.bins[b, 1], 1] * failures / (norm * wp.max(shared.episodes[0], 1.0))
-            total += p.failure_weight * rate + p.uniform_weight * p.bin_shares[b]
+            total += p.failure_weight * rate + p.uniform_weight * share
         shared.starts[b] = total
     for b in range(n):
         shared.starts[b] = shared.starts[b] / total
 
 
-def prepare(spec: mujoco.MjSpec, feet: Sequence[str], *, timestep: float, iterations: tuple[int, int]) -> None:
+def prepare(
+    spec: mujoco.MjSpec,
+    feet: Sequence[str],
+    *,
+    timestep: float | None = None,
+    iterations: tuple[int, int] | None = None,
+) -> None:
     """Prepare a model as ``walkers.prepare_walker`` does, but measure only forces between parts of the robot."""
     walkers.prepare_walker(spec, feet, timestep=timestep, iterations=iterations)
     for sensor in list(spec.sensors):
