@@ -9,7 +9,10 @@ from lyceum_warp import cli
 from lyceum_warp.training import Run
 from lyceum_warp.viz.video import NoVideoError
 
-TINY = "--iterations 1 --horizon 16 --nworld 4 --num-steps 8 --hidden 8 --value-hidden 8 --mean-every 0 --no-plot --no-video".split()
+TINY = [
+    *"--iterations 1 --horizon 16 --nworld 4 --num-steps 8 --hidden 8 --value-hidden 8".split(),
+    *"--mean-every 0 --no-plot --no-video".split(),
+]
 
 
 def test_clips_of_a_run_are_kept_and_evaluated(
