@@ -1,5 +1,6 @@
 """Public names of the package; type checkers read this file, and __init__.py loads a name at its first use."""
 
+from lyceum_warp.algos.common.clip_evaluation import ClipResults as ClipResults, evaluate_clips as evaluate_clips
 from lyceum_warp.algos.common.evaluation import Episodes as Episodes, evaluate as evaluate
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import Iteration as Iteration, Learner as Learner
@@ -122,6 +123,7 @@ from lyceum_warp.kernels.rotations import (
 from lyceum_warp.kernels.velocities import body_velocity as body_velocity, local_velocity as local_velocity
 from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
+from lyceum_warp.motions.clips import Clips as Clips, load_clips as load_clips
 from lyceum_warp.training.callbacks import (
     Callback as Callback,
     TransferTest as TransferTest,
@@ -143,5 +145,6 @@ from lyceum_warp.viewer.show import view as view
 
 from . import terms as terms
 from .models import walkers as walkers
+from .motions import clip_tables as clip_tables
 
 __version__: str

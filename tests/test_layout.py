@@ -17,7 +17,7 @@ LEVELS = {
     "support": 0,
     "core": 1,
     "graphs": 2, "kernels": 2, "models": 2,
-    "engines": 3, "terms": 3,
+    "engines": 3, "terms": 3, "motions": 3,
     "binding": 4,
     "env": 5,
     "algos": 6, "controllers": 6,

@@ -1,3 +1,7 @@
+from lyceum_warp.algos.common.clip_evaluation import (
+    ClipResults as ClipResults,
+    evaluate_clips as evaluate_clips,
+)
 from lyceum_warp.algos.common.distributed import (
     Team as Team,
     join as join,

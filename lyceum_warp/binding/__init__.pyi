@@ -1,5 +1,6 @@
+from lyceum_warp.binding.bound_task import BoundTask as BoundTask
 from lyceum_warp.binding.functions import TaskSource as TaskSource
-from lyceum_warp.binding.layouts import layouts_of as layouts_of
+from lyceum_warp.binding.layouts import action_sizes as action_sizes, observation_layouts as observation_layouts
 from lyceum_warp.binding.models import (
     compile_model as compile_model,
     task_spec as task_spec,

@@ -37,24 +37,34 @@ class Layouts:
 
 def layouts_of(source: TaskSource, params: Mapping[str, Any]) -> Layouts:
     """Compute the layouts for given parameters."""
-    if hasattr(source.definition, "obs"):
-        obs, groups = _declared_groups(source, params), {}
-    else:
-        groups = _struct_groups(source, params)
-        obs = {group: parts.sizes(layout) for group, layout in groups.items()}
-    actions = None
-    if source.definition.actions is not None:
-        sizes = source.definition.actions.items()
-        actions = {name: parts.length(f"the size of the action {name!r}", size, params) for name, size in sizes}
+    obs, groups = observation_layouts(source, params)
     shared = {name: parts.layout(kind, "obs", params, name) for name, kind in source.shared_structs.items()}
     return Layouts(
         obs,
-        actions,
+        action_sizes(source, params),
         memory={name: parts.layout(source.world, name, params, "World") for name in MEMORIES},
         shared=shared,
         structs=groups | shared,
         observers={group: source.observers[group] for group in obs},
     )
+
+
+def observation_layouts(
+    source: TaskSource, params: Mapping[str, Any]
+) -> tuple[dict[str, dict[str, int]], dict[str, parts.Layout]]:
+    """Compute the sizes of the parts of each observation group, and the layouts of groups that are structs."""
+    if hasattr(source.definition, "obs"):
+        return _declared_groups(source, params), {}
+    groups = _struct_groups(source, params)
+    return {group: parts.sizes(layout) for group, layout in groups.items()}, groups
+
+
+def action_sizes(source: TaskSource, params: Mapping[str, Any]) -> dict[str, int] | None:
+    """Compute the sizes of the parts of an action, or return None if actions are controls."""
+    if source.definition.actions is None:
+        return None
+    sizes = source.definition.actions.items()
+    return {name: parts.length(f"the size of the action {name!r}", size, params) for name, size in sizes}
 
 
 def _declared_groups(source: TaskSource, params: Mapping[str, Any]) -> dict[str, dict[str, int]]:

@@ -18,6 +18,9 @@ from lyceum_warp.core.task import Element, FromModel
 _FILLED_IN = ("dt", "substep_dt")
 """Parameters that the package sets: the durations of a step and of a substep, in seconds."""
 
+_SCALARS: dict[Any, Any] = {wp.bool: bool, wp.int32: int}
+"""The Python types of scalars that are no floats."""
+
 
 def defaults(struct: Any, owner: type) -> dict[str, Any]:
     """Return the defaults of a task's parameters, without ``dt`` and ``substep_dt``.
@@ -146,13 +149,11 @@ class Parameters:
         if array.shape not in (shape, per_world):
             takes = f"{shape or 'one number'}, or one per world, {per_world}"
             raise ValueError(f"{text} has shape {array.shape}: it takes {takes}")
-        if array.shape != shape:
-            return array
-        if shape:
-            return kind(*array.ravel())
         if kind in (wp.bool, wp.int32) and not (array == np.round(array)).all():
             raise ValueError(f"{text} must be a whole number")
-        return {wp.bool: bool, wp.int32: int}.get(kind, float)(array.item())
+        if array.shape != shape:
+            return array
+        return kind(*array.ravel()) if shape else _SCALARS.get(kind, float)(array.item())
 
     def _table(self, name: str, value: Any) -> np.ndarray:
         """Convert a table to a read-only array of float32 or int32. The last axes are those of a vector or matrix."""
@@ -213,7 +214,8 @@ class Parameters:
             if name in self.tables:
                 _, value = self._arrays[name]
             elif isinstance(value, np.ndarray):
-                value = kind(*value[world].ravel()) if getattr(kind, "_shape_", ()) else kind(value[world])
+                scalar = _SCALARS.get(kind, float)
+                value = kind(*value[world].ravel()) if getattr(kind, "_shape_", ()) else scalar(value[world])
             setattr(instance, name, value)
         return instance
 

@@ -21,6 +21,7 @@ from lyceum_warp.algos import (
 )
 from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, given, parameter, parameters
+from lyceum_warp.cli.clips import print_clips
 from lyceum_warp.cli.display import console, say, table, tried
 from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
@@ -57,10 +58,11 @@ class Eval:
     $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval go1_velocity --pretrained
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
+    $ lyceum-warp eval runs/g1_tracking-20260101-120000 --clips --video
     """
 
     USUAL = (
-        "pretrained", "which", "episodes", "seed", "nworld", "memory", "video", "transfer", "episodes_to",
+        "pretrained", "which", "episodes", "seed", "nworld", "memory", "video", "transfer", "clips", "episodes_to",
         "device",
     )  # fmt: skip
 
@@ -96,6 +98,11 @@ class Eval:
     command then prints the differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is
     one.
     """
+    clips: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="[FILE ...]", help_behavior_hint="")] = None
+    """Play every clip of a tracking task once from its first frame, without noise, and print its errors: on the C
+    engine under exact physics, and in the run's simulation. Files and folders of motions replace the run's clips
+    (lw.load_clips). With --video, a picture shows the worst moment of each clip.
+    """
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes. Each episode is one file, such as episode-000.npz."""
     env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
@@ -123,6 +130,10 @@ class Eval:
         which = better_policy(run, self.which, task=self.task)
         policy = load(run, which=which, device=env.obs.device)
         check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+        if self.clips is not None:
+            picture = Path(f"{file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
+            print_clips(env, policy, self.clips, picture if self.video else None, camera)
+            return
         curricula, origin_of_memory = self._curricula(run, which, env)
         if len(curricula) > 1 and (self.transfer or self.episodes_to):
             raise ValueError("--transfer and --episodes-to play at one level: give --memory one value")

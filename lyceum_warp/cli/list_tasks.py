@@ -74,13 +74,14 @@ def read_task(name: str) -> dict[str, Any]:
     """Make the row of a task from its class and its model."""
     task = binding.find_task(name)
     source, spec = binding.TaskSource(task), binding.task_spec(task)
-    layouts = binding.layouts_of(source, binding.defaults(source.params, source.defaults))
+    params = binding.defaults(source.params, source.defaults)
+    (obs, _), actions = binding.observation_layouts(source, params), binding.action_sizes(source, params)
     model: Any = task.model() if callable(task.model) else task.model
     file: Any = core.find_model(model, task) if isinstance(model, str | Path) else model
     known, made_in = isinstance(file, core.ModelFile), task.__module__.rpartition(".")[2]
     return {
-        "obs": sum(layouts.obs["policy"].values()),
-        "act": len(spec.actuators) if layouts.actions is None else sum(layouts.actions.values()),
+        "obs": sum(obs["policy"].values()),
+        "act": len(spec.actuators) if actions is None else sum(actions.values()),
         "skip": task.frame_skip,
         "dt": float(f"{spec.option.timestep * task.frame_skip:g}"),
         "horizon": task.horizon,

@@ -14,7 +14,7 @@ import tyro
 
 from lyceum_warp.binding import compile_model, find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import say
-from lyceum_warp.cli.task_text import TRAINING, literal, plain_text, velocity_text
+from lyceum_warp.cli.task_text import TRAINING, actuated_joints, literal, plain_text, tracking_text, velocity_text
 from lyceum_warp.core import (
     CONES,
     ModelFile,
@@ -48,6 +48,7 @@ class New:
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
     $ lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
     $ lyceum-warp new g1_walk --model menagerie:unitree_g1/scene_mjx.xml --template velocity
+    $ lyceum-warp new spot_tracking --model menagerie:boston_dynamics_spot/scene.xml --template tracking
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]
@@ -59,21 +60,22 @@ class New:
     from a checkout to which MENAGERIE_ROOT points.
     """
 
-    template: Literal["plain", "velocity"] = "plain"
-    """The template "velocity" trains a walking robot to follow velocity commands. The robot needs a floating base, and
-    legs made of hinges with one actuator each. The file is short, because it inherits most of its functions.
+    template: Literal["plain", "velocity", "tracking"] = "plain"
+    """The template "velocity" trains a walking robot to follow velocity commands, and "tracking" to follow clips. The
+    robot needs a floating base, and legs made of hinges with one actuator each. The file is short, because it inherits
+    most of its functions.
     """
     feet: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """The names of the feet, for --template velocity: sites, geoms or bodies. The default is the lowest end of each
-    leg."""
+    """The names of the feet, for --template velocity or tracking: sites, geoms or bodies. The default is the lowest end
+    of each leg."""
     joints: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME ...")] = ()
-    """Names of the joints to control, for --template velocity. The default is all leg joints with an actuator. Other
-    joints keep their pose.
+    """Names of the joints to control, for --template velocity or tracking. The default is all leg joints with an
+    actuator, or, for tracking, all joints with an actuator. Other joints keep their pose.
     """
 
     def run(self) -> None:
         if self.template == "plain" and (self.feet or self.joints):
-            raise ValueError("--feet and --joints have no effect without --template velocity")
+            raise ValueError("--feet and --joints have no effect without --template velocity or tracking")
         path = Path(os.path.expanduser(self.task if self.task.endswith(".py") else f"{self.task}.py"))
         class_name = _class_name(path)
         if path.exists():
@@ -89,8 +91,9 @@ class New:
             if self.template == "plain":
                 text = plain_text(model, **names)
             else:
-                legs = Legs(model, self.feet, self.joints)
-                text = velocity_text(legs, **names)
+                tracks = self.template == "tracking"
+                legs = Legs(model, self.feet, self.joints or (actuated_joints(model) if tracks else ()))
+                text = (tracking_text if tracks else velocity_text)(legs, **names)
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
         with replaced(path) as temporary:
@@ -101,10 +104,10 @@ class New:
             sizes = f"{sum(task.obs.values())} observations, {model.nu} actions, {step_ms:.3g} ms in a step"
         else:
             sizes = f"feet {', '.join(foot.site for foot in legs.feet)}; joints {', '.join(legs.joints)}"
-        training = "" if self.template == "plain" else f" {TRAINING}"
+        training = {"plain": "", "velocity": f" {TRAINING}", "tracking": " --clips FILES --device cuda"}[self.template]
         say(f"{path}: {sizes}; check and train it with")
         say(f"  lyceum-warp check {path}\n  lyceum-warp train {path}{training}")
-        if self.template == "velocity":
+        if self.template != "plain":
             cone = next(name for name, kind in CONES.items() if kind == model.opt.cone)
             physics = f"{task.frame_skip} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
             say(f"a step has {physics}; lyceum-warp tune {path} finds faster physics")

@@ -93,26 +93,16 @@ def velocity_text(legs: Legs, **names: str) -> str:
     is_biped = len(legs.feet) == 2
     fastest = round(0.4 * float(np.sqrt(9.81 * legs.height)), 1)
     swing = max(foot.height for foot in legs.feet) - legs.ground + float(np.clip(0.1 * legs.height, 0.03, 0.1))
-    feet = [f"FEET = [{', '.join(literal(foot.site) for foot in legs.feet)}]"]
-    edits = ["walkers.prepare_walker(spec, FEET)"]
-    if legs.has_motors:
-        edits.insert(0, "walkers.use_servos(spec, JOINTS)")
-    if new := [foot for foot in legs.feet if foot.element]:
-        feet += ["NEW_SITES = {  # a body, or a joint or geom in it, and a position there"]
-        feet += [f"    {literal(foot.site)}: ({literal(foot.element)}, {foot.position})," for foot in new]
-        feet += ["}"]
-        edits.insert(0, "walkers.add_feet(spec, NEW_SITES)")
-    params = []
+    feet, edits, params = _robot(legs, "walkers.prepare_walker(spec, FEET)")
     if is_biped:
-        params.append(f"least_height: float = {0.45 * legs.height:.2f}  # of the base; an episode ends below it")
+        params.insert(0, f"least_height: float = {0.45 * legs.height:.2f}  # of the base; an episode ends below it")
     if not legs.has_home:
-        params.append(f"start_height: float = {legs.height:.3f}")
-        params.append(_list("default_pose: wp.array[float]", [f"{angle:.4g}" for angle in legs.pose], 4))
+        params.insert(1, f"start_height: float = {legs.height:.3f}")
     return _filled(
         "velocity",
         legs.model,
         training=TRAINING,
-        feet="\n".join(feet),
+        feet=feet,
         joints=_list("JOINTS", list(map(literal, legs.joints))),
         family="Biped" if is_biped else "Velocity",
         params_family="BipedParams" if is_biped else "Params",
@@ -125,6 +115,54 @@ def velocity_text(legs: Legs, **names: str) -> str:
         edits=_indented(edits, 8),
         **names,
     )
+
+
+def tracking_text(legs: Legs, **names: str) -> str:
+    """Write a task file for a robot that follows clips. The arguments are those of ``velocity_text``.
+
+    The end effectors are the ends of all limbs. Bodies without a name are not tracked.
+    """
+    model, inner = legs.model, set[int]()
+    tree = [body for body in range(1, model.nbody) if model.body_rootid[body] == model.body_rootid[legs.base]]
+    bodies = [body for body in tree if model.body(body).name and body != legs.base]
+    for body in bodies:
+        while body := int(model.body_parentid[body]):
+            inner.add(body)
+    ends = [body for body in bodies if body not in inner]
+    ordered = [legs.base, *ends, *(body for body in bodies if body not in ends)]
+    feet, edits, params = _robot(legs, "tracking.prepare(spec, FEET)")
+    return _filled(
+        "tracking",
+        model,
+        feet=feet,
+        joints=_list("JOINTS", list(map(literal, legs.joints))),
+        bodies=_list("BODIES", [literal(model.body(body).name) for body in ordered]),
+        ends=len(ends),
+        njoint=len(legs.joints),
+        params=_added(params),
+        edits=_indented(edits, 8),
+        **names,
+    )
+
+
+def actuated_joints(model: mujoco.MjModel) -> list[str]:
+    """List the names of the joints that have an actuator, in the model's order."""
+    moved = model.actuator_trnid[model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT, 0]
+    return [model.joint(joint).name for joint in sorted(set(moved.tolist()))]
+
+
+def _robot(legs: Legs, prepare: str) -> tuple[str, list[str], list[str]]:
+    """Write what families of tasks share: the feet, the lines of ``edit_model``, and lines of ``Params``."""
+    feet, edits = [f"FEET = [{', '.join(literal(foot.site) for foot in legs.feet)}]"], [prepare]
+    if legs.has_motors:
+        edits.insert(0, "walkers.use_servos(spec, JOINTS)")
+    if new := [foot for foot in legs.feet if foot.element]:
+        feet += ["NEW_SITES = {  # a body, or a joint or geom in it, and a position there"]
+        feet += [f"    {literal(foot.site)}: ({literal(foot.element)}, {foot.position})," for foot in new]
+        feet += ["}"]
+        edits.insert(0, "walkers.add_feet(spec, NEW_SITES)")
+    pose = [f"{angle:.4g}" for angle in legs.pose]
+    return "\n".join(feet), edits, [] if legs.has_home else [_list("default_pose: wp.array[float]", pose, 4)]
 
 
 def _filled(template: str, model: mujoco.MjModel, **values: object) -> str:

@@ -94,6 +94,7 @@ class Train:
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
     $ lyceum-warp train go1_student_velocity --teacher go1_velocity --recurrent 256 --device cuda
     $ lyceum-warp train hopper --algorithm distill --demonstrations runs/hopper-episodes
+    $ lyceum-warp train g1_tracking --clips dances/ walk.csv --device cuda
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 
     The processes of torchrun share the worlds, even across machines. With --device cuda, each process uses the GPU of
@@ -102,7 +103,7 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device")
+    USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "clips", "device")
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
@@ -167,6 +168,9 @@ class Train:
     engine.
     """
     param: ParamWords = ()
+    clips: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")] = ()
+    """Motions for a task that tracks clips, such as g1_tracking: files and folders of the formats that lw.load_clips
+    reads. The run's folder has a copy."""
     video: bool = False
     """Whether to write a video of one episode of the trained policy."""
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
@@ -293,17 +297,21 @@ class Train:
                 "it in Python by lw.train(learner, lw.Run.open(folder), ...), or begin a new run from its policy by "
                 "--from and --algorithm"
             )
-        options = self._given("nworld", "seed") | given(self.env) | given(self.physics)
-        if "solver" in options:
-            options["solver"] = {**(base.options.physics.solver or {}), **options["solver"]}
-        params = parameters(self.param)
+        flags = self._given("nworld", "seed") | given(self.env) | given(self.physics)
+        if "solver" in flags:
+            flags["solver"] = {**(base.options.physics.solver or {}), **flags["solver"]}
+        options, params = base.options.changed(flags), parameters(self.param)
+        if self.clips:
+            from lyceum_warp.cli.clips import clips_of_task
+
+            params["clips"] = clips_of_task(self.clips, self.task or base.task or "", options)
         if source is None or self.task is None or binding.task_name(binding.find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(
             base,
             **self._given("task", "threads", "iterations"),
-            options=base.options.changed(options),
+            options=options,
             params=params,
             algorithm=algorithm,
             hyperparameters=self.hyperparameters.on_top_of(hyperparameters, algorithm),

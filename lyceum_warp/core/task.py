@@ -436,6 +436,10 @@ class Task:
     gymnasium: ClassVar[str | None] = None
     """Id of the Gymnasium environment that the task reimplements, such as "Hopper-v5". Model, observation, reward,
     termination, reset and parameters are the same as in that environment. Subclasses do not inherit this attribute."""
+    ghost: ClassVar[Any] = None
+    """A static method ``ghost(p, state)`` that returns the coordinates of a pose, (nq,). The viewer and videos show
+    this pose as a transparent robot, such as the reference of a clip. ``p`` has the parameters as attributes, and
+    ``state`` has the parts of a state by their names."""
     trace: ClassVar[str | None] = None
     """Name of a site or body whose path the viewer draws for a planner's samples. By default, this is the centre of
     mass of a robot with a floating base, or the end of an arm."""

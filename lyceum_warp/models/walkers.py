@@ -18,7 +18,7 @@ from lyceum_warp.core.mirror import Mirror
 
 _JOINT, _SENSOR = mujoco.mjtObj.mjOBJ_JOINT, mujoco.mjtObj.mjOBJ_SENSOR
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-_FORCE, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3
+_FORCE, _LARGEST, _NET = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 2, 3
 
 
 # joints
@@ -108,18 +108,28 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 
 def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Collect the names, gains and poses that a robot needs to run a velocity policy, for ``lw.Task.deployment``.
+    """Add the ranges of commands to ``servo_metadata``, for ``lw.Task.deployment`` of velocity tasks.
 
-    All lists are in the order of ``joints``. The ranges of commands cover the curriculum's stages that training has
-    reached.
+    The ranges cover the curriculum's stages that training has reached.
     """
-    actuators, stages = servos(model, p), np.asarray(p.stages)
+    stages = np.asarray(p.stages)
     stages = stages[stages[:, 0] <= max(memory["env_steps"].max(), stages[0, 0])]
-    # the joint's own damping adds to the servo's damping
-    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
     yaw, lateral = float(stages[:, 3].max()), float(np.max(p.lateral_velocity))
     clock = {"gait_frequency": float(p.gait_frequency)} if hasattr(p, "gait_frequency") else {}  # Hz
-    return clock | {
+    commands = {
+        "forward_velocity": [float(stages[:, 1].min()), float(stages[:, 2].max())],
+        "lateral_velocity": [-lateral, lateral],
+        "yaw_rate": [-yaw, yaw],
+    }
+    return clock | servo_metadata(model, p) | {"commands": commands}
+
+
+def servo_metadata(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+    """Collect the names, gains and poses that a robot needs to run a policy. Lists are in the order of ``joints``."""
+    actuators = servos(model, p)
+    # the joint's own damping adds to the servo's damping
+    damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
+    return {
         "base": model.body(base(model)).name,
         "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
@@ -128,11 +138,6 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
         "stiffness": model.actuator_gainprm[actuators, 0].tolist(),
         "damping": (damping - model.actuator_biasprm[actuators, 2]).tolist(),
         "force_limit": force_limits(model, p).tolist(),
-        "commands": {
-            "forward_velocity": [float(stages[:, 1].min()), float(stages[:, 2].max())],
-            "lateral_velocity": [-lateral, lateral],
-            "yaw_rate": [-yaw, yaw],
-        },
     }
 
 
@@ -409,6 +414,22 @@ def prepare_walker(
             name=f"{name}_force", type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=mujoco.mjtObj.mjOBJ_BODY,
             objname=site.parent.name, intprm=[_FORCE, _NET, 1],
         )  # fmt: skip
+
+
+def add_self_contact(spec: mujoco.MjSpec, name: str) -> None:
+    """Add a sensor of the largest contact force between parts of the robot, three numbers in the contact's axes (N).
+
+    Args:
+        spec: The model, which is changed in place. Its first joint is the free joint of the robot's base.
+        name: The name of the sensor.
+    """
+    body = spec.joints[0].parent
+    body.name = body.name or "base"
+    tree = mujoco.mjtObj.mjOBJ_XBODY
+    spec.add_sensor(
+        name=name, type=mujoco.mjtSensor.mjSENS_CONTACT, objtype=tree, objname=body.name, reftype=tree,
+        refname=body.name, intprm=[_FORCE, _LARGEST, 1],
+    )  # fmt: skip
 
 
 def add_feet(spec: mujoco.MjSpec, feet: Mapping[str, tuple[str, Sequence[float]]]) -> None:

@@ -5,6 +5,11 @@ from lyceum_warp.viz.cameras import (
     parsed_camera as parsed_camera,
 )
 from lyceum_warp.viz.extra import NoVideoError as NoVideoError
+from lyceum_warp.viz.ghosts import (
+    REFERENCE as REFERENCE,
+    reference_states as reference_states,
+)
+from lyceum_warp.viz.moments import draw_moments as draw_moments
 from lyceum_warp.viz.page import write_states as write_states
 from lyceum_warp.viz.pictures import WorldPictures as WorldPictures
 from lyceum_warp.viz.policy_videos import (

@@ -16,6 +16,7 @@ from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.extra import NoVideoError
+from lyceum_warp.viz.ghosts import REFERENCE, reference_states
 from lyceum_warp.viz.render import Shot
 from lyceum_warp.viz.renderer import Renderer, check_video
 
@@ -87,7 +88,8 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
     parts = env.state_space.parts
     for state in states.numpy():
         fields = {field.name: state[parts[field.name]] for field in env.task.dynamics}
-        yield Shot(state=state[: env.engine.integration_size], model_fields=fields, ghosts=[], lines=[], frames=1)
+        ghosts: Any = [(pose, REFERENCE, (0.0, 0.0)) for pose in reference_states(env, state)]
+        yield Shot(state=state[: env.engine.integration_size], model_fields=fields, ghosts=ghosts, lines=[], frames=1)
 
 
 class Recorder:

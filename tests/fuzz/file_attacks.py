@@ -23,6 +23,7 @@ import torch
 from arbitrary_models import ARM, MOTOR, text
 from guarded import ProblemError
 from minimal_cases import FILES
+from motion_files import go1, go1_clip, write_csv, write_npz, write_pickle
 
 import lyceum_warp as lw
 import lyceum_warp.cli.view
@@ -83,6 +84,9 @@ KINDS = {
     "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("the task 'tiny'",)),
     "task.py": Kind("slide.py", mutations.mutated_task, ("make file", "check"), ("the task 'tiny'",)),
     "table.npy": Kind("table.npy", _table, ("table",)),
+    "clip.npz": Kind("clips/clip.npz", functools.partial(_episode, main="joint_pos"), ("clips",)),
+    "clip.csv": Kind("clips/clip.csv", mutations.mutated_csv, ("clips",)),
+    "clip.pkl": Kind("clips/clip.pkl", functools.partial(mutations.mutated_pickle, canary=CANARY), ("clips",)),
 }  # fmt: skip
 
 
@@ -124,6 +128,7 @@ READERS: dict[str, Callable[[], object]] = {
     "make file": lambda: lw.make(CASE / "slide.py").step(),
     "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "reset"),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
+    "clips": lambda: lw.load_clips(CASE / "clips", go1()),
 }  # fmt: skip
 WITHOUT = {"resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
 """Files that a case deletes first, so that the command must read another file."""
@@ -222,6 +227,11 @@ def _make(folder: Path) -> None:
     (folder / "slide.py").write_text(TASK)
     (folder / "slide.xml").write_text(SLIDE)
     (folder / "model.xml").write_text(SLIDE)
+    (folder / "clips").mkdir()
+    qpos = go1_clip()[:20]
+    write_npz(folder / "clips/clip.npz", go1(), qpos, 50.0)
+    write_csv(folder / "clips/clip.csv", qpos)
+    write_pickle(folder / "clips/clip.pkl", qpos, 50.0)
     np.save(folder / "table.npy", np.linspace(0.0, 1.0, 80, dtype=np.float32).reshape(40, 2))
     options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)

@@ -90,6 +90,10 @@ FILES: dict[str, tuple[str, str, Change]] = {
     "a model that asks for 900 GB": ("model.xml", "make", _inside(b'<size memory="900G"/>')),
     "a task's file that raises BaseException": ("task.py", "check", lambda data: data + b"\nraise BaseException"),
     "a task's file that ends the program": ("task.py", "make file", lambda data: b"raise SystemExit(0)\n" + data),
+    "a motion whose pickle calls a function": ("clip.pkl", "clips", lambda data: b"cbuiltins\nprint\n(Vx\ntR."),
+    "a motion whose pickle asks for a memo of 4 GB": (
+        "clip.pkl", "clips", lambda data: data[:-1] + b"r\xff\xff\xff\x7f."
+    ),
     "a table whose header asks for 40 GB": ("table.npy", "table", _header),
     "a table whose header does not end": ("table.npy", "table", lambda data: data.replace(b"}", b"(", 1)),
 }  # fmt: skip

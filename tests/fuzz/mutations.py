@@ -173,15 +173,15 @@ def _saved(array: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
+def mutated_episode(data: bytes, random: Random, canary: Path, main: str = "info") -> bytes:
     kind = random.randrange(4)
     if kind == 0:
         return mutated_bytes(data, random)
     if kind == 1:
-        return _mutated_archive(data, random, "info.npy", _saved(np.array([Canary(canary)], dtype=object)))
+        return _mutated_archive(data, random, f"{main}.npy", _saved(np.array([Canary(canary)], dtype=object)))
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
-    if kind == 2:
+    if kind == 2 and main == "info":
         arrays["info"] = np.array(mutated_json(str(arrays["info"]).encode(), random).decode("utf-8", "replace"))
     else:
         name = random.choice(list(arrays))
@@ -191,6 +191,14 @@ def mutated_episode(data: bytes, random: Random, canary: Path) -> bytes:
     new = io.BytesIO()
     np.savez(new, **arrays)
     return new.getvalue()
+
+
+def mutated_pickle(data: bytes, random: Random, canary: Path) -> bytes:
+    if random.random() < 0.4:
+        return mutated_bytes(data, random)
+    values = (*VALUES, Canary(canary), np.zeros((2, 3)), np.array([Canary(canary)]), np.float32(1.0), b"x", (1, 2))
+    content = mutated_value(pickle.loads(data), random, values)
+    return pickle.dumps(content, protocol=random.randrange(6))
 
 
 def mutated_table(data: bytes, random: Random, canary: Path) -> bytes:

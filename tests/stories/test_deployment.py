@@ -14,7 +14,7 @@ import torch
 import lyceum_warp as lw
 from lyceum_warp.cli import main
 
-PAGE = Path(__file__).parents[2] / "docs" / "deployment.md"
+DOCS = Path(__file__).parents[2] / "docs"
 
 CALM = {
     "linear_velocity_noise": 0.0, "angular_velocity_noise": 0.0, "gravity_noise": 0.0, "joint_position_noise": 0.0,
@@ -23,14 +23,19 @@ CALM = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def program_of(page: str, title: str, folder: Path) -> dict[str, Any]:
     pytest.importorskip("onnxruntime")
-    (program,) = re.findall(r"^```python title=robot_loop.py\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    text = (DOCS / page).read_text()
+    (program,) = re.findall(rf"^```python title={title}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert "lyceum_warp" not in program
-    path = tmp_path_factory.mktemp("page") / "robot_loop.py"
+    path = folder / title
     path.write_text(program)
     return runpy.run_path(str(path))
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    return program_of("deployment.md", "robot_loop.py", tmp_path_factory.mktemp("page"))
 
 
 def walking_policy(env: lw.Env) -> lw.GaussianPolicy:
@@ -75,6 +80,35 @@ def test_control_loop_in_the_documentation_reproduces_steps_of_the_environment(
         np.testing.assert_allclose(robot.observation(data, command), env.obs[0], atol=1e-4, rtol=1e-4)
         moved = max(moved, np.abs(robot.action).max())
     assert moved > 0.3 and not env.done.any()
+
+
+@pytest.mark.quick("go1_tracking")
+@pytest.mark.parametrize("task", ["go1_tracking", "g1_tracking", "g1_blind_tracking"])
+def test_tracking_loop_in_the_documentation_reproduces_steps_of_the_environment(task: str, tmp_path: Path) -> None:
+    page = program_of("tracking.md", "tracking_loop.py", tmp_path)
+    torch.manual_seed(0)
+    env = lw.make(task, randomness=0.0, start_clip=1, start_frame=30)
+    policy = walking_policy(env)
+    with torch.no_grad():
+        policy.network[-1].weight *= 0.5
+    file = lw.export_policy(policy, tmp_path / "policy.onnx", env=env)
+    first, count = env.task.params["ranges"][1]
+    table = env.task.params["clips"][first : first + count]
+    clips = lw.Clips(names=("turn",), qpos=(table[:, 2:].astype(float),), rate=50.0, weights=(1.0,))
+    model = copy.copy(env.model)
+    robot, data = page["Policy"](str(file), model), mujoco.MjData(model)
+    clip = page["Clip"](str(clips.save(tmp_path / "turn.npz", model)), robot)
+    assert len(clip) == count
+    parts = env.state_space.split(env.get_state()[0])
+    data.qpos[:], data.qvel[:] = parts["qpos"], parts["qvel"]
+    for step in range(31, 51):
+        robot.act(model, data, clip.frame(step))
+        env.step(policy(env.obs))
+        mujoco.mj_step(model, data, robot.substeps)
+        np.testing.assert_allclose(robot.action, env.action[0], atol=1e-5)
+        seen = robot.observation(model, data, clip.frame(step + 1))
+        np.testing.assert_allclose(seen, env.obs[0], atol=1e-4, rtol=1e-4)
+    assert np.abs(robot.action).max() > 0.1 and not env.done.any()
 
 
 def test_export_command_writes_metadata_of_the_task(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,7 @@ from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
+from lyceum_warp.viz import REFERENCE, reference_states
 
 _COLOURS = (
     (0.20, 0.55, 0.95), (0.95, 0.60, 0.15), (0.35, 0.75, 0.35), (0.75, 0.40, 0.85), (0.90, 0.80, 0.20),
@@ -104,6 +105,7 @@ class FrameMaker:
     ) -> Frame:
         parts = self._env.state_space.parts
         fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
+        ghosts = [*(Ghost(pose, REFERENCE) for pose in reference_states(self._env, state)), *ghosts]
         return Frame(self._physics(state), fields, status, tuple(ghosts), paths, self._driving.arrows(state))
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:

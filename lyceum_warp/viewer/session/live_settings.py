@@ -3,10 +3,14 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
+
 from lyceum_warp.algos import Planner
 from lyceum_warp.env import Env
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
+STARTS = ("start_clip", "start_frame")
+"""Parameters of tracking tasks. A change puts the displayed world there."""
 _OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that a planner sets itself
 
 Numbers = tuple[tuple[str, float], ...]
@@ -21,9 +25,9 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """Return the task's float parameters, including the weights of reward terms."""
-    params = env.task.params.items()
-    return tuple((n, v) for n, v in params if isinstance(v, float) and n not in ("dt", "substep_dt"))
+    """Return the task's float parameters, including the weights of reward terms, and the start of a clip."""
+    params = [(n, v) for n, v in env.task.params.items() if isinstance(v, float) or (n in STARTS and np.ndim(v) == 0)]
+    return tuple((n, float(v)) for n, v in params if n not in ("dt", "substep_dt"))
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:

@@ -19,7 +19,7 @@ from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
-from lyceum_warp.viewer.session.live_settings import planner_numbers, rebuilt_planner, task_numbers
+from lyceum_warp.viewer.session.live_settings import STARTS, planner_numbers, rebuilt_planner, task_numbers
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
@@ -198,7 +198,9 @@ class Stage:
         else:
             plans = [each.controller.env for each in planners if isinstance(each.controller, Planner)]
             for env in {id(env): env for env in (self.env, self.live.env, *plans)}.values():
-                env.set_params(**{name: value})
+                env.set_params(**{name: round(value) if name in STARTS else value})
+            if name in STARTS:
+                self.reset(random=False)
         for planner in planners:
             if (thread := self._threads.pop(planner.name, None)) is not None:
                 thread.close()

@@ -6,7 +6,7 @@ from conftest import SharedEnv
 from memory_window import pushing
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.commands import command, set_ghosts, set_mode, set_world, step_by
+from lyceum_warp.viewer.commands import command, set_ghosts, set_mode, set_number, set_world, step_by
 from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
@@ -29,6 +29,25 @@ def test_other_worlds_and_past_states_are_drawn_transparently(shared_env: Shared
     assert len(shifts) == 3 and (0.0, 0.0) not in shifts and all(g.colour is None for g in session.stage.frame().ghosts)
     session.obey(command(set_ghosts, Ghosts(worlds=9)))
     assert len(session.stage.frame().ghosts) == 3
+
+
+def test_reference_of_a_clip_is_a_ghost_and_the_panel_moves_along_clips() -> None:
+    env = lw.make("go1_tracking", nworld=2)
+    session = Session(env, paused=True, seed=0)
+    session.stage.advance(3)
+    frame, parts = session.stage.frame(), env.state_space.split(env.get_state())
+    (ghost,) = frame.ghosts
+    table, qpos = env.task.params["clips"], env.state_space.parts["qpos"]
+    np.testing.assert_allclose(ghost.state[qpos], table[int(parts["frame"][0, 0]), 2:])
+    assert dict(frame.status.params)["start_clip"] == -1.0
+    for name, value in (("start_clip", 2.0), ("start_frame", 77.0)):
+        session.obey(command(set_number, "task", name, value))
+    row = int(env.task.params["ranges"][2, 0]) + 77
+    frame = session.stage.frame()
+    np.testing.assert_allclose(frame.state[qpos], table[row, 2:], atol=1e-6)
+    np.testing.assert_allclose(frame.ghosts[0].state[qpos], table[row, 2:])
+    session.obey(command(set_number, "task", "start_frame", 1e6))
+    assert not session.stage.frame().messages
 
 
 def test_faults_and_ends_of_episodes_are_shown_as_messages(shared_env: SharedEnv) -> None:

@@ -1,0 +1,75 @@
+"""Compare stored bodies with a model, and report what a robot cannot do: sinking, slipping, joints beyond limits."""
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.motions.kinematics import contact_spheres
+from lyceum_warp.motions.rotations import rotate
+
+_SAME = 0.01
+"""Distance in m below which a stored body is where the model's kinematics put it."""
+
+_SINK, _SLIP, _CONTACT, _BEYOND = 0.02, 0.3, 0.01, 0.02
+"""What is reported: depth below the ground in m, mean speed of contacts in m/s, height in m below which a point is in
+contact, and distance beyond a joint's limit in rad."""
+
+
+def check_bodies(model: mujoco.MjModel, stored: np.ndarray, positions: np.ndarray, names: list[str] | None) -> None:
+    """Compare stored positions of bodies (frames, bodies, 3) with those of all the model's bodies.
+
+    Raises:
+        ValueError: The file belongs to another robot, or has another order of joints or bodies.
+    """
+    all_names = [model.body(body).name for body in range(model.nbody)]
+    bodies = range(1, model.nbody) if names is None else [all_names.index(name) for name in names if name in all_names]
+    if stored.shape[1] != len(bodies):
+        strange = sorted(set(names or ()) - set(all_names))
+        what = f", such as {', '.join(strange[:3])}" if strange else ""
+        raise ValueError(f"it has {stored.shape[1]} bodies{what}, but the model has {model.nbody - 1}: another robot?")
+    ours = positions[:, list(bodies)]
+    errors = np.linalg.norm(stored - ours, axis=2).max(0)
+    if errors.max() <= _SAME:
+        return
+    distances = np.linalg.norm(stored[:, :, None] - ours[:, None], axis=3).max(0)
+    nearest = distances.argmin(1)
+    texts = []
+    for i in np.argsort(-errors)[:4]:
+        name, other = all_names[bodies[i]], all_names[bodies[nearest[i]]]
+        place = (
+            f"is where the model has {other}" if distances[i, nearest[i]] <= _SAME else f"is off by {errors[i]:.2g} m"
+        )
+        texts.append(f"{name} {place}")
+    raise ValueError(
+        f"its bodies are not those of the model: {', '.join(texts)}; the file has another order of bodies or joints, "
+        "or belongs to another robot"
+    )
+
+
+def findings(model: mujoco.MjModel, qpos: np.ndarray, poses: tuple[np.ndarray, np.ndarray], rate: float) -> list[str]:
+    """Describe in short texts what the robot cannot do in a motion.
+
+    Args:
+        model: The robot on a ground at height 0.
+        qpos: The coordinates, (frames, nq).
+        poses: Positions and rotations of all bodies, from ``body_poses``.
+        rate: Frames per second.
+    """
+    texts = []
+    bodies, spheres = contact_spheres(model)
+    points = poses[0][:, bodies] + rotate(poses[1][:, bodies], spheres[:, :3])
+    heights = points[..., 2] - spheres[:, 3]
+    if heights.size and (depth := -heights.min()) > _SINK:
+        frame, sphere = np.unravel_index(heights.argmin(), heights.shape)
+        name = model.body(bodies[sphere]).name
+        texts.append(f"{name} sinks {100 * depth:.0f} cm into the ground at {frame / rate:.2f} s")
+    touching = (heights[1:] < _CONTACT) & (heights[:-1] < _CONTACT)
+    speeds = np.linalg.norm(np.diff(points[..., :2], axis=0), axis=2) * rate
+    if touching.any() and (slip := speeds[touching].mean()) > _SLIP:
+        texts.append(f"its contacts slip at {slip:.2f} m/s on average")
+    hinges = np.flatnonzero(model.jnt_limited)
+    values, limits = qpos[:, model.jnt_qposadr[hinges]], model.jnt_range[hinges]
+    beyond = np.maximum(limits[:, 0] - values, values - limits[:, 1]).max(0)
+    for i in np.argsort(-beyond)[:3]:
+        if beyond[i] > _BEYOND:
+            texts.append(f"{model.joint(hinges[i]).name} is {beyond[i]:.2g} rad beyond its limit")
+    return texts

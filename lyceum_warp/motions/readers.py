@@ -1,0 +1,159 @@
+"""Read motions from files of several formats, without running code from the files."""
+
+import dataclasses
+import io
+import json
+import pickle
+import pickletools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lyceum_warp.support.validate import first_sentence
+
+_CSV_RATE = 30.0
+"""Frames per second of Unitree's CSV files, which do not store it."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """A motion as a file stores it."""
+
+    qpos: np.ndarray
+    """Position (m) and rotation (w, x, y, z) of the base, and positions of the joints (rad), (frames, 7 + joints)."""
+    rate: float
+    """Frames per second."""
+    joints: list[str] | None = None
+    """Names of the joints, if the file stores them."""
+    body_positions: np.ndarray | None = None
+    """Stored positions of the robot's bodies, (frames, bodies, 3), in m."""
+    bodies: list[str] | None = None
+    """Names of these bodies, if the file stores them."""
+
+
+def read_motion(path: Path) -> Motion:
+    """Read a file.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The file has another format, or is broken.
+    """
+    if path.suffix not in READERS:
+        raise ValueError(f"{path} is not a motion: its name must end in {', '.join(READERS)}")
+    try:
+        motion = READERS[path.suffix](path)
+        _check(motion)
+    except Exception as error:  # the readers raise many types of errors
+        if isinstance(error, OSError) and error.filename is not None:
+            raise
+        raise ValueError(f"{path} is broken, or is not a motion ({first_sentence(error)})") from error
+    return motion
+
+
+def _check(motion: Motion) -> None:
+    qpos, rate = motion.qpos, motion.rate
+    if qpos.ndim != 2 or len(qpos) < 3 or qpos.shape[1] < 8:
+        raise ValueError(f"it has the shape {qpos.shape}, but needs three frames of a base and at least one joint")
+    if not 1.0 <= rate <= 10000.0:
+        raise ValueError(f"it has {rate:g} frames per second")
+    if not (np.abs(qpos) < 1e6).all():
+        raise ValueError("it has a coordinate that is not finite or absurd")
+    if (norms := np.abs(np.linalg.norm(qpos[:, 3:7], axis=1) - 1.0)).max() > 1e-2:
+        raise ValueError(f"the base's rotation in frame {norms.argmax()} is no unit quaternion")
+    if motion.joints is not None and len(motion.joints) != qpos.shape[1] - 7:
+        raise ValueError(f"it has {qpos.shape[1] - 7} joints, but {len(motion.joints)} names of joints")
+    stored = motion.body_positions
+    if stored is not None and (stored.shape[::2] != (len(qpos), 3) or not (np.abs(stored) < 1e6).all()):
+        raise ValueError(f"the bodies' positions have the shape {stored.shape}, or are not finite")
+    if stored is not None and motion.bodies is not None and len(motion.bodies) != stored.shape[1]:
+        raise ValueError(f"it has {stored.shape[1]} bodies, but {len(motion.bodies)} names of bodies")
+
+
+def _read_npz(path: Path) -> Motion:
+    """Read an episode of this package, or a motion in BeyondMimic's format, with or without names."""
+    with np.load(path, allow_pickle=False) as file:
+        if "states" in file:
+            info = json.loads(str(file["info"]))
+            start, stop = info["state_parts"]["qpos"]
+            return Motion(np.asarray(file["states"], float)[:, start:stop], 1.0 / float(info["timestep"]))
+        joints, bodies = ([str(name) for name in file[names]] if names in file else None
+                          for names in ("joint_names", "body_names"))  # fmt: skip
+        positions, qpos = np.asarray(file["body_pos_w"], float), np.asarray(file["joint_pos"], float)
+        if joints is None or qpos.shape[1] == len(joints):  # holosoma's files have the base's pose here, too
+            qpos = np.hstack([positions[:, 0], np.asarray(file["body_quat_w"], float)[:, 0], qpos])
+        return Motion(qpos, float(np.ravel(file["fps"])[0]), joints, positions, bodies)
+
+
+def _read_csv(path: Path) -> Motion:
+    """Read Unitree's format: in each row the base's position, its rotation (x, y, z, w), and the joints."""
+    rows = np.loadtxt(path, delimiter=",", ndmin=2, encoding="utf-8")
+    return Motion(rows[:, [0, 1, 2, 6, 3, 4, 5, *range(7, rows.shape[1])]], _CSV_RATE)
+
+
+def _read_pickle(path: Path) -> Motion:
+    """Read GMR's format, a dict with fps, root_pos, root_rot (x, y, z, w) and dof_pos."""
+    content = _unpickled(path.read_bytes())
+    position, rotation, joints = (np.asarray(content[name], float) for name in ("root_pos", "root_rot", "dof_pos"))
+    return Motion(np.hstack([position, rotation[:, [3, 0, 1, 2]], joints]), float(np.asarray(content["fps"], float)))
+
+
+READERS: dict[str, Callable[[Path], Motion]] = {".npz": _read_npz, ".csv": _read_csv, ".pkl": _read_pickle}
+"""The reader of each kind of files."""
+
+
+# pickles
+
+
+class _DType:
+    """A numeric dtype that is built from the arguments that NumPy pickles."""
+
+    def __init__(self, text: str, *flags: bool) -> None:
+        self.dtype = np.dtype(text)
+        if self.dtype.kind not in "fiub":
+            raise pickle.UnpicklingError(f"it has an array of {self.dtype}")
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.dtype = self.dtype.newbyteorder(state[1])
+
+
+class _Array:
+    """An array that is built from the bytes that NumPy pickles."""
+
+    def __init__(self, *arguments: Any) -> None:
+        self.array = np.zeros(0)
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, is_fortran, content = state
+        self.array = _from_buffer(content, kind, shape, "F" if is_fortran else "C")
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.asarray(self.array, dtype)
+
+
+def _from_buffer(content: Any, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
+    return np.frombuffer(content, kind.dtype).reshape(shape, order="F" if order == "F" else "C")
+
+
+_MAKERS: dict[str, Callable[..., Any]] = {
+    "_reconstruct": _Array, "ndarray": _Array, "dtype": _DType, "_frombuffer": _from_buffer,
+    "scalar": lambda kind, content: np.frombuffer(content, kind.dtype)[0],
+}  # fmt: skip
+"""What stands for each name of NumPy in a pickle. All other names are refused."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if module.partition(".")[0] == "numpy" and name in _MAKERS:
+            return _MAKERS[name]
+        raise pickle.UnpicklingError(f"it would run {module}.{name}, but only arrays are read")
+
+
+def _unpickled(data: bytes) -> Any:
+    """Read a pickle of dicts, lists, texts, numbers and arrays."""
+    for count, (operation, argument, _) in enumerate(pickletools.genops(data)):
+        # the unpickler's memo has as many entries as the largest index that is put
+        if "PUT" in operation.name and int(argument or 0) > count:
+            raise pickle.UnpicklingError("its memo is larger than the file")
+    return _Unpickler(io.BytesIO(data)).load()

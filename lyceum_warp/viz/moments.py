@@ -1,0 +1,38 @@
+"""Draw the moment at which a policy was farthest from each clip."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from lyceum_warp.algos import ClipResults
+from lyceum_warp.env import Env
+from lyceum_warp.viz.cameras import CameraChoice, camera_values
+from lyceum_warp.viz.renderer import Renderer
+from lyceum_warp.viz.style import new_figure, save_png
+from lyceum_warp.viz.video import shots
+
+
+def draw_moments(
+    env: Env, names: Sequence[str], results: ClipResults, out: str | Path, *, camera: CameraChoice = None
+) -> Path:
+    """Draw the worst moment of each clip as one PNG file, with the reference as a transparent robot.
+
+    Args:
+        env: An environment of the results' task and physics.
+        names: The names of the clips.
+        results: The results of ``evaluate_clips``.
+        out: The file.
+        camera: The camera, as in ``write_video``.
+    """
+    columns = min(4, len(names))
+    figure = new_figure("the worst moments", 3.0 * columns, 3.6 * math.ceil(len(names) / columns))
+    all_axes = figure.subplots(math.ceil(len(names) / columns), columns, squeeze=False).ravel()
+    for axes in all_axes:
+        axes.set_axis_off()
+    with Renderer(env.model, camera=camera_values(env.model, camera), size=(480, 480)) as renderer:
+        for i, shot in enumerate(shots(env, results.worst_states)):
+            renderer.render(shot)
+            all_axes[i].imshow(renderer.picture())
+            end = f", failed at {results.tracked[i]:.2f} s" if results.failed[i] else ""
+            all_axes[i].set_title(f"{names[i]}\n{results.worst[i]:.2f} s{end}", fontsize=9)
+    return save_png(figure, out)
