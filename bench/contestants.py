@@ -18,6 +18,7 @@ import warp as wp
 from mujoco.rollout import Rollout
 
 import lyceum_warp as lw
+from lyceum_warp.binding import find_task
 
 WORKER = venvs.FOLDER / "environments" / "sampling.py"
 sys.path.append(str(WORKER.parent))
@@ -26,6 +27,8 @@ import sampling  # noqa: E402  # a worker of the peers; its clock and its action
 LABELS = {
     "c": "lyceum_warp, C engine",
     "warp": "lyceum_warp, Warp engine",
+    "c-suggested": "C engine, suggested physics",
+    "warp-suggested": "Warp engine, suggested physics",
     "native": "native C",
     "envpool": "EnvPool",
     "gym-async": "Gymnasium, AsyncVectorEnv",
@@ -43,7 +46,7 @@ GPU_WORLDS = 16_384
 def worlds(contestant: str, threads: int, device: str) -> int:
     if contestant == "warp" and device.startswith("cuda"):
         return GPU_WORLDS
-    return WORLDS[contestant] * (1 if contestant == "gym-sync" else threads)
+    return WORLDS[contestant.removesuffix("-suggested")] * (1 if contestant == "gym-sync" else threads)
 
 
 def takes_part(contestant: str, task: str) -> bool:
@@ -58,7 +61,7 @@ def measure(
     """Measure environment steps per second of a contestant in ``LABELS``."""
     torch.set_num_threads(1)
     with experiment.cores(threads):
-        if contestant in ("c", "warp"):
+        if contestant.startswith(("c", "warp")):
             stepper: LyceumWarp | Native = LyceumWarp(contestant, task, worlds, threads, device, seed)
         elif contestant == "native":
             stepper = Native(task, worlds, threads, seed, warm)
@@ -77,8 +80,12 @@ def python_of(contestant: str) -> Path:
 
 class LyceumWarp:
     def __init__(self, contestant: str, task: str, nworld: int, threads: int, device: str, seed: int) -> None:
-        engine = {"engine": "mujoco", "nthread": threads} if contestant == "c" else {"engine": "warp", "device": device}
-        self.env = lw.make(task, nworld=nworld, seed=seed, **engine)
+        options: dict[str, Any] = {"engine": "warp", "device": device}
+        if contestant.startswith("c"):
+            options = {"engine": "mujoco", "nthread": threads}
+        if contestant.endswith("suggested"):
+            options["physics"] = find_task(task).training.physics
+        self.env = lw.make(task, nworld=nworld, seed=seed, **options)
         self.actions = actions(self.env, seed)
 
     def step(self, t: int) -> None:

@@ -4,8 +4,9 @@
     lyceum-warp bench humanoid --tasks humanoid_stand --contestants real_time --repeats 20
 
 An episode lasts 20 s. In the contestant ``real_time``, the plant never waits, and the planner plans as often as it can
-(``lw.control_async``). ``predicted`` is the same with plans from predicted states (``predict=True``). In ``in_turn``,
-the plant waits until each plan is ready. Run the real-time episodes on idle cores, because other processes delay plans.
+(``lw.control_async``). ``predicted`` is the same with plans from predicted states (``predict=True``), ``discrete`` with
+the physics "discrete" instead of the task's preset. In ``in_turn`` and ``discrete_in_turn``, the plant waits until each
+plan is ready. Run the real-time episodes on idle cores, because other processes delay plans.
 """
 
 import dataclasses
@@ -39,6 +40,7 @@ WALKS, UP = {"humanoid_walk": 0.5, "g1_walk": 0.3}, 1.1
 """Minimum mean speed of a walk, m/s, and minimum height of the humanoid's standing torso, m."""
 CONTESTANTS = {
     "real_time": "in real time", "predicted": "in real time, from predicted states", "in_turn": "the plant waits",
+    "discrete": "in real time", "discrete_in_turn": "the plant waits",
 }  # fmt: skip
 
 
@@ -54,13 +56,18 @@ class Case:
 
 
 @functools.cache
-def planner(task: str, threads: int) -> lw.MPPI:
-    return lw.MPPI(task, nthread=threads)
+def planner(task: str, threads: int, options: tuple[tuple[str, Any], ...]) -> lw.MPPI:
+    return lw.MPPI(task, nthread=threads, **dict(options))
 
 
-def settings(task: str) -> str:
+def options_of(contestant: str) -> dict[str, Any]:
+    return {"physics": "discrete"} if contestant.startswith("discrete") else {}
+
+
+def settings(task: str, contestant: str) -> str:
     planning = find_task(task).planning
-    return ", ".join(f"{name} {value}" for name, value in (*planning.settings.items(), *planning.options.items()))
+    both = {**planning.settings, **planning.options, **options_of(contestant)}
+    return ", ".join(f"{name} {value}" for name, value in both.items())
 
 
 def cases(options: experiment.Options) -> list[Case]:
@@ -70,7 +77,7 @@ def cases(options: experiment.Options) -> list[Case]:
     repeats = options.repeats or (1 if options.short else 20)
     seconds = 0.3 if options.short else SECONDS
     return [
-        Case(task, name, FIRST_SEED + repeat, seconds, options.threads or cpu_cores(), settings(task))
+        Case(task, name, FIRST_SEED + repeat, seconds, options.threads or cpu_cores(), settings(task, name))
         for task in tasks for repeat in range(repeats) for name in contestants
     ]  # fmt: skip
 
@@ -86,11 +93,11 @@ def measure(case: Case, options: experiment.Options) -> dict[str, Any]:
     with experiment.cores(case.threads):
         plant = lw.make(case.task, autoreset=False, nthread=1, **params)
         episode: dict[str, Any] = dict(steps=round(case.seconds / plant.timestep), seed=case.seed)
-        if case.contestant == "in_turn":
-            trajectory = lw.control(plant, planner(case.task, case.threads), **episode)
+        plans = planner(case.task, case.threads, tuple(options_of(case.contestant).items()))
+        if case.contestant.endswith("in_turn"):
+            trajectory = lw.control(plant, plans, **episode)
         else:
-            predict = case.contestant == "predicted"
-            trajectory = lw.control_async(plant, planner(case.task, case.threads), predict=predict, **episode)
+            trajectory = lw.control_async(plant, plans, predict=case.contestant == "predicted", **episode)
     report = lw.control_report([trajectory])
     positions = trajectory.states[:, slice(*trajectory.state_parts["qpos"])]
     up, seconds = positions[:, 2] > UP, trajectory.steps * trajectory.timestep

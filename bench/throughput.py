@@ -6,7 +6,8 @@
 The part ``sampling`` runs many worlds on all threads; the reference is native C (``mujoco.rollout``). ``suite`` runs
 dm_control's tasks with equal numbers of worlds; the reference is dm_control. ``single`` runs one world on one thread;
 the reference is Gymnasium. ``cores`` runs the part ``sampling`` on 1, 2, 4, ... cores. ``worlds`` measures lyceum_warp
-with 1 to 131,072 worlds. ``kept`` compares an environment with its bare engine (kept.py).
+with 1 to 131,072 worlds. ``training`` compares exact physics with the physics that a task suggests for training.
+``kept`` compares an environment with its bare engine (kept.py).
 """
 
 import dataclasses
@@ -41,9 +42,11 @@ PARTS = {
     "single": ("gymnasium", "c", "envpool"),
     "cores": ("native", "c", "envpool", "gym-async"),
     "worlds": ("warp", "c"),
+    "training": ("c", "c-suggested", "warp", "warp-suggested"),
     "kept": ("c", "warp"),
 }
 """Contestants of each part. By default, the Warp engine runs only on a GPU."""
+VELOCITY = tuple(name for name in lw.task_names() if name.endswith("_velocity"))
 UNITS = {"sampling": "native", "suite": "dm_control", "single": "gymnasium", "cores": "native"}
 WORLDS = {"warp": (1, 8, 64, 512, 2_048, 8_192, 16_384, 32_768, 65_536, 131_072), "c": (1, 8, 64, 512, 4_096)}
 CPU_WORLDS = 512
@@ -52,7 +55,7 @@ CPU_WORLDS = 512
 @dataclasses.dataclass(frozen=True)
 class Options(experiment.Options):
     parts: tuple[str, ...] = ()
-    """Parts: sampling, suite, single, cores, worlds, kept; by default all."""
+    """Parts: sampling, suite, single, cores, worlds, training, kept; by default all."""
     seconds: float = 1.0
     """Duration of each measurement in seconds."""
     worlds: int | None = None
@@ -82,13 +85,15 @@ def cases(options: Options) -> list[Case]:
     named = choose(options.contestants, everything, what="contestant")
     choices = (*TASKS, *sorted({*lw.task_names()} - {*TASKS}))
     tasks = choose(options.tasks, choices, SHORT_TASKS if options.short else TASKS, what="task")
-    usual = {"cores": SCALED, "worlds": SCALED, "suite": SUITE[:1] if options.short else SUITE}
+    usual = {"cores": SCALED, "worlds": SCALED, "training": VELOCITY, "suite": SUITE[:1] if options.short else SUITE}
     threads, gpu = options.threads or cpu_cores(), options.device.startswith("cuda")
     repeats = options.repeats or (1 if options.short else 3)
     seconds, warm = (0.2, 20) if options.short else (options.seconds, 100)
 
     def size(part: str, name: str, cores: int) -> int:
-        requested = options.worlds if name in ("native", "c", "warp") else None
+        requested = options.worlds if name.startswith(("native", "c", "warp")) else None
+        if part == "training" and gpu:
+            requested = requested or 4096
         return 1 if part == "single" else requested or contestants.worlds(name, cores, options.device)
 
     def sizes(part: str, name: str) -> list[tuple[int, int]]:
@@ -104,15 +109,17 @@ def cases(options: Options) -> list[Case]:
         return [(size(part, name, threads), 1 if part == "single" else threads)]
 
     return [
-        Case(part, task, repeat, name, worlds, cores, options.device if name == "warp" else "cpu", seconds,
+        Case(part, task, repeat, name, worlds, cores, options.device if name.startswith("warp") else "cpu", seconds,
              0 if part == "kept" else warm if worlds <= contestants.GPU_WORLDS else 20,
              options.policy if part == "kept" else None)
         for part in choose(options.parts, PARTS, what="part")
         for task in (tasks if options.tasks else usual.get(part, tasks))
         for repeat in range(1 if part == "kept" else repeats)
         for name in PARTS[part]
-        if name in named and (name != "warp" or gpu or options.contestants)
-        and (part == "kept" or (task.startswith("dm/") if part == "suite" else task in TASKS))
+        if name in named and (name.startswith("warp") == gpu if part == "training" else
+                              name != "warp" or gpu or options.contestants)
+        and (part == "kept" or (task.startswith("dm/") if part == "suite" else
+                                task in VELOCITY if part == "training" else task in TASKS))
         and (part == "kept" or contestants.takes_part(name, task))
         for worlds, cores in sizes(part, name)
     ]  # fmt: skip
@@ -169,6 +176,12 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         ("single", ("task",), "One world on one thread: environment steps per second, and their ratio to Gymnasium's."),
         ("cores", ("task", "threads"), "Environment steps per second by cores, and their ratio to native C's."),
         ("worlds", ("task", "worlds"), "Environment steps per second by worlds."),
+        (
+            "training",
+            ("task", "worlds"),
+            "Environment steps per second with exact physics, and with the physics that a "
+            "task suggests for training; random actions.",
+        ),
     ):
         groups = grouped(rows, part, *by)
         names = [name for name in contestants_of(part) if any(rates(same, name) for same in groups.values())]

@@ -124,8 +124,6 @@ from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
 from lyceum_warp.training.callbacks import (
     Callback as Callback,
-    Minutes as Minutes,
-    TargetReturn as TargetReturn,
     TransferTest as TransferTest,
     Videos as Videos,
 )
@@ -138,6 +136,7 @@ from lyceum_warp.training.runs.folder import (
     load_value as load_value,
 )
 from lyceum_warp.training.runs.pretrained_runs import pretrained_run as pretrained_run
+from lyceum_warp.training.stopping import Minutes as Minutes, TargetReturn as TargetReturn
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
 from lyceum_warp.tuning.search import Tuning as Tuning, tune as tune
 from lyceum_warp.viewer.show import view as view

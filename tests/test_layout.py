@@ -140,7 +140,7 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"torch", "warp"} & set(loaded)
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
-    faces = {"lyceum_warp.support", "lyceum_warp.support.faces"}
+    faces = {"lyceum_warp.support", "lyceum_warp.support.collection", "lyceum_warp.support.faces"}
     rendering = {"lyceum_warp.viz", "lyceum_warp.viz.render"}
     messages = {"lyceum_warp.viewer.commands", "lyceum_warp.viewer.protocol"}
     assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *rendering, *faces, *window}
@@ -212,6 +212,21 @@ def test_importing_the_package_does_not_import_torch_warp_or_mujoco() -> None:
     program = """
         import sys, lyceum_warp
         print([name for name in ("torch", "warp", "mujoco", "numpy") if name in sys.modules])
+    """
+    assert in_new_process(program) == "[]\n"
+
+
+def test_help_lists_and_errors_of_the_command_line_do_not_import_torch_or_warp() -> None:
+    program = """
+        import contextlib, io, sys
+        from lyceum_warp import cli
+        out, err = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            for arguments in (["train", "--help"], ["train", "--help-all"], ["tasks"], ["train", "--itertions", "3"]):
+                with contextlib.suppress(SystemExit):
+                    cli.main(arguments)
+        assert "--learning-rate" in out.getvalue() and "hopper" in out.getvalue() and "--iterations" in err.getvalue()
+        print([name for name in ("torch", "warp") if name in sys.modules])
     """
     assert in_new_process(program) == "[]\n"
 

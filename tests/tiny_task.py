@@ -1,6 +1,11 @@
 """Define the source code of the shortest task. Tests change single lines of it."""
 
+from collections.abc import Iterable
 from pathlib import Path
+
+import pytest
+
+import lyceum_warp as lw
 
 TINY = """
 import warp as wp
@@ -33,11 +38,30 @@ def changed(*changes: tuple[str, str]) -> str:
     return source
 
 
-def with_function(function: str) -> str:
-    return changed(("class Tiny", f"@wp.func\n{function}\n\nclass Tiny"))
+def function(text: str) -> tuple[str, str]:
+    return "class Tiny", f"@wp.func\n{text}\n\nclass Tiny"
+
+
+def field(text: str) -> tuple[str, str]:
+    return "    qpos: Row[float]", f"    qpos: Row[float]\n    {text}"
+
+
+def attribute(text: str) -> tuple[str, str]:
+    return '    obs = {"x": 1}', f'    obs = {{"x": 1}}\n    {text}'
+
+
+def with_function(text: str) -> str:
+    return changed(function(text))
 
 
 def write(folder: Path, source: str, name: str = "tiny.py") -> Path:
     file = folder / name
     file.write_text(source)
     return file
+
+
+def check_mistake(folder: Path, changes: Iterable[tuple[str, str]], message: str) -> None:
+    """Check that the changed task raises an error with one line, which matches ``message``."""
+    with pytest.raises((ValueError, ImportError, FileNotFoundError), match=message) as caught:
+        lw.make(write(folder, changed(*changes)))
+    assert "\n" not in str(caught.value)

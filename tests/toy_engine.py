@@ -11,7 +11,7 @@ from lyceum_warp.core.fields import STATE_FIELDS, Field, Stage, state_columns
 from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.engines import Engine
 from lyceum_warp.kernels import faults, state
-from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds
+from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds, repeated
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
 
@@ -117,7 +117,7 @@ class ToyEngine(Engine):
         launch_worlds(faults.faults_of_rows, self.nworld, args, self.device)
 
     def reset(self, mask: wp.array) -> None:
-        launch_rows(state.fill_rows64, mask, self._initial, self._rows)
+        launch_rows(state.copy_rows64, mask, repeated(self._initial, self.nworld), self._rows)
         self._read_state_fields(mask)
 
     def _read_state_fields(self, mask: wp.array) -> None:

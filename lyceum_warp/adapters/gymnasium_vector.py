@@ -14,7 +14,8 @@ from lyceum_warp.adapters.adapted_env import environment_of, per_world
 from lyceum_warp.core import Space, Task
 from lyceum_warp.env import Env
 from lyceum_warp.support.arrays import torch_view
-from lyceum_warp.support.validate import check_tensor, described, whole_number
+from lyceum_warp.support.tensors import check_tensor
+from lyceum_warp.support.validate import described, whole_number
 from lyceum_warp.viz import CameraChoice, WorldPictures
 
 

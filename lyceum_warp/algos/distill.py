@@ -18,10 +18,10 @@ from torch import nn
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision
-from lyceum_warp.algos.common.networks import Activation, initialize_as_torch, trainable
+from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_sizes
 from lyceum_warp.algos.common.rollout_buffer import Rollout
@@ -323,7 +323,7 @@ class Distill(Learner):
         self._loss.zero_()
         for _ in range(self.config.epochs):
             self._epoch()
-        self._player.state = self._next_state.clone()
+        self._player.state.copy_(self._next_state)
         self.team.copy_leader(self.policy.parameters())
 
     def learn(self) -> None:
@@ -359,4 +359,4 @@ class Distill(Learner):
         self._epoch.forget()  # the graph contains the learning rate
         self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for player, memory in zip(self._remembering, state["memory"], strict=True):
-            player.state = memory[self.own_worlds].to(self.env.obs.device)
+            player.state.copy_(memory[self.own_worlds])

@@ -16,8 +16,8 @@ import torch
 
 from lyceum_warp.algos.common.dense import dense_policy, predict
 from lyceum_warp.algos.common.distributed import Team, unflatten
-from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
-from lyceum_warp.algos.common.networks import Activation, Normalizer
+from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
+from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered, pooled

@@ -16,10 +16,10 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
-from lyceum_warp.algos.common.distributed import Team, unflatten
-from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
+from lyceum_warp.algos.common.distributed import Branch, Captured, Team
+from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.common.networks import LIMIT, Activation
+from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
@@ -128,6 +128,9 @@ class PPOConfig:
     this has no effect if the task sets ``lw.Task.settle``."""
     tf32: bool = True
     """Whether matrix products on a GPU use TensorFloat-32."""
+    half: bool = True
+    """Whether networks on a GPU are updated in half precision, whose significand is as long as TensorFloat-32's. This
+    applies to the default networks with activation tanh, relu or elu, if tf32 is set."""
     mean_every: int = 20
     """Iterations between evaluations of the mean policy; 0 means no evaluations. A run with fewer iterations than
     ``mean_every`` has no best policy."""
@@ -250,9 +253,12 @@ class PPO(OnPolicyLearner):
         self._mirror, self._mirror_value = apply_symmetry(config.symmetry, env, self.policy, self.value.group)
         self._make_rollout(steps)
         self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
-        self._mean = torch.empty_like(self.rollout.action)
+        self._mean = torch.empty_like(env.action)
+        self._means = self.rollout.store_too(self._mean)
+        self._act = Captured(self._choose, team, device)
+        self._observe = Captured(self._update_normalizers, team, device)
         self._player = Player(self.policy, env)
-        self._first = self._player.state  # the policy's states before the rollout
+        self._first = torch.zeros_like(self._player.state)  # the policy's states before the rollout
         self._value_state = torch.zeros(env.nworld, self.value.state_size, device=device)
 
         # the update
@@ -260,14 +266,15 @@ class PPO(OnPolicyLearner):
         self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
         self.std.requires_grad_(log_std.requires_grad)
         acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
-        self._learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
-        self._parameters = [p for group in self._learned for p in group]
+        learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
+        self._parameters = [p for group in learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = Adam(self._parameters, self.rate, numbers=4)
         self._sums = self.optimizer.sums
-        for parameter, part in zip(self._parameters, unflatten(self.optimizer.gradient, self._parameters), strict=True):
-            parameter.grad = part  # for clip_grad_norm_
+        sizes = [sum(p.numel() for p in group) for group in learned]
+        self._gradients = self.optimizer.gradient.split(sizes)
+        self._branch = Branch(device)
         self._losses = torch.zeros(3, device=device)
         self._entropy_coef = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
@@ -284,7 +291,7 @@ class PPO(OnPolicyLearner):
     def __next__(self) -> PPOIteration:
         config, rollout, team = self.config, self.rollout, self.team
         timer = PhaseTimer(self.env.obs.device)
-        with precision(tf32=config.tf32 and self._cuda):
+        with precision(tf32=config.tf32 and self._cuda, half=config.half and config.tf32 and self._cuda):
             # 1. Collect samples.
             self.sample()
             self.env.update_shared(team.sum)
@@ -337,20 +344,28 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
+        rollout = self.rollout
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            noise = self.noise[:, self.own_worlds]
             rollout.begin()
-            self._first = self._player.state
-            for t in range(rollout.steps):
-                self._mean[t] = self._player(env.obs)
-                torch.addcmul(self._mean[t], noise[t], std, out=env.action)
+            self._first.copy_(self._player.state)
+            for _ in range(rollout.steps):
+                self._act()
                 rollout.store_inputs()
-                env.step()
+                self.env.step()
                 rollout.store_outputs()
-                self.policy.observe(env.obs, self.team, eps=_EPS)
-                self.value.observe(env.obs_groups[self.value.group], self.team, eps=_EPS)
+                self._observe()
+
+    @torch.no_grad()
+    def _choose(self) -> None:
+        """Draw actions from the policy."""
+        noise = self.noise.index_select(0, self.rollout.index)[0, self.own_worlds]
+        self._mean.copy_(self._player(self.env.obs))
+        torch.addcmul(self._mean, noise, self.policy.log_std.exp(), out=self.env.action)
+
+    def _update_normalizers(self) -> None:
+        self.policy.observe(self.env.obs, self.team, eps=_EPS)
+        self.value.observe(self.env.obs_groups[self.value.group], self.team, eps=_EPS)
 
     @torch.no_grad()
     def evaluated_samples(self) -> dict[str, torch.Tensor]:
@@ -374,8 +389,8 @@ class PPO(OnPolicyLearner):
             advantage = advantage / (variance.sqrt() + 1e-8)
         self._old_log_std.copy_(self.policy.log_std)
         samples = {
-            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._mean,
-            "log_prob": log_density(rollout.action, self._mean, self._old_log_std), "value": value, "target": target,
+            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
+            "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip
         return samples | {"state": self._first[None], "value_state": before[None]} if self._recurrent else samples
@@ -409,44 +424,57 @@ class PPO(OnPolicyLearner):
         old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
-        (mean, value), log_std = self._outputs(samples), self._log_std()
+        with self._branch:
+            value = self._value_of(samples)
+            error = (value - samples["target"]).square()
+            if config.clip_value_loss:
+                clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
+                error = torch.max(error, (clipped - samples["target"]).square())
+            value_loss = (weight * error).sum()
+        mean, log_std = self._mean_of(samples), self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
-        error = (value - samples["target"]).square()
-        if config.clip_value_loss:
-            clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
-            error = torch.max(error, (clipped - samples["target"]).square())
         entropy = (log_std + 0.5 * math.log(2 * math.pi * math.e)).sum()
-        losses = torch.stack([(weight * error).sum(), (weight * surrogate).sum(), weight.sum() * entropy])
+        surrogate_loss = (weight * surrogate).sum()
+        self._branch.join()
+        losses = torch.stack([value_loss, surrogate_loss, weight.sum() * entropy])
         loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
         if config.symmetry == "loss":
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
             loss = loss + config.symmetry_coef * (weight * (mean - image).square().mean(-1)).sum()
+        scale = float(self.minibatches.batch * self._length) if MLP.in_half else 1.0
         # backward() accumulates on the CUDA stream of its first call
-        gradients = torch.autograd.grad(loss, self._parameters)
+        gradients = torch.autograd.grad(scale * loss, self._parameters)
 
         with torch.no_grad():
             # an image's old mean is not the policy's: KL divergences of images would measure the policy's asymmetry
             kl = (kl_weight * divergence(old_mean, self._old_log_std, mean[: len(old_mean)], log_std)).sum()
             torch.cat([*(part.flatten() for part in gradients), kl[None], losses], out=self._sums)
+            self.optimizer.gradient /= scale
             self.team.sum(self._sums)
             if config.schedule == "adaptive":
                 self._adapt(self._sums[-4])
-            for parameters in self._learned:
-                nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+            for part in self._gradients:
+                part *= (config.max_grad_norm / (torch.linalg.vector_norm(part) + 1e-6)).clamp_max(1.0)
             self.optimizer.step()
             self._losses += self._sums[-3:]
 
-    def _outputs(self, samples: Samples) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the mean actions and the values of a mini-batch."""
-        obs, value_obs, step = samples["obs"], samples["value_obs"], samples["step"]
+    def _mean_of(self, samples: Samples) -> torch.Tensor:
+        """Compute the mean actions of a mini-batch."""
         if not self._recurrent:
-            return self.policy(obs), self.value(value_obs, step)
-        mean, _ = self.policy.unrolled(obs, samples["state"][0], step == 0.0)
-        value, _ = self.value.unrolled(value_obs, step, samples["value_state"][0], step == 0.0)
-        return mean, value
+            return self.policy(samples["obs"])
+        mean, _ = self.policy.unrolled(samples["obs"], samples["state"][0], samples["step"] == 0.0)
+        return mean
+
+    def _value_of(self, samples: Samples) -> torch.Tensor:
+        """Predict the values of a mini-batch."""
+        obs, step = samples["value_obs"], samples["step"]
+        if not self._recurrent:
+            return self.value(obs, step)
+        value, _ = self.value.unrolled(obs, step, samples["value_state"][0], step == 0.0)
+        return value
 
     def _with_images(self, samples: Samples) -> dict[str, torch.Tensor]:
         """Append the mirror images of samples; an image has the same density as its original."""
@@ -479,7 +507,7 @@ class PPO(OnPolicyLearner):
         """Compute the KL divergence from the old to the current policy, averaged over the samples."""
         rollout, policy = self.rollout, self.policy
         mean, _ = policy.unrolled(rollout.obs, self._first, rollout.step == 0.0)
-        kl = divergence(self._mean, self._old_log_std, mean, policy.log_std).mean()
+        kl = divergence(self._means, self._old_log_std, mean, policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
@@ -505,4 +533,5 @@ class PPO(OnPolicyLearner):
         self._recent.extend(state["recent"])
         if self._recurrent:
             parts = [part[self.own_worlds].to(self.env.obs.device) for part in state["memory"]]
-            self._player.state, self._value_state = parts
+            self._player.state.copy_(parts[0])
+            self._value_state = parts[1]

@@ -22,10 +22,10 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import LEAST, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision, room
-from lyceum_warp.algos.common.networks import Activation, trainable
+from lyceum_warp.algos.common.networks import trainable
 from lyceum_warp.algos.common.policy_check import check_sizes
 from lyceum_warp.algos.common.replay import Replay, Transitions, default_capacity
 from lyceum_warp.algos.common.rollout_buffer import Rollout

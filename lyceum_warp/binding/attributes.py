@@ -1,5 +1,6 @@
 """Check the attributes of a task's class, and the names of its functions and fields."""
 
+import itertools
 import math
 import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -56,6 +57,11 @@ def _new_names(source: TaskSource) -> Iterator[tuple[str, Collection[str], float
 
 
 def _problems(task: Any, source: TaskSource) -> Iterator[str]:
+    groups = _wrong_numbers, _wrong_names, _wrong_metrics, _wrong_actions
+    return itertools.chain.from_iterable(group(task, source) for group in groups)
+
+
+def _wrong_numbers(task: Any, source: TaskSource) -> Iterator[str]:
     for name, low in _LOWEST.items():
         value = getattr(task, name)
         if not isinstance(value, int) or value < low:
@@ -67,6 +73,9 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
             f"success_steps = {task.success_steps}, but an episode has {task.horizon} steps, so no episode can "
             "succeed: lower success_steps, or raise horizon"
         )
+
+
+def _wrong_names(task: Any, source: TaskSource) -> Iterator[str]:
     if unknown := [name for name in task.params if name not in source.params.vars]:
         yield f"params has {unknown[0]!r}, which is no field of Params: it has {', '.join(source.params.vars)}"
     for attribute in ("lagged", "cleared"):
@@ -76,6 +85,9 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
     twice = source.drawn_between_steps & source.writes["startup"]
     if both := [name for name in source.types if is_model_field(name) and name in twice]:
         yield f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"
+
+
+def _wrong_metrics(task: Any, source: TaskSource) -> Iterator[str]:
     metrics = source.terms.metrics
     for name in metrics:
         if not name.isprintable() or not set(name).isdisjoint(",'\""):
@@ -84,6 +96,9 @@ def _problems(task: Any, source: TaskSource) -> Iterator[str]:
             yield f"the metric {name!r} is named twice: give each one name"
     if source.functions["measure"] is not None and not task.metrics:
         yield f"{FUNCTIONS['measure'].signature} has no names for its metrics: add metrics = (...) to the class"
+
+
+def _wrong_actions(task: Any, source: TaskSource) -> Iterator[str]:
     if (bounds := task.action_range) is not None and not -math.inf < bounds[0] < bounds[1] < math.inf:
         yield f"action_range = {bounds!r} must be two finite numbers, lowest first, such as (-1.0, 1.0)"
     if task.actions is not None and not (isinstance(task.actions, Mapping) and task.actions):

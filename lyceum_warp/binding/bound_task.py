@@ -1,7 +1,8 @@
 """Bind a task to its model and its parameters, and make its kernels."""
 
+import contextlib
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,12 +64,8 @@ class BoundTask:
         self.spec = read_task_spec(task, model)
         """The model before ``edit_model``."""
         edited = models.edited(task, self.spec)
-        try:
+        with _file_in_errors(task.model if model is None else model):
             self.model = models.compile_model(edited, data_fields, physics, varied={*model_fields, *dynamics})
-        except ValueError as error:
-            origin: Any = task.model if model is None else model
-            file = origin if isinstance(origin, str | Path) else getattr(origin, "file", None)
-            raise ValueError(f"{file or 'the model'}: {error}") from error
         if physics.timestep is not None or physics.integrator is not None:
             models.warn_of_unstable_servos(self.model)
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
@@ -85,7 +82,13 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*data_fields, "time", "ctrl"])
         ]
-        drawn = source.drawn_between_steps
+        self._describe_model_fields(model_fields, dynamics)
+        self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
+        self.layouts = layouts_of(source, self.params)
+        self.kernels = kernels_of(source, self.layouts)
+
+    def _describe_model_fields(self, model_fields: Collection[str], dynamics: Collection[str]) -> None:
+        drawn = self.source.drawn_between_steps
         self.reset_dynamics = [name for name in model_fields if name in drawn]
         """The model fields that resets or events write. A reset first restores their nominal values."""
         varied = drawn | self.writes["startup"] | frozenset(dynamics)
@@ -104,10 +107,6 @@ class BoundTask:
                 f"World.{stale[0]} stays the same when a world changes {bases[0]!r}: read the fields from which MuJoCo "
                 f"computes {stale[0]}"
             )
-
-        self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
-        self.layouts = layouts_of(source, self.params)
-        self.kernels = kernels_of(source, self.layouts)
 
     @functools.cached_property
     def name(self) -> str:
@@ -159,6 +158,16 @@ class BoundTask:
         data = is_data_field(name)
         field = describe(self.model, name) if data else describe_model_field(self.model, name, varies=False)
         return f"{name}: {_spelled(field.dtype, len(field.shape))}"
+
+
+@contextlib.contextmanager
+def _file_in_errors(model: Any) -> Iterator[None]:
+    """Put the file of a model in front of a ValueError."""
+    try:
+        yield
+    except ValueError as error:
+        file = model if isinstance(model, str | Path) else getattr(model, "file", None)
+        raise ValueError(f"{file or 'the model'}: {error}") from error
 
 
 def _spelled(dtype: Any, ndim: int) -> str:

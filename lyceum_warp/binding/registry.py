@@ -22,6 +22,7 @@ from typing import Any
 from lyceum_warp.binding.local_modules import importable, local_modules
 from lyceum_warp.binding.opened_files import Stamps, data_files, stamps
 from lyceum_warp.core.task import Task
+from lyceum_warp.support.collection import without_collection
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.suggestions import did_you_mean
 
@@ -86,7 +87,7 @@ def _package_modules() -> dict[str, str]:
         for module in pkgutil.iter_modules([str(folder)]):
             if module.ispkg:
                 tasks = importlib.import_module(f"{_PACKAGE}{module.name}").TASKS
-                found |= {task: f"{_PACKAGE}{module.name}.{file}" for task, file in tasks.items()}
+                found |= {task: f"{_PACKAGE}{module.name}.{file}" for file, names in tasks.items() for task in names}
             else:
                 found[module.name] = f"{_PACKAGE}{module.name}"
     return found
@@ -154,7 +155,8 @@ def find_task(task: str | Path | type[Task]) -> type[Task]:
     if path.endswith(".py"):
         return _task_of_file(Path(path), attribute)
     if task not in _tasks and (module := _package_modules().get(task)) is not None:
-        importlib.import_module(module)
+        with without_collection():
+            importlib.import_module(module)
     if task in _tasks:
         source_files(_tasks[task])
         return _tasks[task]

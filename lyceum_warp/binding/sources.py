@@ -28,8 +28,10 @@ class FunctionSource:
         self.file = Path(adj.filename).name
         self._first_line: int = adj.fun_lineno
         self.scope = _scope(function.func)
+        nodes = list(ast.walk(self.tree))
+        self.has_loops = any(isinstance(node, ast.For | ast.While) for node in nodes)
         self.locals = {argument.arg for argument in self.tree.args.args} | {
-            node.id for node in ast.walk(self.tree) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+            node.id for node in nodes if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
         }
 
     def place(self, node: ast.AST) -> str:

@@ -168,8 +168,8 @@ class _Reader:
         self.trace, self.source = found, source_of(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
-        # read everything twice: in a loop, a local struct may be used before the line that puts a row into it
-        for _ in range(2):
+        # read loops twice: a local struct may be used before the line that puts a row into it
+        for _ in range(2 if self.source.has_loops else 1):
             for statement in self.source.tree.body:
                 self._read(statement)
 
@@ -188,9 +188,9 @@ class _Reader:
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
-            named = isinstance(node.value, ast.Name)
-            owner = self.places.get(ast.unparse(node.value)) if named else self._read(node.value)
-            return owner.attribute(node.attr) if owner else self.places.get(ast.unparse(node))
+            local = node.value.id if isinstance(node.value, ast.Name) else None
+            owner = self._read(node.value) if local is None else self.places.get(local)
+            return owner.attribute(node.attr) if owner else self.places.get(f"{local}.{node.attr}")
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)

@@ -12,17 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp.algos import (
-    EXACT,
-    Demonstrations,
-    Learner,
-    SquashedPolicy,
-    Team,
-    evaluation_seed,
-    evaluation_worlds,
-    join,
-)
-from lyceum_warp.binding import file_name, find_task, task_name, task_names
+from lyceum_warp import algos, binding, controllers, core, engines, training, viz  # each name loads at its first use
 from lyceum_warp.cli.arguments import (
     CameraWords,
     EnvFlags,
@@ -32,36 +22,17 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
-from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.controllers import load_episodes
-from lyceum_warp.core import EnvOptions, PhysicsOptions, Training
-from lyceum_warp.engines import options_on_cores
+from lyceum_warp.cli.display import console, curve_table, note, say, tried
+from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.training import (
-    ALGORITHMS,
-    EPISODES,
-    Callback,
-    Configuration,
-    Minutes,
-    PassGate,
-    Run,
-    TargetReturn,
-    TensorBoard,
-    TransferTest,
-    Videos,
-    choose_policy,
-    learning_curve,
-    load,
-    note_changes,
-    pretrained_run,
-    pretrained_tasks,
-    read_checkpoint,
-    saved_networks,
-    train,
-)
-from lyceum_warp.viz import find_camera, parsed_camera, policy_video
+from lyceum_warp.support.outlines import outline
+
+_CONFIGS = {
+    name.removesuffix("Config").lower(): outline("lyceum_warp.algos", name)
+    for name in ("NPGConfig", "PPOConfig", "SACConfig", "DistillConfig")
+}
+"""The hyperparameters of each of ``training.ALGORITHMS``. Their own classes come with torch."""
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
              "gate_every": 0, "exact_from": None}  # fmt: skip
@@ -77,7 +48,7 @@ _RUN_FLAGS = {
 def _default_texts() -> dict[str, str]:
     """List the algorithms that have a hyperparameter, with their defaults."""
     texts: dict[str, list[str]] = {}
-    for algorithm, (_, config) in ALGORITHMS.items():
+    for algorithm, config in _CONFIGS.items():
         for field in dataclasses.fields(config):
             default = getattr(config, field.name)
             text = " ".join(map(str, default)) if isinstance(default, tuple) else "" if default is None else default
@@ -85,16 +56,16 @@ def _default_texts() -> dict[str, str]:
     return {name: f"({', '.join(each)})" for name, each in texts.items()}
 
 
-class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.values()], defaults=_default_texts()):
+class Hyperparameters(OptionFlags, options=[*_CONFIGS.values()], defaults=_default_texts()):
     """Hyperparameters. For each flag, the help lists the algorithms that have the flag, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""
-        if algorithm not in ALGORITHMS:
-            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
+        if algorithm not in _CONFIGS:
+            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(_CONFIGS)}")
         flags = given(self)
         owners = {
-            name: [key for key, (_, kind) in ALGORITHMS.items() if name in kind.__dataclass_fields__] for name in flags
+            name: [key for key, config in _CONFIGS.items() if name in config.__dataclass_fields__] for name in flags
         }
         for name, algorithms in owners.items():
             if algorithm not in algorithms:
@@ -102,7 +73,7 @@ class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.v
                     f"--{name.replace('_', '-')} is a setting of {' or '.join(algorithms)}, not of {algorithm}: "
                     f"omit it, or give --algorithm {' or '.join(algorithms)}"
                 )
-        return dataclasses.replace(config or ALGORITHMS[algorithm][1](), **flags)
+        return dataclasses.replace(config or training.ALGORITHMS[algorithm][1](), **flags)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -208,6 +179,9 @@ class Train:
     """
     take_over: bool = False
     """Continue a run that another process has locked, on this or another host. That process ends at its next write."""
+    evaluate: bool = False
+    """Whether to evaluate the last and the best policy in 32 new episodes at the end, under exact physics on the C
+    engine. --video and --require-return do so, too."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: float | None = None
@@ -219,23 +193,23 @@ class Train:
     def run(self) -> int:
         self._check_flags()
         folder = self.resume or self.from_run
-        source = None if folder is None else Run.open(folder)
+        source = None if folder is None else training.Run.open(folder)
         settings = self._settings({} if source is None else source.config)
-        camera = parsed_camera(self.camera)
+        camera = viz.parsed_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
-        with join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
+        with algos.join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
             if not team.leads:  # only one process prints messages
                 logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
             with team.together():  # check all options before the folder is created
                 configuration = self.configuration(source, team)
                 learner, folder, entries = self._learner(configuration, source, team)
-                find_camera(learner.env.model, camera)
+                viz.find_camera(learner.env.model, camera)
                 callbacks = self._callbacks(settings)
             total = configuration.iterations
             hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
             try:
-                run = train(
+                run = training.train(
                     learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
                     **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
                     take_over=self.take_over, entries=settings | entries,
@@ -255,7 +229,7 @@ class Train:
                 if getattr(self, name) is not None:
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and not self.task:
-            raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
+            raise ValueError(f"train needs a task: one of {', '.join(binding.task_names())}, or path/to/file.py")
         if self.take_over and self.resume is None:
             raise ValueError("--take-over has no effect without --resume: omit it")
 
@@ -271,14 +245,14 @@ class Train:
         return settings
 
     def _say_interrupted(self, folder: Path, signalled: Interrupted, total: int, hint: str) -> None:
-        done = read_checkpoint(folder / "policy.pt", parts=("iteration",))["iteration"]
+        done = training.read_checkpoint(folder / "policy.pt", parts=("iteration",))["iteration"]
         name = signal.Signals(signalled.number).name
         say(f"interrupted by {name} after {done} of {total} iterations{f'; {hint}' if done < total else ''}")
         if self.plot and (folder / "metrics.csv").exists():
             with obeyed():
-                say(f"curve:      {tried(learning_curve, folder)}")
+                say(f"curve:      {tried(training.learning_curve, folder)}")
 
-    def _say_end(self, run: Run, iteration: int, total: int, hint: str) -> None:
+    def _say_end(self, run: "training.Run", iteration: int, total: int, hint: str) -> None:
         """Say why the run has ended before its last iteration."""
         reached, passed = run.config.get("reached", {}), run.config.get("passed")
         if passed is not None:
@@ -290,28 +264,30 @@ class Train:
         elif iteration < total and self.minutes is not None:
             say(f"stopped after {iteration} of {total} iterations: the limit is {self.minutes:g} minutes; {hint}")
 
-    def _callbacks(self, settings: Mapping[str, Any]) -> list[Callback]:
+    def _callbacks(self, settings: Mapping[str, Any]) -> "list[training.Callback]":
+        from lyceum_warp.cli.progress import Display  # its base class comes with torch
+
         display = Display(console)
-        callbacks: list[Callback] = [display]
+        callbacks: list[training.Callback] = [display]
         if settings["target_return"] is not None:
-            callbacks.insert(0, TargetReturn(settings["target_return"]))
+            callbacks.insert(0, training.TargetReturn(settings["target_return"]))
         if settings["tensorboard"]:
-            callbacks.append(TensorBoard())
+            callbacks.append(training.TensorBoard())
         if every := settings["video_every"]:
-            callbacks.append(Videos(every, camera=parsed_camera(self.camera), progress=display.work))
+            callbacks.append(training.Videos(every, camera=viz.parsed_camera(self.camera), progress=display.work))
         if every := settings["gate_every"]:
-            callbacks.append(PassGate(every))
+            callbacks.append(training.PassGate(every))
         if self.transfer:
-            callbacks.append(TransferTest(progress=display.work))
+            callbacks.append(training.TransferTest(progress=display.work))
         if self.minutes is not None:
-            callbacks.append(Minutes(self.minutes))
+            callbacks.append(training.Minutes(self.minutes))
         return callbacks
 
-    def configuration(self, source: Run | None, team: Team) -> Configuration:
+    def configuration(self, source: "training.Run | None", team: "algos.Team") -> "training.Configuration":
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
-        base = self._suggestion(team) if source is None else Configuration.of(source)
+        base = self._suggestion(team) if source is None else training.Configuration.of(source)
         algorithm = self.algorithm or base.algorithm
-        if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
+        if source is not None and self.algorithm is None and algorithm not in training.ALGORITHMS:
             raise ValueError(
                 f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: resume "
                 "it in Python by lw.train(learner, lw.Run.open(folder), ...), or begin a new run from its policy by "
@@ -321,7 +297,7 @@ class Train:
         if "solver" in options:
             options["solver"] = {**(base.options.physics.solver or {}), **options["solver"]}
         params = parameters(self.param)
-        if source is None or self.task is None or task_name(find_task(self.task)) == source.task_name:
+        if source is None or self.task is None or binding.task_name(binding.find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
         return dataclasses.replace(
@@ -334,45 +310,46 @@ class Train:
             seed=base.seed if self.seed is None else None,
         )
 
-    def _suggestion(self, team: Team) -> Configuration:
+    def _suggestion(self, team: "algos.Team") -> "training.Configuration":
         """Return the configuration that the task suggests."""
-        training = self._training()
+        suggested, hyperparameters = self._training(), None
         try:
-            hyperparameters = ALGORITHMS[training.algorithm][1](**training.settings) if training.settings else None
+            if suggested.settings:
+                hyperparameters = training.ALGORITHMS[suggested.algorithm][1](**suggested.settings)
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"the task {self.task} has an invalid attribute 'training': {error}") from error
-        few = 8 if training.algorithm == "sac" else 64  # SAC makes an update for each step of each world
+        few = 8 if suggested.algorithm == "sac" else 64  # SAC makes an update for each step of each world
         nworld = 4096 * team.size if (self.env.device or "cpu").startswith("cuda") else few
-        return Configuration(
+        return training.Configuration(
             task=self.task,
-            options=EnvOptions(nworld=nworld, device="cpu", physics=PhysicsOptions(base=training.physics)),
-            algorithm=training.algorithm,
+            options=EnvOptions(nworld=nworld, device="cpu", physics=PhysicsOptions(base=suggested.physics)),
+            algorithm=suggested.algorithm,
             hyperparameters=hyperparameters,
-            iterations=training.iterations,
+            iterations=suggested.iterations,
         )
 
-    def _training(self) -> Training:
+    def _training(self) -> "core.Training":
         """Return the task's suggestions, or the defaults if a flag chooses another algorithm."""
         assert self.task is not None
-        training = find_task(self.task).training
-        return training if self.algorithm in (None, training.algorithm) else Training(algorithm=self.algorithm)
+        suggested = binding.find_task(self.task).training
+        return suggested if self.algorithm in (None, suggested.algorithm) else core.Training(algorithm=self.algorithm)
 
     def _given(self, *names: str) -> dict[str, Any]:
         return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def _learner(
-        self, configuration: Configuration, source: Run | None, team: Team
-    ) -> tuple[Learner, Path, dict[str, Any]]:
+        self, configuration: "training.Configuration", source: "training.Run | None", team: "algos.Team"
+    ) -> "tuple[algos.Learner, Path, dict[str, Any]]":
         """Make the learner, the run's folder, and additional entries for config.json."""
         if self.out is not None and team.leads:
-            Run.check_free(self.out)
+            training.Run.check_free(self.out)
         policy = value = None
         entries: dict[str, Any] = {}
         teacher, parts = self._teacher(configuration.algorithm, source)
         if source is not None:
-            policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
+            policy, value, iteration = training.saved_networks(source, self.which if self.resume is None else None)
             algorithm = configuration.algorithm
-            if policy is not None and isinstance(policy, SquashedPolicy) != (algorithm == "sac"):
+            if policy is not None and isinstance(policy, algos.SquashedPolicy) != (algorithm == "sac"):
                 raise ValueError(
                     f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit "
                     f"{algorithm}: omit --algorithm {algorithm}"
@@ -398,11 +375,11 @@ class Train:
                         f"--{name.replace('_', '-')}"
                     )
         if source is not None and self.task is None and self.resume is None:
-            note_changes(source, learner.env)
-        name = f"{file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
+            training.note_changes(source, learner.env)
+        name = f"{binding.file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
         return learner, self.resume or self.out or Path("runs", name), entries
 
-    def _teacher(self, algorithm: str, source: Run | None) -> tuple[Any, Mapping[str, slice] | None]:
+    def _teacher(self, algorithm: str, source: "training.Run | None") -> "tuple[Any, Mapping[str, slice] | None]":
         """Load what distill imitates, and the parts of its observations if they are to be checked."""
         if self.teacher is not None and self.demonstrations is not None:
             raise ValueError("--teacher and --demonstrations are two teachers: omit one of them")
@@ -411,44 +388,57 @@ class Train:
                 raise ValueError("--teacher and --demonstrations need --algorithm distill")
             return None, None
         if self.demonstrations is not None:
-            episodes = list(load_episodes(self.demonstrations).values())
-            return Demonstrations(episodes), {name: slice(*place) for name, place in episodes[0].obs_parts.items()}
+            episodes = list(controllers.load_episodes(self.demonstrations).values())
+            return algos.Demonstrations(episodes), {
+                name: slice(*place) for name, place in episodes[0].obs_parts.items()
+            }
         if self.teacher is None:
             if source is None or not source.teacher.is_file():
                 raise ValueError("distill needs a teacher: give --teacher RUN, or --demonstrations FILE...")
-            return load(source.teacher), None
-        path = Path(self.teacher)
-        if not path.exists() and self.teacher in pretrained_tasks():
-            path = pretrained_run(self.teacher)
-        run = Run.open(path.parent if path.is_file() else path)
-        return load(path), run_worlds(run, options_on_cores(), {}, nworld=1).obs_space.parts
+            return training.load(source.teacher), None
+        from lyceum_warp.cli.evaluate import run_worlds
 
-    def _report(self, run: Run, learner: Learner) -> int:
-        env = learner.env
+        path = Path(self.teacher)
+        if not path.exists() and self.teacher in training.pretrained_tasks():
+            path = training.pretrained_run(self.teacher)
+        run = training.Run.open(path.parent if path.is_file() else path)
+        return training.load(path), run_worlds(run, engines.options_on_cores(), {}, nworld=1).obs_space.parts
+
+    def _report(self, run: "training.Run", learner: "algos.Learner") -> int:
+        env, choice = learner.env, None
         console.print(curve_table(run.rows()))
-        judge = functools.partial(evaluation_worlds, env, EPISODES, **options_on_cores(), physics=EXACT)
-        with LongWork("evaluating the mean policy", "steps", console) as work:
-            choice = choose_policy(run, judge, progress=work)
-        score = choice.score
-        say(f"mean policy, {EPISODES} new episodes on the C engine, exact physics: "
-            f"return {score.mean:.1f} ± {score.std:.1f} ({score.low:.1f} to {score.high:.1f})")  # fmt: skip
-        if len(choice.scores) > 1:
-            say(choice.text)
+        if self.evaluate or self.video or self.require_return is not None:
+            choice = self._choice(run, learner)
         paths = {"checkpoint": str(run.checkpoint), "metrics": str(run.metrics)}
         if run.best.is_file():
             paths["best"] = str(run.best)
         if run.transfer.is_file():
             say(f"transfer: {json.loads(run.transfer.read_text())['line']}")
         if self.plot:
-            paths["curve"] = tried(learning_curve, run)
-        if self.video:
-            camera, path = parsed_camera(self.camera), run.folder / "video.mp4"
-            policy, seed = load(run, which=choice.which), evaluation_seed(env.options.seed + 1)
-            paths["video"] = tried(policy_video, env, policy, path, seed, camera=camera)
+            paths["curve"] = tried(training.learning_curve, run)
+        if self.video and choice is not None:
+            camera, path = viz.parsed_camera(self.camera), run.folder / "video.mp4"
+            policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
+            paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
         for name, place in paths.items():
             say(f"{name + ':':<12}{place}")
-        if self.require_return is not None and not score.mean > self.require_return:
+        if choice is None:
+            say(f"{'evaluate:':<12}lyceum-warp eval {run.folder}")
+        elif self.require_return is not None and not choice.score.mean > self.require_return:
             demand = f"--require-return demands more than {self.require_return:g}"
-            note(f"the {choice.which} policy returns {score.mean:.1f}; {demand}")
+            note(f"the {choice.which} policy returns {choice.score.mean:.1f}; {demand}")
             return 1
         return 0
+
+    def _choice(self, run: "training.Run", learner: "algos.Learner") -> "training.Choice":
+        """Evaluate the last and the best policy, and print the better one's returns."""
+        options = {**engines.options_on_cores(), "physics": algos.EXACT}
+        judge = functools.partial(algos.evaluation_worlds, learner.env, training.EPISODES, **options)
+        with LongWork("evaluating the mean policy", "steps", console) as work:
+            choice = training.choose_policy(run, judge, progress=work)
+        score = choice.score
+        say(f"mean policy, {training.EPISODES} new episodes on the C engine, exact physics: "
+            f"return {score.mean:.1f} ± {score.std:.1f} ({score.low:.1f} to {score.high:.1f})")  # fmt: skip
+        if len(choice.scores) > 1:
+            say(choice.text)
+        return choice

@@ -15,7 +15,7 @@ from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.controllers import episode_env, load_episodes
 from lyceum_warp.core import EnvOptions
-from lyceum_warp.env import Env, start_episodes
+from lyceum_warp.env import Env, Policy, start_episodes
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.training import AUTO, Run, load, load_curriculum, pretrained_run, pretrained_text, runs_in
 from lyceum_warp.viewer import Follower, Watcher, view
@@ -92,28 +92,16 @@ class View:
         page: dict[str, Any] = {"paused": self.paused, "host": self.host, "port": self.port}
         params = parameters(self.param)
         if kind == "episodes":
-            files = load_episodes(self.what)
-            names = [file.name for file in files]
-            unique = len(set(names)) == len(names)
-            episodes = dict(zip(names if unique else map(str, files), files.values(), strict=True))
-            view(episode_env(files, task=self.task, **params), episodes=episodes, **page)
+            self._play(params, page)
             return 0
         options = given(self.place) | given(self.physics)
         controllers: dict[str, Any] = {}
         watchers: list[Watcher] = []
         if kind == "run":
-            if self.follow and self.which not in (AUTO, "last"):
-                raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
             run = Run.open(self.what[0])
-            nworld = 16 if self.nworld is None else self.nworld
-            env = run_worlds(run, options, params, nworld=nworld, task=self.task)
-            which = "last" if self.follow else better_policy(run, self.which, task=self.task)
-            policy = load(run, which=which, device=env.obs.device)
-            check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
-            start_episodes(env, self.seed, None if self.task else load_curriculum(run, which=which))
-            controllers["policy"] = policy
+            env, controllers["policy"] = self._policy(run, options, params)
             if self.follow:
-                watchers.append(Follower(run, policy))
+                watchers.append(Follower(run, controllers["policy"]))
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
             env = Env(self.what[0], EnvOptions(autoreset=False, nthread=1), params)
         else:
@@ -125,6 +113,24 @@ class View:
             controllers["mppi"] = MPPI(env.task.definition, config, seed=self.seed, params=env.given_params, **options)
         view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **page)
         return 0
+
+    def _play(self, params: dict[str, Any], page: dict[str, Any]) -> None:
+        files = load_episodes(self.what)
+        names = [file.name for file in files]
+        unique = len(set(names)) == len(names)
+        episodes = dict(zip(names if unique else map(str, files), files.values(), strict=True))
+        view(episode_env(files, task=self.task, **params), episodes=episodes, **page)
+
+    def _policy(self, run: Run, options: dict[str, Any], params: dict[str, Any]) -> tuple[Env, Policy]:
+        """Return a run's worlds in their first states, and its policy."""
+        if self.follow and self.which not in (AUTO, "last"):
+            raise ValueError(f"--follow shows the newest policy, not {self.which!r}: omit --follow or --which")
+        env = run_worlds(run, options, params, nworld=16 if self.nworld is None else self.nworld, task=self.task)
+        which = "last" if self.follow else better_policy(run, self.which, task=self.task)
+        policy = load(run, which=which, device=env.obs.device)
+        check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+        start_episodes(env, self.seed, None if self.task else load_curriculum(run, which=which))
+        return env, policy
 
 
 def _kind(what: tuple[str, ...]) -> str:

@@ -24,21 +24,10 @@ class Stage(enum.IntEnum):
     ACCELERATION = 3
 
 
-STATE_FIELDS = {
-    "time": mujoco.mjtState.mjSTATE_TIME,
-    "qpos": mujoco.mjtState.mjSTATE_QPOS,
-    "qvel": mujoco.mjtState.mjSTATE_QVEL,
-    "act": mujoco.mjtState.mjSTATE_ACT,
-    "history": mujoco.mjtState.mjSTATE_HISTORY,
-    "plastic": mujoco.mjtState.mjSTATE_PLASTIC,
-    "qacc_warmstart": mujoco.mjtState.mjSTATE_WARMSTART,
-    "ctrl": mujoco.mjtState.mjSTATE_CTRL,
-    "qfrc_applied": mujoco.mjtState.mjSTATE_QFRC_APPLIED,
-    "xfrc_applied": mujoco.mjtState.mjSTATE_XFRC_APPLIED,
-    "eq_active": mujoco.mjtState.mjSTATE_EQ_ACTIVE,
-    "mocap_pos": mujoco.mjtState.mjSTATE_MOCAP_POS,
-    "mocap_quat": mujoco.mjtState.mjSTATE_MOCAP_QUAT,
-    "userdata": mujoco.mjtState.mjSTATE_USERDATA,
+STATE_FIELDS: dict[str, mujoco.mjtState] = {
+    name: getattr(mujoco.mjtState, f"mjSTATE_{name.removeprefix('qacc_').upper()}")
+    for name in "time qpos qvel act history plastic qacc_warmstart ctrl qfrc_applied xfrc_applied eq_active mocap_pos "
+    "mocap_quat userdata".split()
 }
 """Fields of the integration state, each with its mjtState component."""
 

@@ -44,6 +44,8 @@ class ModelFile:
     """Function that returns two paths: the models' folder, and the file relative to this folder."""
     install: str = ""
     """The requirement for pip, such as "lyceum-warp[hand]", if a package has the file."""
+    packages: tuple[str, ...] = ()
+    """Names in Python of the packages that may have the file. One of them suffices."""
 
     def path(self) -> Path:
         """The path of the file.
@@ -83,7 +85,8 @@ def _package_folder(package: str) -> Path | None:
 
 def _in_package(file: str, package: str, within: str, install: str, before_python: str | None = None) -> ModelFile:
     source = package.replace("_", "-")
-    return ModelFile(file, source, partial(_package_place, file, package, within, install, before_python), install)
+    place = partial(_package_place, file, package, within, install, before_python)
+    return ModelFile(file, source, place, install, (package,))
 
 
 def _package_place(file: str, package: str, within: str, install: str, before_python: str | None) -> tuple[Path, str]:
@@ -195,7 +198,7 @@ def playground_model(file: str) -> ModelFile:
     The extra "menagerie" installs the scenes.
     """
     install = "lyceum-warp[menagerie]"
-    return ModelFile(file, "MuJoCo Playground", partial(_playground_place, file, install), install)
+    return ModelFile(file, "MuJoCo Playground", partial(_playground_place, file, install), install, _ASSETS)
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -15,7 +15,7 @@ from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
 from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, zeros_of
-from lyceum_warp.support.validate import check_tensor
+from lyceum_warp.support.tensors import check_tensor
 
 
 def own_bytes_per_world(task: BoundTask) -> int:
@@ -62,12 +62,14 @@ class WorldArrays:
             wp.zeros((n, sum(sizes(self.task.layouts.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
         )
-        self.metric_sums = wp.zeros((n, len(self.task.metrics)), dtype=float)
-        self.success_counts = wp.zeros((n, int(task.success_steps > 1)), dtype=float)
-        """Number of consecutive successes, (nworld, 1), or (nworld, 0) if ``success_steps`` is 1."""
-        own = ("memory", "lasting_memory", "metric_sums", "success_counts")
-        self._clearable = {name: getattr(self, name) for name in own}
-        self._clearable |= {name: flat(self.engine.arrays[name]) for name in task.cleared}
+        counts = {"success_count": (n, int(task.success_steps > 1)), "metric_sum": (n, len(self.task.metrics))}
+        self.episodes = zeros_of(step_types.Episodes, n, fault_count=(n, int(FAULTS).bit_length()), **counts)
+        self.episodes.success_steps = task.success_steps
+        self._clearable = {
+            "memory": self.memory, "lasting_memory": self.lasting_memory, "metrics": self.episodes.metric_sum,
+            "success_steps": self.episodes.success_count,
+            **{name: flat(self.engine.arrays[name]) for name in task.cleared},
+        }  # fmt: skip
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
         self.transition = kernels.Transition()
         """The arrays of the last step, which the kernels of the task use."""
@@ -143,14 +145,13 @@ class WorldArrays:
         self.transition.counters = self.counters
         self._seed = wp.zeros(1, dtype=int)
         self._action_fault, self._no_fault, self._judged = (wp.zeros(n, dtype=int) for _ in range(3))
-        self.fault_count = wp.zeros((n, int(FAULTS).bit_length()), dtype=int)
 
     def _allocate_masks(self) -> None:
         n = self.nworld
         self.everyone = wp.full(n, True, dtype=bool)
         self.mask = wp.zeros(n, dtype=bool)
         """Worlds that the next reset or restore changes."""
-        self.restarting = wp.zeros(n, dtype=bool)
+        self.restarting = self.episodes.restart
         """Worlds whose episode ended in the last step."""
         self._rejected = wp.zeros(n, dtype=bool)
         self._physics_changed = wp.zeros(n, dtype=bool)
@@ -174,8 +175,7 @@ class WorldArrays:
         """Write the state of every world into ``state``. Its part ``done_reason`` is taken from ``ended``."""
         size = self.engine.state_size
         self.engine.get_state(self.state[:, :size])
-        own = self.counters
-        counters = [own.step, own.key, own.episode, ended, self.state[:, size:]]
+        counters = [self.counters, ended, self.state[:, size:]]
         wp.launch(state.pack_counters, self.nworld, counters, device=self.device)
         for array, columns in self._own_parts():
             launch_rows(state.widen, self.everyone, array, columns)
@@ -189,12 +189,10 @@ class WorldArrays:
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         columns = memory_columns(self.task, self.state_space)
         columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
-        arrays = {"metrics": self.metric_sums, "success_steps": self.success_counts}
         for name, place in columns.items():
-            yield arrays[name] if name in arrays else getattr(self, name), self.state[:, place]
+            yield self._clearable[name], self.state[:, place]
 
     def restore_counters(self, mask: wp.array, columns: wp.array) -> None:
         """Set the selected worlds' counters from ``columns``, the state's columns after those of the engine."""
-        own = self.counters
-        counters = [mask, columns, own.step, own.key, own.episode, self.outcome.done_reason]
+        counters = [mask, columns, self.counters, self.outcome.done_reason]
         wp.launch(state.unpack_counters, self.nworld, counters, device=self.device)

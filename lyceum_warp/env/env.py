@@ -30,10 +30,12 @@ from lyceum_warp.env.worlds import Worlds
 from lyceum_warp.graphs.compilation import compile_ahead
 from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.collection import without_collection
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.suggestions import Named, did_you_mean
-from lyceum_warp.support.validate import check_group, check_kind, check_tensor, whole_number
+from lyceum_warp.support.tensors import check_tensor
+from lyceum_warp.support.validate import check_group, check_kind, whole_number
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
@@ -187,7 +189,7 @@ class Env:
         task, options, params = find_task(task), options or EnvOptions(), dict(params or {})
         self._given_params = params
         self._scratch: Env | None = None
-        with errors_of(task):
+        with errors_of(task), without_collection():
             self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
             self.nworld = options.nworld
             self.task = BoundTask(
@@ -643,7 +645,7 @@ class Env:
     @property
     def fault_counts(self) -> dict[str, int]:
         """Count the faults of each kind since construction. This waits for the device."""
-        counts = self.worlds.fault_count.numpy().sum(axis=0)
+        counts = self.worlds.episodes.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
 
 

@@ -91,7 +91,6 @@ class OpenLoop:
         self._keys, self._models = keys, dict(models or {})
         for name, row in (env.engine.nominal if nominal_model else {}).items():
             self._models.setdefault(name, wp.array(flat(row).numpy(), dtype=wp.float64, device=env.device))
-        rows = self.horizon * n
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         length = f"horizon {self.horizon} with frame_skip {task.frame_skip}"
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=length)
@@ -99,35 +98,14 @@ class OpenLoop:
             self._state = wp.zeros((states, env.state_space.size), dtype=wp.float64)
             self._actions = wp.zeros((self.horizon, n, nact), dtype=float)
             self._controls = wp.zeros((self.horizon, n, 0 if stepwise else task.model.nu), dtype=float)
-            self._reward = wp.zeros(rows, dtype=float)
-            self._terminated = wp.zeros(rows, dtype=bool)
+            self._reward = wp.zeros(self.horizon * n, dtype=float)
+            self._terminated = wp.zeros(self.horizon * n, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
             shapes = {group: (n, space.size) for group, space in env.obs_spaces.items()}
             self._obs = zeros_of(task.kernels.Observations, **shapes)
             self._finite = wp.zeros((len(env.obs_spaces), n), dtype=bool)
-            self._no_memory = wp.zeros((rows + n, 0), dtype=float)
-            # for each field, the rows before and after the steps, and the last rows, are views of one buffer
-            self._fields: dict[str, wp.array] = {}
-            self._rows, self._last = task.kernels.Transition(), task.kernels.Transition()
-            self._rows.action = self._actions.reshape((-1, nact))
-            self._rows.counters = self._last.counters = self.worlds.counters
-            batches = (self._rows.before, self._rows.after, self._last.after)
-            if task.layouts.shared:
-                for batch in batches:
-                    batch.shared = self.worlds.shared
-            constant = {f.name: shared_rows(f.value(task.model), f.dtype, rows + n, env.device) for f in task.constants}
-            for name in task.types:
-                live = getattr(self.worlds.after, name)
-                buffer = constant.get(name)
-                if buffer is None:
-                    buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
-                    self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
-                for batch, start in zip(batches, (0, n, rows), strict=True):
-                    # Warp cannot slice an array without elements
-                    part = buffer[start : min(start + rows, rows + n)] if buffer.size else with_memory(buffer)
-                    setattr(batch, name, part)
-        self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
-        self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}
+            self._no_memory = wp.zeros(((self.horizon + 1) * n, 0), dtype=float)
+            self._make_rows()
         self.states, self.actions = torch_view(self._state), torch_view(self._actions)
         self.state = self.states[0] if states == 1 else self.states
         self.reward = torch_view(self._reward).view(self.horizon, n)
@@ -137,6 +115,33 @@ class OpenLoop:
         self.final_obs = self.final_obs_groups["policy"]
         self.phases = self._step_by_step() if stepwise else self._whole_horizon()
         self._calls = self.sequence(self.phases)
+
+    def _make_rows(self) -> None:
+        """Make the arrays of the states and their fields at all steps."""
+        task, n, rows = self.env.task, self.env.nworld, self.horizon * self.env.nworld
+        # for each field, the rows before and after the steps, and the last rows, are views of one buffer
+        self._fields: dict[str, wp.array] = {}
+        self._rows, self._last = task.kernels.Transition(), task.kernels.Transition()
+        self._rows.action = self._actions.reshape((-1, self.env.action_space.size))
+        self._rows.counters = self._last.counters = self.worlds.counters
+        batches = (self._rows.before, self._rows.after, self._last.after)
+        if task.layouts.shared:
+            for batch in batches:
+                batch.shared = self.worlds.shared
+        constants = {field.name: field for field in task.constants}
+        for name in task.types:
+            live = getattr(self.worlds.after, name)
+            if field := constants.get(name):
+                buffer = shared_rows(field.value(task.model), field.dtype, rows + n, self.env.device)
+            else:
+                buffer = wp.zeros((rows + n, *live.shape[1:]), dtype=live.dtype)
+                self._fields[name] = buffer.reshape((self.horizon + 1, *live.shape))
+            for batch, start in zip(batches, (0, n, rows), strict=True):
+                # Warp cannot slice an array without elements
+                part = buffer[start : min(start + rows, rows + n)] if buffer.size else with_memory(buffer)
+                setattr(batch, name, part)
+        self._memories = {name: self._fields.pop(name) for name in MEMORIES if name in self._fields}
+        self._dynamics = {f.name: self._fields.pop(f.name) for f in task.dynamics if f.name in self._fields}
 
     def run(self) -> None:
         """Roll out."""

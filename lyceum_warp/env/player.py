@@ -8,7 +8,8 @@ import torch
 from torch import nn
 
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.validate import described, repeatable
+from lyceum_warp.support.tensors import repeatable
+from lyceum_warp.support.validate import described
 
 Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
 """A module with the method ``act``, or a function from observations to actions."""
@@ -43,7 +44,7 @@ class Player:
             action: torch.Tensor = self._act(obs)
             return action
         action, state = self._act(obs, self._state())
-        self.state = state.detach()
+        self.state.copy_(state.detach())
         return action
 
     def first(self, obs: torch.Tensor) -> torch.Tensor:
@@ -63,7 +64,7 @@ class Player:
             texts = [" and ".join(map(described, each)) for each in (expected, outputs)]
             raise ValueError(f"policy must return {texts[0]}, not {texts[1]}")
         if state:
-            self.state = outputs[1].detach()
+            self.state.copy_(outputs[1].detach())
         action: torch.Tensor = outputs[0]
         return action
 

@@ -9,7 +9,7 @@ from lyceum_warp.core.fields import Stage
 from lyceum_warp.env.arrays import WorldArrays
 from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels import random, state
-from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds
+from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds, repeated
 
 
 class Resets(WorldArrays):
@@ -46,7 +46,7 @@ class Resets(WorldArrays):
 
     def _restart(self, mask: wp.array, *, randomly: bool, again: bool = False) -> None:
         self.engine.reset(mask)
-        counts = [] if again else ["metric_sums", "success_counts"]
+        counts = [] if again else ["metrics", "success_steps"]
         self._clear(mask, "memory", *self.task.definition.cleared, *counts)
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
             backup, live = self._lasting_before, self.lasting_memory
@@ -72,8 +72,9 @@ class Resets(WorldArrays):
     def _clear(self, mask: wp.array, *names: str) -> None:
         for name in names:
             if (array := self._clearable[name]).size:
-                launch_rows(state.fill_rows, mask, self._zeros[: array.shape[1]], array)
+                launch_rows(state.copy_rows, mask, repeated(self._zeros[: array.shape[1]], self.nworld), array)
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
         for name in names:
-            launch_rows(state.fill_rows, mask, flat(self.engine.nominal[name])[0], flat(self.engine.arrays[name]))
+            nominal = repeated(flat(self.engine.nominal[name])[0], self.nworld)
+            launch_rows(state.copy_rows, mask, nominal, flat(self.engine.arrays[name]))

@@ -53,7 +53,7 @@ class Worlds(Resets):
 
     def configure(self, *, horizon: int, autoreset: bool, graphs: bool) -> None:
         """Set the horizon, automatic restarts, and whether to capture launches as graphs."""
-        self.horizon, self.autoreset = horizon, autoreset
+        self.horizon, self.autoreset, self.episodes.horizon = horizon, autoreset, horizon
         key = (horizon, autoreset, graphs)
         if key not in self._programs:
             reset, rand_reset = self.reset_phases(randomly=False), self.reset_phases(randomly=True)
@@ -210,9 +210,8 @@ class Worlds(Resets):
         args = [mask, self.transition, transition, fault, action_fault, self._found, self.metrics, self.final_obs]
         launch_parts(kernels.judge, self._judging, self.nworld, [*args, self._judging], self.device)
         launch_lanes(kernels.conclude, self.nworld, [
-            mask, self.transition, self._found, self.horizon, transition, keep_reason, fault, action_fault,
-            self.outcome, self.metric_sums, self.task.definition.success_steps, self.success_counts, self.obs,
-            self.final_obs, self.restarting, self.fault_count,
+            mask, self.transition, self._found, self.outcome, self.episodes, transition, keep_reason, fault,
+            action_fault, self.obs, self.final_obs,
         ], self.device)  # fmt: skip
 
     def _event(self, kernel: wp.Kernel) -> None:

@@ -9,7 +9,6 @@ graphs, one for each part of the worlds, and threads replay the graphs in parall
 
 import contextlib
 import dataclasses
-import gc
 import threading
 import time
 import weakref
@@ -20,6 +19,7 @@ import warp as wp
 
 from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.support.arrays import part_of_worlds
+from lyceum_warp.support.collection import without_collection
 from lyceum_warp.support.upstream import TILES_ON_CPU, separate_captures, separate_tiles, tiles
 
 Calls = tuple[Callable[[], None], ...]
@@ -101,18 +101,12 @@ separate_tiles()
 
 @contextlib.contextmanager
 def capturing() -> Iterator[None]:
-    """During a capture, exclude other captures, and disable Python's garbage collection.
+    """During a capture, exclude other captures, and pause Python's garbage collection.
 
     Garbage collection may delete unused torch graphs, and a deletion makes a CUDA capture fail.
     """
-    with _CAPTURING:
-        collects = gc.isenabled()
-        gc.disable()
-        try:
-            yield
-        finally:
-            if collects:
-                gc.enable()
+    with _CAPTURING, without_collection():
+        yield
 
 
 class _Graph:

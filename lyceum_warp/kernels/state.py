@@ -9,6 +9,8 @@ from typing import Any
 
 import warp as wp
 
+from lyceum_warp.kernels.step_types import Counters
+
 
 def _casts(name: str, source: Any, target: Any) -> wp.Kernel:
     """Make a kernel that copies the masked rows of an array, cast to the target's type; launched over (nworld, lanes).
@@ -27,22 +29,6 @@ def _casts(name: str, source: Any, target: Any) -> wp.Kernel:
 
     cast.__qualname__ = name
     return wp.kernel(cast, enable_backward=False)
-
-
-def _fills(name: str, dtype: Any) -> wp.Kernel:
-    """Make a kernel that copies one row into all masked rows; launched over (nworld, lanes)."""
-
-    def fill(
-        mask_in: wp.array[bool], source_in: wp.array[dtype], target_out: wp.array2d[dtype], lanes: int, first: int
-    ):
-        k, lane = wp.tid()
-        w = first + k
-        if mask_in[w]:
-            for i in range(lane, target_out.shape[1], lanes):
-                target_out[w, i] = source_in[i]
-
-    fill.__qualname__ = name
-    return wp.kernel(fill, enable_backward=False)
 
 
 @wp.func
@@ -85,8 +71,6 @@ narrow_four = _casts_four("narrow_four", wp.float64, wp.float32)
 widen = _casts("widen", wp.float32, wp.float64)
 widen_bool = _casts("widen_bool", wp.bool, wp.float64)
 widen_four = _casts_four("widen_four", wp.float32, wp.float64)
-fill_rows = _fills("fill_rows", wp.float32)
-fill_rows64 = _fills("fill_rows64", wp.float64)
 
 
 @wp.kernel(enable_backward=False)
@@ -108,34 +92,23 @@ def zero_columns(column_in: wp.array[int], target_out: wp.array2d[float]):
 
 
 @wp.kernel(enable_backward=False)
-def pack_counters(
-    step_in: wp.array[int],
-    key_in: wp.array[wp.uint32],
-    episode_in: wp.array[int],
-    done_reason_in: wp.array[int],
-    state_out: wp.array2d[wp.float64],
-):
+def pack_counters(counters_in: Counters, done_reason_in: wp.array[int], state_out: wp.array2d[wp.float64]):
     """Write step, stream key, episode and done reason into four columns, without rounding; launched over (nworld,)."""
     w = wp.tid()
-    state_out[w, 0] = wp.float64(step_in[w])
-    state_out[w, 1] = wp.float64(key_in[w])
-    state_out[w, 2] = wp.float64(episode_in[w])
+    state_out[w, 0] = wp.float64(counters_in.step[w])
+    state_out[w, 1] = wp.float64(counters_in.key[w])
+    state_out[w, 2] = wp.float64(counters_in.episode[w])
     state_out[w, 3] = wp.float64(done_reason_in[w])
 
 
 @wp.kernel(enable_backward=False)
 def unpack_counters(
-    mask_in: wp.array[bool],
-    state_in: wp.array2d[wp.float64],
-    step_out: wp.array[int],
-    key_out: wp.array[wp.uint32],
-    episode_out: wp.array[int],
-    done_reason_out: wp.array[int],
+    mask_in: wp.array[bool], state_in: wp.array2d[wp.float64], counters_out: Counters, done_reason_out: wp.array[int]
 ):
     """Read the columns that ``pack_counters`` writes, in the masked worlds; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
-        step_out[w] = int(state_in[w, 0])
-        key_out[w] = wp.uint32(state_in[w, 1])
-        episode_out[w] = int(state_in[w, 2])
+        counters_out.step[w] = int(state_in[w, 0])
+        counters_out.key[w] = wp.uint32(state_in[w, 1])
+        counters_out.episode[w] = int(state_in[w, 2])
         done_reason_out[w] = int(state_in[w, 3])

@@ -51,6 +51,24 @@ class Findings:
     """Bits of the faults, one row for each part of ``judge``, (parts, nworld)."""
 
 
+@wp.struct
+class Episodes:
+    """The rules and the counts of the worlds' episodes."""
+
+    horizon: int
+    """The time limit in steps, or 0 for none."""
+    success_steps: int
+    """Number of successful steps in a row that an episode needs."""
+    success_count: wp.array2d[float]
+    """Successful steps in a row so far, (nworld, 1), if an episode needs several."""
+    metric_sum: wp.array2d[float]
+    """Sums of the metrics, (nworld, nmetrics)."""
+    fault_count: wp.array2d[int]
+    """Number of faults since the construction, (nworld, bits of Done)."""
+    restart: wp.array[bool]
+    """Whether the world begins a new episode, (nworld,)."""
+
+
 OUTCOMES = {name: field.type.dtype for name, field in Outcome.vars.items() if field.type.ndim == 1}
 """The fields of Outcome with the shape (nworld,), and their types."""
 

@@ -1,13 +1,11 @@
-"""Make the kernels that compute rewards, metrics and observations, and decide whether an episode ends."""
+"""Make the kernels that compute rewards, metrics and observations, and end episodes."""
 
 import warp as wp
 
 from lyceum_warp.core.done import Done
-from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.step_types import Findings, Outcome, TaskCode
+from lyceum_warp.kernels import ends, faults
+from lyceum_warp.kernels.step_types import Episodes, Findings, Outcome, TaskCode
 
-TERMINATED = wp.constant(int(Done.TERMINATED))
-TRUNCATED = wp.constant(int(Done.TRUNCATED))
 REWARD = wp.constant(int(Done.REWARD))
 OBSERVATION = wp.constant(int(Done.OBSERVATION))
 NAN = wp.constant(int(Done.NAN))
@@ -97,24 +95,21 @@ def _make_judge(task: TaskCode) -> None:
 
 
 def _make_conclude(task: TaskCode) -> None:
+    has_metrics = "measure" in task.written or hasattr(task.terms, "score")
+
     @task.kernel()
     def conclude(
         mask_in: wp.array[bool],
         t: task.Transition,
         found: Findings,
-        horizon: int,
+        out: Outcome,
+        episodes: Episodes,
         transition: bool,
         keep_reason: bool,
         fault_inout: wp.array[int],
         action_fault_in: wp.array[int],
-        out: Outcome,
-        metric_sum_inout: wp.array2d[float],
-        success_steps: int,
-        success_count_inout: wp.array2d[float],
         obs_out: task.Observations,
         final_obs_inout: task.Observations,
-        restart_out: wp.array[bool],
-        fault_count_inout: wp.array2d[int],
         lanes: int,
         first: int,
     ):
@@ -123,8 +118,7 @@ def _make_conclude(task: TaskCode) -> None:
         The kernel writes the reward, the metrics and their sums, the evaluation, the end of the episode, success and
         the observations. A transition with a fault has reward 0, metrics 0, the evaluation of the state before it, and
         the last good observations. Such a transition counts as truncated, so that learners bootstrap from the
-        last good observations. Success needs ``success_steps`` successful steps in a row. ``success_count``, (nworld,
-        1), holds those so far. The evaluation of a state alone does not change the count.
+        last good observations. The evaluation of a state alone does not change the count of successful steps.
 
         If ``transition`` is not set, the kernel evaluates a state and ends no episode. ``found.terminated`` then holds
         the result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
@@ -133,27 +127,17 @@ def _make_conclude(task: TaskCode) -> None:
         w = first + k
         if not mask_in[w]:
             return
-        fault = fault_inout[w] | action_fault_in[w]
-        for part in range(found.fault.shape[0]):
-            fault = fault | found.fault[part, w]
+        fault = ends.all_faults(w, fault_inout[w] | action_fault_in[w], found)
         if fault == 0:
             task.copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
             task.copy_observations(obs_out, final_obs_inout, w, lane, lanes)
-        if wp.static("measure" in task.written or hasattr(task.terms, "score")):
-            for i in range(lane, out.metrics.shape[1], lanes):
-                if fault != 0 or not transition:
-                    out.metrics[w, i] = 0.0
-                if wp.isfinite(out.metrics[w, i]):  # the sum is part of the state, which must be finite
-                    metric_sum_inout[w, i] = metric_sum_inout[w, i] + out.metrics[w, i]
-                out.episode_metrics[w, i] = metric_sum_inout[w, i]
+        if wp.static(has_metrics):
+            ends.add_metrics(w, lane, lanes, fault == 0 and transition, out, episodes.metric_sum)
         if lane > 0:
             return
         fault_inout[w] = fault
-        gain = float(0.0)
-        if fault == 0 and transition:
-            gain = found.reward[w]
-        out.reward[w] = gain
+        out.reward[w] = wp.where(fault == 0 and transition, found.reward[w], 0.0)
         if wp.static("evaluate" in task.written):
             if fault == 0:
                 out.eval[w] = found.eval[w]
@@ -162,32 +146,25 @@ def _make_conclude(task: TaskCode) -> None:
                 if not faults.is_out_of_range(found.eval[w]):  # else keep the previous evaluation
                     out.eval[w] = found.eval[w]
         else:
-            out.eval[w] = gain
+            out.eval[w] = out.reward[w]
         found.terminated[w] = fault == 0 and found.terminated[w]
         out.success[w] = fault == 0 and found.success[w]
-        if success_steps > 1:
+        if episodes.success_steps > 1:
             if transition:
-                count = wp.min(success_count_inout[w, 0] + 1.0, float(success_steps))
-                success_count_inout[w, 0] = wp.where(out.success[w], count, 0.0)
-            out.success[w] = out.success[w] and success_count_inout[w, 0] >= float(success_steps)
+                ends.count_success(out.success[w], episodes.success_steps, episodes.success_count[w])
+            out.success[w] = out.success[w] and episodes.success_count[w, 0] >= float(episodes.success_steps)
         reason = int(0)
         if transition:
-            reason = fault
-            if found.terminated[w]:
-                reason = TERMINATED
-            if (horizon > 0 and t.counters.step[w] >= horizon) or (fault == 0 and found.truncated[w]):
-                reason = reason | TRUNCATED
+            truncated = fault == 0 and found.truncated[w]
+            reason = ends.reason_of_end(fault, found.terminated[w], truncated, t.counters.step[w], episodes.horizon)
         if keep_reason:
             reason = reason | out.done_reason[w]
-        out.done_reason[w] = reason
-        out.terminated[w] = (reason & TERMINATED) != 0
-        out.truncated[w] = (reason & ~TERMINATED) != 0
-        out.done[w] = reason != 0
+        ends.put_reason(w, reason, out)
         if transition:
             # without automatic resets, a world continues after its episode's end, but not after a fault
-            restart_out[w] = wp.where(keep_reason, fault != 0, reason != 0)
+            episodes.restart[w] = wp.where(keep_reason, fault != 0, reason != 0)
             if fault != 0:
-                faults.count_faults(fault, fault_count_inout[w])
+                faults.count_faults(fault, episodes.fault_count[w])
 
 
 def _make_observe_worlds(task: TaskCode) -> None:

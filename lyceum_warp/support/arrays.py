@@ -30,6 +30,11 @@ def flat(array: wp.array) -> wp.array:
     return alias(array, wp.float32, (array.shape[0], n))
 
 
+def repeated(row: wp.array, count: int) -> wp.array:
+    """View a row as an array (count, n) of equal rows."""
+    return alias(row, row.dtype, (count, row.size), (0, *row.strides))
+
+
 def shared_rows(row: np.ndarray, dtype: type, count: int, device: wp.Device) -> wp.array:
     """Make a read-only array (count, ...) of equal rows, which share the memory of one row (stride 0)."""
     single: Any = wp.array(row[None], dtype=dtype, device=device)
@@ -50,7 +55,8 @@ def zeros_of(struct: Any, shape: int = 0, /, **shapes: Any) -> Any:
     """Make an instance of a struct with arrays of zeros of the given shape. ``shapes`` has other shapes by name."""
     instance = struct()
     for name, field in struct.vars.items():
-        setattr(instance, name, wp.zeros(shapes.get(name, shape), dtype=field.type.dtype))
+        if hasattr(field.type, "dtype"):
+            setattr(instance, name, wp.zeros(shapes.get(name, shape), dtype=field.type.dtype))
     return instance
 
 

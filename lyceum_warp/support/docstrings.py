@@ -6,16 +6,15 @@ An attribute's docstring is the string below it, as Sphinx and type checkers rea
 import ast
 import dataclasses
 import enum
-import functools
+import importlib.util
 import inspect
 import itertools
+import sys
 from collections.abc import Mapping
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 Class = TypeVar("Class", bound=type)
-
-
-_parse = functools.lru_cache(maxsize=1)(ast.parse)
 
 
 def attribute_docs(*classes: type) -> dict[str, str]:
@@ -26,8 +25,8 @@ def attribute_docs(*classes: type) -> dict[str, str]:
     docs: dict[str, str] = {}
     for cls in classes:
         try:
-            lines, _ = inspect.findsource(inspect.getmodule(cls) or cls)
-            body: list[ast.stmt] = _parse("".join(lines)).body
+            lines = _lines(cls)
+            body: list[ast.stmt] = ast.parse("".join(lines)).body
             for name in cls.__qualname__.split("."):
                 body = next(each.body for each in body if isinstance(each, ast.ClassDef) and each.name == name)
         except (OSError, TypeError, SyntaxError, StopIteration):  # a class without source, as in an interactive session
@@ -45,6 +44,14 @@ def attribute_docs(*classes: type) -> dict[str, str]:
     return docs
 
 
+def _lines(cls: type) -> list[str]:
+    """Return the source of a class's module, which need not be loaded."""
+    if cls.__module__ in sys.modules:
+        return inspect.findsource(inspect.getmodule(cls) or cls)[0]
+    found = importlib.util.find_spec(cls.__module__)
+    return Path(str(found and found.origin)).read_text("utf-8").splitlines(keepends=True)
+
+
 def listed(docs: Mapping[str, str]) -> str:
     """Format names and docstrings as an ``Attributes:`` or ``Args:`` section."""
     entries = (f"{name}: {text}".splitlines() for name, text in docs.items())
@@ -53,9 +60,20 @@ def listed(docs: Mapping[str, str]) -> str:
 
 def document_attributes(cls: Class) -> Class:
     """Append the docstrings of attributes, including those of parent dataclasses, to a class's docstring."""
-    docs = attribute_docs(*filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])), cls)
-    if issubclass(cls, enum.Enum):
-        docs = {f"{member.name} ({member.value})": docs[member.name] for member in cls if member.name in docs}
-    if docs:
-        cls.__doc__ = f"{inspect.cleandoc(cls.__doc__ or '')}\n\nAttributes:\n{listed(docs)}\n"
+    documented: Any = cls
+    doc = _Doc(cls.__doc__)
+    documented.__doc__ = doc if type(cls) is type else doc.__get__(None, cls)  # pydoc reads __doc__ past a metaclass
     return cls
+
+
+class _Doc:
+    """The docstring of a class, which lists its attributes. They are read from the source when ``help()`` asks."""
+
+    def __init__(self, text: str | None) -> None:
+        self._text = text
+
+    def __get__(self, instance: object, cls: type) -> str | None:
+        docs = attribute_docs(*filter(dataclasses.is_dataclass, reversed(cls.__mro__[1:])), cls)
+        if issubclass(cls, enum.Enum):
+            docs = {f"{member.name} ({member.value})": docs[member.name] for member in cls if member.name in docs}
+        return f"{inspect.cleandoc(self._text or '')}\n\nAttributes:\n{listed(docs)}\n" if docs else self._text

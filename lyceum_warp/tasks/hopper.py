@@ -29,14 +29,14 @@ class Params:
 @wp.func
 def healthy(s: World, p: Params) -> bool:
     ok = lw.inside(s.qpos[1], p.healthy_z_range) and lw.inside(s.qpos[2], p.healthy_angle_range)
-    ok = ok and lw.all_inside(s.qpos, 2, 6, p.healthy_state_range)
-    return ok and lw.all_inside(s.qvel, 0, 6, p.healthy_state_range)
+    ok = ok and lw.all_inside(s.qpos, 2, s.qpos.shape[0], p.healthy_state_range)
+    return ok and lw.all_inside(s.qvel, 0, s.qvel.shape[0], p.healthy_state_range)
 
 
 @wp.func
 def observe(s: World, p: Params, obs: Row[float]):
-    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), 6)
-    for i in range(6):
+    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), s.qpos.shape[0])
+    for i in range(s.qvel.shape[0]):
         obs[k + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
 
 
@@ -59,7 +59,7 @@ def terminated(s: World, p: Params) -> bool:
 
 @wp.func
 def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(6):
+    for i in range(s.qpos.shape[0]):
         s.qpos[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
         s.qvel[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
 

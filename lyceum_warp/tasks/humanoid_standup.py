@@ -9,6 +9,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row
+from lyceum_warp.tasks.humanoid import Humanoid
 
 
 @wp.struct
@@ -87,14 +88,4 @@ class HumanoidStandup(lw.Task):
     model, frame_skip, gymnasium = "humanoidstandup.xml", 5, "HumanoidStandup-v5"
     metrics = ("reward_linup", "reward_quadctrl", "reward_impact")
     lagged = ("cinert", "cvel")
-
-    @staticmethod
-    def obs(p: Params) -> dict[str, int]:
-        return {
-            "position": 24 - 2 * p.exclude_current_positions_from_observation,
-            "velocity": 23,
-            "inertia": 130 * p.include_cinert_in_observation,
-            "body_velocity": 78 * p.include_cvel_in_observation,
-            "actuator_force": 17 * p.include_qfrc_actuator_in_observation,
-            "contact_force": 78 * p.include_cfrc_ext_in_observation,
-        }
+    obs = staticmethod(Humanoid.obs)

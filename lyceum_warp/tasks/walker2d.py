@@ -1,67 +1,18 @@
-"""Walker2d: walk forward on two legs (Gymnasium's Walker2d-v5)."""
+"""Walker2d: walk forward on two legs (Gymnasium's Walker2d-v5), with the reward of the task hopper."""
 
-import warp as wp
+import math
 
 import lyceum_warp as lw
-from lyceum_warp import Row
-
-
-@wp.struct
-class World:
-    qpos: Row[float]
-    qvel: Row[float]
-
-
-@wp.struct
-class Params:
-    dt: float
-    forward_reward_weight: float = 1.0
-    ctrl_cost_weight: float = 1e-3
-    healthy_reward: float = 1.0
-    terminate_when_unhealthy: bool = True
-    healthy_z_range: wp.vec2 = wp.vec2(0.8, 2.0)
-    healthy_angle_range: wp.vec2 = wp.vec2(-1.0, 1.0)
-    reset_noise_scale: float = 5e-3
-    exclude_current_positions_from_observation: bool = True
-
-
-@wp.func
-def healthy(s: World, p: Params) -> bool:
-    return lw.inside(s.qpos[1], p.healthy_z_range) and lw.inside(s.qpos[2], p.healthy_angle_range)
-
-
-@wp.func
-def observe(s: World, p: Params, obs: Row[float]):
-    k = lw.put(obs, 0, s.qpos, int(p.exclude_current_positions_from_observation), 9)
-    for i in range(9):
-        obs[k + i] = wp.clamp(s.qvel[i], -10.0, 10.0)
-
-
-@wp.func
-def reward(s0: World, action: Row[float], s1: World, p: Params) -> float:
-    forward = p.forward_reward_weight * (s1.qpos[0] - s0.qpos[0]) / p.dt
-    alive = wp.where(healthy(s1, p), p.healthy_reward, 0.0)
-    return forward + alive - p.ctrl_cost_weight * lw.sum_squares(action)
-
-
-@wp.func
-def evaluate(s: World, p: Params) -> float:
-    return s.qpos[0]
-
-
-@wp.func
-def terminated(s: World, p: Params) -> bool:
-    return p.terminate_when_unhealthy and not healthy(s, p)
-
-
-@wp.func
-def randomize(s: World, p: Params, rng: Row[wp.uint32]):
-    for i in range(9):
-        s.qpos[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
-        s.qvel[i] += lw.uniform(rng, -p.reset_noise_scale, p.reset_noise_scale)
+from lyceum_warp.tasks.hopper import Hopper
 
 
 @lw.register
-class Walker2d(lw.Task):
+class Walker2d(Hopper):
     model, frame_skip, gymnasium = "walker2d_v5.xml", 4, "Walker2d-v5"
     obs = staticmethod(lambda p: {"position": 9 - p.exclude_current_positions_from_observation, "velocity": 9})
+    params = {
+        "healthy_state_range": (-math.inf, math.inf),
+        "healthy_z_range": (0.8, 2.0),
+        "healthy_angle_range": (-1.0, 1.0),
+    }
+    physics, planning = {}, lw.Planning()

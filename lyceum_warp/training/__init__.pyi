@@ -1,7 +1,5 @@
 from lyceum_warp.training.callbacks import (
     Callback as Callback,
-    Minutes as Minutes,
-    TargetReturn as TargetReturn,
     TransferTest as TransferTest,
     Videos as Videos,
 )
@@ -15,6 +13,7 @@ from lyceum_warp.training.runs.checkpoints import (
 from lyceum_warp.training.runs.choice import (
     AUTO as AUTO,
     EPISODES as EPISODES,
+    Choice as Choice,
     choose_policy as choose_policy,
 )
 from lyceum_warp.training.runs.configuration import (
@@ -39,5 +38,9 @@ from lyceum_warp.training.runs.task_copy import (
     note_changes as note_changes,
     run_env as run_env,
     task_copy as task_copy,
+)
+from lyceum_warp.training.stopping import (
+    Minutes as Minutes,
+    TargetReturn as TargetReturn,
 )
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard

@@ -1,7 +1,7 @@
 """End a run when its policy passes the gate of its task.
 
-Policies are tested on CPU cores by a subprocess, ``python -m lyceum_warp.training.gating FOLDER``, while training
-continues. It reads iteration numbers and seeds, and writes a verdict for each in one line of JSON.
+Policies are tested on CPU cores by subprocesses, ``python -m lyceum_warp.training.gating FOLDER THREADS``, while
+training continues. They read iteration numbers and seeds, and write a verdict for each in one line of JSON.
 """
 
 import json
@@ -11,7 +11,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
+
+import torch
 
 from lyceum_warp.algos import Iteration, Learner, gate
 from lyceum_warp.engines import options_on_cores
@@ -24,13 +26,52 @@ from lyceum_warp.training.runs.configuration import Configuration
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum
 from lyceum_warp.training.runs.task_copy import run_env
 
+_SEEDS = 2
+"""Number of seeds with which a policy must pass."""
+
+
+class _Tester:
+    """A subprocess that tests policies of a run, one at a time."""
+
+    def __init__(self, folder: Path, nthread: int) -> None:
+        words = [sys.executable, "-m", "lyceum_warp.training.gating", str(folder), str(nthread)]
+        # in a session of its own, because Ctrl-C must not end the test before the run
+        self._process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self.busy = False
+
+    def test(self, number: int, seed: int) -> None:
+        """Start the test of a saved policy."""
+        assert self._process.stdin is not None
+        print(number, seed, file=self._process.stdin, flush=True)
+        self.busy = True
+
+    def verdict(self, *, wait: bool) -> dict[str, Any] | None:
+        """Return the verdict of the current test, or None if it is not finished."""
+        assert self._process.stdout is not None
+        if not wait and not select.select([self._process.stdout], [], [], 0.0)[0]:
+            return None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(f"the subprocess that tests policies has ended with exit code {self._process.wait()}")
+        self.busy = False
+        verdict: dict[str, Any] = json.loads(line)
+        return verdict
+
+    def close(self) -> None:
+        """End the subprocess."""
+        self._process.kill()
+        self._process.communicate()
+
 
 class PassGate(Callback):
-    """Ends training when the policy passes the gate of its task with two seeds, one after the other.
+    """Ends training when the policy passes the gate of its task with two seeds.
 
-    A subprocess tests the newest policy while training continues, so that training ends some iterations after the
-    policy that passes. That policy is kept in a numbered file of the run's folder. Every verdict is a line of
-    ``gate.jsonl``, with the seconds that the test took. Each test uses new seeds.
+    Subprocesses test the newest policy while training continues, so that training ends some iterations after the policy
+    that passes. That policy is kept in a numbered file of the run's folder. Every verdict is a line of ``gate.jsonl``,
+    with the seconds that the test took. Each test uses a new seed. On four cores or more, both seeds are tested at the
+    same time. On fewer, the second seed is only tested if the policy passes with the first.
 
     Args:
         every: Iterations between policies to test. While a test lasts, the next ones are left out.
@@ -42,10 +83,10 @@ class PassGate(Callback):
     def __init__(self, every: int = 20) -> None:
         self.every = whole_number("every", every, low=1)
         self.settings = {"gate_every": self.every}
-        self._process: subprocess.Popen[str] | None = None
+        self._testers: list[_Tester] = []
 
     def begin(self, run: Run, learner: Learner, iterations: int) -> None:
-        """Start the subprocess, which gets ready while the first iterations run."""
+        """Start the subprocesses, which get ready while the first iterations run."""
         if learner.env.task.definition.gate is None:
             raise ValueError(f"the task {learner.env.task.name!r} has no gate: set its attribute gate to a lw.Gate")
         if run.config["task"] is None or run.manifest.get("program"):
@@ -57,19 +98,17 @@ class PassGate(Callback):
         self._file = run.folder / "gate.jsonl"
         self._tries = len(self._file.read_text().splitlines()) if self._file.exists() else 0
         self._tested: int | None = None
-        words = [sys.executable, "-m", "lyceum_warp.training.gating", str(run.folder)]
-        # in a session of its own, because Ctrl-C must not end the test before the run
-        self._process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-        )
+        cores = cpu_cores()
+        count = _SEEDS if cores >= 4 else 1
+        self._testers = [_Tester(run.folder, max(1, (cores - 1) // count)) for _ in range(count)]
 
     def __call__(self, iteration: Iteration) -> bool:
-        """Read the verdict if there is one, and test the next policy if none is being tested."""
-        if self._tested is not None and self._verdict(wait=False):
+        """Read verdicts if there are some, and test the next policy if none is being tested."""
+        if self._tested is not None and self._passed(wait=False):
             return True
         if self._tested is None and iteration.iteration % self.every == 0:
             self._test(iteration.iteration)
-        return self._tested is not None and iteration.iteration >= self._last and self._verdict(wait=True)
+        return self._tested is not None and iteration.iteration >= self._last and self._passed(wait=True)
 
     def _test(self, number: int) -> None:
         learner, path = self._learner, self._run.numbered(number)
@@ -79,25 +118,30 @@ class PassGate(Callback):
             self._temporary: Path | None = path
         else:
             self._temporary = None
-        assert self._process is not None and self._process.stdin is not None
-        print(number, self._tries, file=self._process.stdin, flush=True)
-        self._tested = number
+        self._tested, self._good, self._left = number, 0, _SEEDS
+        self._start_tests()
 
-    def _verdict(self, *, wait: bool) -> bool:
-        """Return whether the tested policy has passed with both seeds."""
-        assert self._process is not None and self._process.stdout is not None
-        pipe: IO[str] = self._process.stdout
-        if not wait and not select.select([pipe], [], [], 0.0)[0]:
-            return False
-        line = pipe.readline()
-        if not line:
-            raise RuntimeError(f"the subprocess that tests policies has ended with exit code {self._process.wait()}")
-        verdicts: list[dict[str, Any]] = json.loads(line)
-        with self._file.open("a") as file:
-            for verdict in verdicts:
-                print(json.dumps({"iteration": self._tested, **verdict}), file=file)
-        self._tries += len(verdicts)
-        passed = len(verdicts) == 2 and all(verdict["passed"] for verdict in verdicts)
+    def _start_tests(self) -> None:
+        assert self._tested is not None
+        for tester in self._testers:
+            if self._left and not tester.busy:
+                tester.test(self._tested, self._tries)
+                self._tries += 1
+                self._left -= 1
+
+    def _passed(self, *, wait: bool) -> bool:
+        """Read verdicts of the tested policy, and return whether it has passed with all seeds."""
+        while busy := [tester for tester in self._testers if tester.busy]:
+            verdicts = [verdict for tester in busy if (verdict := tester.verdict(wait=wait)) is not None]
+            with self._file.open("a") as file:
+                for verdict in verdicts:
+                    print(json.dumps({"iteration": self._tested, **verdict}), file=file)
+                    self._good += verdict["passed"]
+                    self._left = self._left if verdict["passed"] else 0
+            self._start_tests()
+            if not verdicts:
+                return False
+        passed = self._good == _SEEDS
         if passed:
             self._run.amend(passed={"iteration": self._tested, "tries": self._tries})
         elif self._temporary is not None:
@@ -106,35 +150,30 @@ class PassGate(Callback):
         return passed
 
     def close(self) -> None:
-        """End the subprocess."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-            if self._tested is not None and self._temporary is not None:
-                self._temporary.unlink(missing_ok=True)
+        """End the subprocesses."""
+        for tester in self._testers:
+            tester.close()
+        if self._testers and self._tested is not None and self._temporary is not None:
+            self._temporary.unlink(missing_ok=True)
 
 
-def serve(folder: Path) -> None:
-    """Read lines "iteration seed", and write the verdicts of the policies: two if the first is good."""
+def serve(folder: Path, nthread: int) -> None:
+    """Read lines "iteration seed", and write the verdicts of the policies."""
     verdicts_out = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # messages of libraries go to stderr
     run = Run.open(folder)
     saved = Configuration.of(run)
     options = saved.options.changed({**options_on_cores(), "nworld": 1, "physics": "exact"})
     env = run_env(run, options, saved.params, trust=True)
-    nthread = max(1, cpu_cores() - 1)
+    torch.set_num_threads(1)  # more threads would take longer to wake up than to compute
     for line in sys.stdin:
         number, seed = map(int, line.split())
         policy, curriculum = load(run, which=number), load_curriculum(run, which=number)
-        verdicts: list[dict[str, Any]] = []
-        while len(verdicts) < 2 and all(verdict["passed"] for verdict in verdicts):
-            start = time.perf_counter()
-            verdict = gate(env, policy, seed=seed, curriculum=curriculum, nthread=nthread, quick=True)
-            seconds = time.perf_counter() - start
-            verdicts.append({**verdict.to_dict(), "seconds": seconds, "unix_time": time.time()})
-            seed += 1
-        print(json.dumps(verdicts), file=verdicts_out, flush=True)
+        start = time.perf_counter()
+        verdict = gate(env, policy, seed=seed, curriculum=curriculum, nthread=nthread, quick=True)
+        result = {**verdict.to_dict(), "seconds": time.perf_counter() - start, "unix_time": time.time()}
+        print(json.dumps(result), file=verdicts_out, flush=True)
 
 
 if __name__ == "__main__":
-    serve(Path(sys.argv[1]))
+    serve(Path(sys.argv[1]), int(sys.argv[2]))

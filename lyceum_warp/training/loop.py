@@ -106,24 +106,11 @@ def train(
         settings |= observer.settings
     with contextlib.ExitStack() as stack:
         with team.together(), contextlib.ExitStack() as undo:
-            saved = -1
             if isinstance(run, Run):
-                if leads:
-                    run.check = stack.enter_context(run_lock(run.folder, take_over=take_over))
-                _load_checkpoint(run, learner, iterations)
+                settings |= _restore(run, learner, iterations, stack, take_over=take_over)
                 saved = learner.iteration
-                if leads:
-                    settings |= _changed_versions(run)
             else:
-                run = Run(Path(run), describe(learner) | settings)
-                if leads:
-                    manifest, files = task_copy(learner.env)
-                    run = Run.create(run.folder, run.config | {"kept": manifest}, files=files)
-                    undo.callback(shutil.rmtree, run.folder, ignore_errors=True)
-                    run.check = stack.enter_context(run_lock(run.folder))
-                    note_uncopied_data(learner.env)
-                    if learner.teacher is not None:
-                        write_content(run.teacher, policy_content(0, learner.teacher))
+                run, saved = _create(Path(run), learner, settings, stack, undo), -1
             for observer in observers:
                 stack.callback(observer.close)
                 observer.begin(run, learner, iterations)
@@ -140,6 +127,34 @@ def train(
             if leads and saver.saved >= 0:
                 error.add_note(f"the run in {run.folder} is saved up to iteration {saver.saved}")
             raise
+    return run
+
+
+def _restore(
+    run: Run, learner: Learner, iterations: int, stack: contextlib.ExitStack, *, take_over: bool
+) -> dict[str, Any]:
+    """Lock a run, load its checkpoint into the learner, and return new entries for config.json."""
+    leads = learner.team.leads
+    if leads:
+        run.check = stack.enter_context(run_lock(run.folder, take_over=take_over))
+    _load_checkpoint(run, learner, iterations)
+    return _changed_versions(run) if leads else {}
+
+
+def _create(
+    folder: Path, learner: Learner, settings: dict[str, Any], stack: contextlib.ExitStack, undo: contextlib.ExitStack
+) -> Run:
+    """Make the folder of a new run, and lock it. ``undo`` deletes it."""
+    config = describe(learner) | settings
+    if not learner.team.leads:
+        return Run(folder, config)
+    manifest, files = task_copy(learner.env)
+    run = Run.create(folder, config | {"kept": manifest}, files=files)
+    undo.callback(shutil.rmtree, folder, ignore_errors=True)
+    run.check = stack.enter_context(run_lock(folder))
+    note_uncopied_data(learner.env)
+    if learner.teacher is not None:
+        write_content(run.teacher, policy_content(0, learner.teacher))
     return run
 
 

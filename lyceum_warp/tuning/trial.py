@@ -79,13 +79,13 @@ class Trials:
         for step in range(max(self.effort.recorded_at) + 1):
             if step in self.effort.recorded_at:
                 self._starts.append(env.get_state())
-                memories.append(None if self.player is None else self.player.state)
+                memories.append(None if self.player is None else self.player.state.clone())
             env.rand_reset(mask=env.done)
             env.step(self._mixed(next(draw), policy_worlds))
         for start, memory in zip(self._starts, memories, strict=True):
             env.set_state(start)
             if self.player is not None and memory is not None:
-                self.player.state = memory
+                self.player.state.copy_(memory)
             actions = []
             for _ in range(_ACTIONS):
                 actions.append(self._mixed(next(draw), policy_worlds))

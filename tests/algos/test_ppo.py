@@ -44,7 +44,7 @@ def test_reported_statistics_equal_the_statistics_of_the_samples(shared_env: Sha
     assert it.samples == 3 * 48 == 3 * ppo.count and it.length_mean == 10.0 and it.faults == 0
     assert it.reward_mean == pytest.approx(rollout.reward.mean().item())
     assert it.learning_rate == pytest.approx(ppo.rate.item())
-    old = torch.distributions.Normal(ppo._mean.double(), ppo._old_log_std.double().exp())
+    old = torch.distributions.Normal(ppo._means.double(), ppo._old_log_std.double().exp())
     new = torch.distributions.Normal(ppo.policy(rollout.obs).double(), ppo.policy.log_std.double().exp())
     assert it.kl == pytest.approx(torch.distributions.kl_divergence(old, new).sum(-1).mean().item(), rel=1e-4)
 

@@ -29,26 +29,6 @@ def test_function_with_the_documented_signature_is_found_and_another_signature_i
     assert str(caught.value) == f"{name} must be written as {FUNCTIONS[name].signature}{more}"
 
 
-CLASS = "class Tiny(lw.Task):"
-MISTAKES = {
-    "another result": (
-        CLASS, f"@wp.func\ndef terminated(s: World, p: Params) -> float:\n    return 1.0\n\n{CLASS}",
-        r"terminated must be written as terminated\(s: World, p: Params\) -> bool",
-    ),
-    "no observe": ("def observe", "def look", r"there is no observe\(s, p, obs\)"),
-    "an ordinary class World": (
-        CLASS, f"{CLASS}\n    class World:\n        qpos: Row[float]\n",
-        "World must be a @wp.struct in the task's module, not <class",
-    ),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("old", "new", "message"), MISTAKES.values(), ids=MISTAKES)
-def test_invalid_struct_function_or_attribute_raises_an_error(old: str, new: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=message):
-        source_of(tmp_path, tiny_task.changed((old, new)))
-
-
 def test_annotations_may_be_text(tmp_path: Path) -> None:
     text = f"from __future__ import annotations\n{tiny_task.TINY}"
     assert source_of(tmp_path, text).functions["observe"] is not None

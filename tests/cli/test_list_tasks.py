@@ -1,4 +1,5 @@
 import importlib.util
+import json
 import subprocess
 import sys
 
@@ -7,7 +8,8 @@ from training_runs import refused
 
 import lyceum_warp as lw
 from lyceum_warp import cli
-from lyceum_warp.binding import task_names
+from lyceum_warp.binding import package_task_names
+from lyceum_warp.cli import list_tasks
 
 
 def rows(out: str) -> dict[str, list[str]]:
@@ -22,15 +24,21 @@ def test_tasks_are_listed_with_their_sizes_and_models(capsys: pytest.CaptureFixt
     assert cli.main(["tasks"]) == 0
     out = capsys.readouterr().out
     tasks = rows(out)
-    assert sorted(tasks) == task_names()
+    assert list(tasks) == sorted(package_task_names())
     assert max(map(len, out.splitlines())) <= 101
     assert tasks["hopper"] == ["11", "3", "4", "0.008", "s", "1000", "gymnasium:", "hopper.xml"]
     assert tasks["adroit_pen"][-2:] == ["gymnasium-robotics", "[hand]"]
     assert "    hop forward on one leg (Gymnasium's Hopper-v5) (physics: fast)" in out.splitlines()
+
+
+def test_the_stored_list_agrees_with_the_tasks() -> None:
+    """If it does not: python -m lyceum_warp.cli.list_tasks."""
+    stored = json.loads(list_tasks.LIST.read_text("utf-8"))
+    assert stored == json.loads(json.dumps({name: list_tasks.read_task(name) for name in package_task_names()}))
     for name in ("hopper", "humanoid", "pusher"):
         env = lw.make(name)
-        sizes = [env.obs_space.size, env.action_space.size, env.options.physics.frame_skip or env.task.frame_skip]
-        assert tasks[name][:4] == list(map(str, [*sizes, f"{env.timestep:g}"]))
+        sizes = [env.obs_space.size, env.action_space.size, env.task.frame_skip, env.timestep]
+        assert [stored[name][column] for column in ("obs", "act", "skip", "dt")] == pytest.approx(sizes)
 
 
 @pytest.mark.parametrize(("word", "task"), [("walker", "walker2d"), ("HOP", "hopper"), ("[hand]", "adroit_pen")])
@@ -54,7 +62,16 @@ def test_a_task_with_a_missing_extra_is_listed_with_the_command_that_installs_it
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if "robotics" in name else find(name, *a))
     assert cli.main(["tasks", "[hand]"]) == 0
     out, error = capsys.readouterr()
-    assert error == "" and rows(out)["adroit_pen"] == ["45", "-", "5", "-", "200", "gymnasium-robotics", "[hand]"]
+    assert error == "" and rows(out)["adroit_pen"] == [
+        "45",
+        "24",
+        "5",
+        "0.01",
+        "s",
+        "200",
+        "gymnasium-robotics",
+        "[hand]",
+    ]
     about = out.partition("\nadroit_pen")[2].partition("\nadroit_relocate")[0]
     assert "    turn a pen in the hand" in about and "pip install 'lyceum-warp[hand]'" in " ".join(about.split())
 

@@ -199,9 +199,18 @@ def test_train_exits_with_1_if_the_return_is_below_require_return(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert train(tmp_path / "easy", "--iterations", "1", "--require-return", "-1e6") == 0
+    assert "mean policy, 32 new episodes on the C engine, exact physics: return " in capsys.readouterr().out
     assert train(tmp_path / "hard", "--iterations", "1", "--require-return", "1e6") == 1
     assert "--require-return demands more than 1e+06" in capsys.readouterr().err
     assert (tmp_path / "hard" / "checkpoint.pt").exists()
+
+
+def test_train_plays_no_episodes_at_the_end_unless_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, flags, plays in (("quick", [], False), ("judged", ["--evaluate"], True)):
+        assert train(tmp_path / name, "--iterations", "1", *flags) == 0
+        out = capsys.readouterr().out
+        assert ("mean policy, 32 new episodes" in out) == (tmp_path / name / "evaluation.json").exists() == plays
+        assert (f"lyceum-warp eval {tmp_path / name}\n" in out) != plays
 
 
 def test_default_number_of_worlds_depends_on_device_and_algorithm() -> None:

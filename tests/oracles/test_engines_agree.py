@@ -29,7 +29,7 @@ FORCE_PARTS = ("contact_force", "touch", "imu", "force_torque")
 """Parts of the observation that depend on constraint forces. These are exact only to the solver's tolerance."""
 
 
-WALKERS = tuple(name for name in VELOCITY if name != "go1_velocity")
+WALKERS = tuple(name for names in VELOCITY.values() for name in names if name != "go1_velocity")
 CONVERGED = {"iterations": 100, "ls_iterations": 50}
 PARAMS: dict[str, dict[str, Any]] = {
     **{name: {"fall_angle": 0.5, "solver": CONVERGED} for name in WALKERS},
@@ -106,7 +106,7 @@ SUITE_ONE_STEP = {
     "swimmer": (9e-7, 3e-6, 4e-4, 1.5e-3),  # with 15 links: 2.5e-7, 8.5e-7; 1.2e-4, 4.3e-4
     "walker": (2e-7, 4e-7, 9e-6, 4e-5),  # 5.9e-8, 1.1e-7; 2.6e-6, 1.1e-5
 }
-ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for name, module in SUITE.items()}
+ONE_STEP |= {name: SUITE_ONE_STEP[module.removeprefix("dm_")] for module, names in SUITE.items() for name in names}
 
 
 @dataclasses.dataclass

@@ -23,6 +23,7 @@ from gymnasium.envs.registration import load_env_creator
 
 import lyceum_warp as lw
 from lyceum_warp.binding import find_task
+from lyceum_warp.binding.functions import TaskSource
 
 gymnasium.register_envs(gymnasium_robotics)
 
@@ -31,16 +32,15 @@ OWN = {spec.id: spec for spec in gymnasium.registry.values() if "gymnasium.envs.
 TASKS = [name for name, id in IDS.items() if id in OWN]
 
 
-def fields(task: str) -> set[str]:
-    return set(find_task(task).scope["World"].vars)
+SOURCES = {task: TaskSource(find_task(task)) for task in TASKS}
 
 
 def has(task: str, function: str) -> bool:
-    return function in find_task(task).scope
+    return SOURCES[task].functions[function] is not None
 
 
 # for these tasks, Gymnasium's class gets the mixin SensorStage
-WITH_FORCES = [task for task in TASKS if "cfrc_ext" in fields(task)]
+WITH_FORCES = [task for task in TASKS if "cfrc_ext" in SOURCES[task].types]
 
 
 class SensorStage:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from lyceum_warp.support.validate import check_tensor, whole_number
+from lyceum_warp.support.tensors import check_tensor
+from lyceum_warp.support.validate import whole_number
 
 
 @pytest.mark.parametrize("value", [3, 3.0, np.int64(3), np.float32(3), torch.tensor(3)])

@@ -5,9 +5,11 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.velocity import TASKS
+from lyceum_warp.binding import task_names
 
-ROBOTS = [task for task in TASKS if task != "go1_velocity" and "rough" not in task]
+ROBOTS = [
+    task for task in task_names() if task.endswith("_velocity") and task != "go1_velocity" and "rough" not in task
+]
 NWORLD = 16
 
 

@@ -9,11 +9,10 @@ from conftest import SharedEnv
 
 from lyceum_warp import walkers
 from lyceum_warp.algos.common.symmetry import Reflected, reflections
-from lyceum_warp.binding import find_task
+from lyceum_warp.binding import find_task, task_names
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.tasks.velocity import TASKS
 
-ROBOTS = [task for task in TASKS if "rough" not in task]
+ROBOTS = [task for task in task_names() if task.endswith("_velocity") and "rough" not in task]
 FLIP = np.array([1.0, -1.0, 1.0])
 
 

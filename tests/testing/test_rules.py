@@ -60,7 +60,7 @@ def keep_warm_start(engine: MujocoEngine) -> None:
 
 
 def narrow_positions(worlds: Worlds) -> None:
-    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :-1]
+    worlds.after.qpos = worlds.before.qpos = worlds.after.qpos[:, :0]
     del worlds._copies["qpos"]
 
 
@@ -138,8 +138,8 @@ BREAKS: list[Break] = [
 FULL_BREAKS: list[Break] = [
     ("bad_state", lw.Env, "step", then(lambda env: env.final_obs_groups["critic"].copy_(env.obs_groups["critic"]))),
     ("noise", Worlds, "_judge_state", count_steps_as_none),
-    ("metrics", Worlds, "_clear", clear_all_but("metric_sums")),
-    ("success_steps", Worlds, "_clear", clear_all_but("success_counts")),
+    ("metrics", Worlds, "_clear", clear_all_but("metrics")),
+    ("success_steps", Worlds, "_clear", clear_all_but("success_steps")),
     ("events", Worlds, "_event", in_every_world),
     ("events", Worlds, "_mark_changes", nothing),
     ("events", MujocoEngine, "commit", only_after_resets),

@@ -112,7 +112,7 @@ def test_training_ends_before_the_iteration_that_would_exceed_the_minutes(
 ) -> None:
     """The first iteration takes 30 s, for example to compile kernels, the second 20 s, and all others 10 s."""
     clock = [0.0]
-    monkeypatch.setattr("lyceum_warp.training.callbacks.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr("lyceum_warp.training.stopping.time", SimpleNamespace(monotonic=lambda: clock[0]))
     ends = []
     for minutes in (0.01, 75 / 60, 95 / 60):
         clock[0], first = 0.0, npg.iteration

@@ -12,10 +12,18 @@ TASKS = Path(__file__).parent / "gated_tasks.py"
 
 
 def verdicts(run: lw.Run) -> list[dict[str, object]]:
-    return [json.loads(line) for line in (run.folder / "gate.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (run.folder / "gate.jsonl").read_text().splitlines()]
+    return sorted(rows, key=lambda row: row["seed"])
 
 
-def test_run_ends_once_a_policy_passes_the_gate_with_two_seeds(tmp_path: Path) -> None:
+@pytest.fixture
+def cores(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    monkeypatch.setattr("lyceum_warp.training.gating.cpu_cores", lambda: request.param)
+    return int(request.param)
+
+
+@pytest.mark.parametrize("cores", [2, 4], indirect=True)
+def test_run_ends_once_a_policy_passes_the_gate_with_two_seeds(cores: int, tmp_path: Path) -> None:
     words = ["train", f"{TASKS}:Easy", "--out", str(tmp_path / "run"), *TINY, *QUIET]
     assert cli.main([*words, "--iterations", "10000", "--gate-every", "2"]) == 0
     run = lw.Run.open(tmp_path / "run")
@@ -30,7 +38,8 @@ def test_run_ends_once_a_policy_passes_the_gate_with_two_seeds(tmp_path: Path) -
     assert again.numbers["distance"] == verdicts(run)[1]["numbers"]["distance"]  # type: ignore[index]
 
 
-def test_policies_that_fail_the_gate_are_counted_and_not_kept(tmp_path: Path) -> None:
+@pytest.mark.parametrize("cores", [2], indirect=True)
+def test_policies_that_fail_the_gate_are_counted_and_not_kept(cores: int, tmp_path: Path) -> None:
     env = lw.make(f"{TASKS}:Impossible", nworld=2, physics="exact")
     npg = lw.NPG(env, config=lw.NPGConfig(samples=12, hidden=(4,), value_hidden=(4,)))
     run = lw.train(npg, tmp_path / "run", 4, callbacks=[lw.PassGate(4)])

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.algos.common.half import SLOPES, activation_of
+from lyceum_warp.algos.common.networks import MLP, Normalizer
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.value import ValueFunction
 
@@ -22,17 +23,11 @@ def _elu_(x: _Array) -> None:
     np.copyto(x, np.expm1(x), where=x < 0.0)
 
 
-_tanh_slope = torch.ops.aten.tanh_backward.grad_input
-_relu_slope = torch.ops.aten.threshold_backward.grad_input
-_elu_slope = torch.ops.aten.elu_backward.grad_input
-
 # NumPy's tanh is several times as fast as torch's on some processors
-_ACTIVATIONS: dict[type[nn.Module], tuple[Callable[[_Array], Any], Callable[[torch.Tensor, torch.Tensor], Any]]] = {
-    nn.Tanh: (lambda x: np.tanh(x, out=x), lambda d, y: _tanh_slope(d, y, grad_input=d)),
-    nn.ReLU: (lambda x: np.maximum(x, 0.0, out=x), lambda d, y: _relu_slope(d, y, 0.0, grad_input=d)),
-    nn.ELU: (_elu_, lambda d, y: _elu_slope(d, 1.0, 1.0, 1.0, True, y, grad_input=d)),
-}
-"""Two functions for each activation: one applies it in place, the other multiplies by its derivative in place."""
+_ACTIVATIONS: dict[type[nn.Module], Callable[[_Array], Any]] = {
+    nn.Tanh: lambda x: np.tanh(x, out=x), nn.ReLU: lambda x: np.maximum(x, 0.0, out=x), nn.ELU: _elu_,
+}  # fmt: skip
+"""Functions that apply an activation in place."""
 
 _FEW = 2**18  # up to this number of multiplications, use NumPy, whose calls have less overhead than torch's
 
@@ -47,7 +42,7 @@ class DensePasses:
         self.parameters = [parameter.detach() for parameter in parameters]
         self.weights, self.biases = self.parameters[::2], self.parameters[1::2]
         self.activation = activation
-        self._activate, self._times_slope = _ACTIVATIONS[activation]
+        self._activate, self._times_slope = _ACTIVATIONS[activation], SLOPES[activation]
         self._parameter_arrays = [(w.numpy().T, b.numpy()) for w, b in zip(self.weights, self.biases, strict=True)]
         self._pulled = [torch.empty_like(parameter) for parameter in self.parameters]
         self._rows = 0
@@ -57,20 +52,11 @@ class DensePasses:
     @staticmethod
     def of(network: nn.Module) -> "DensePasses | None":
         """Wrap a CPU network made by ``mlp``; return None for any other network."""
-        layers: list[Any] = list(network) if type(network) is nn.Sequential else []
-        linear, activations = layers[::2], layers[1::2]
-        kind = type(activations[0]) if activations else nn.Tanh
         parameters = list(network.parameters())
-        supported = (
-            len(layers) % 2 == 1
-            and len(parameters) == 2 * len(linear)  # no layers share parameters
-            and all(type(layer) is nn.Linear and layer.bias is not None for layer in linear)
-            and kind in _ACTIVATIONS
-            and all(type(layer) is kind and getattr(layer, "alpha", 1.0) == 1.0 for layer in activations)
-            and all(p.device.type == "cpu" and p.dtype == torch.float32 for p in parameters)
-            and not any(map(_hooked, network.modules()))
-        )
-        return DensePasses(parameters, kind) if supported else None
+        usual = type(network) in (nn.Sequential, MLP)
+        on_cpu = all(p.device.type == "cpu" and p.dtype == torch.float32 for p in parameters)
+        kind = activation_of(network) if usual and on_cpu else None
+        return None if kind is None else DensePasses(parameters, kind)
 
     def _allocate(self, rows: int) -> None:
         widths = [len(bias) for bias in self.biases]
@@ -175,7 +161,3 @@ def predict(value: ValueFunction, obs: torch.Tensor, step: torch.Tensor) -> torc
     features = value.features(obs, step)
     output = passes(features.reshape(-1, features.shape[-1])).view(features.shape[:-1])
     return output * value.scale.float() + value.shift.float()
-
-
-def _hooked(module: nn.Module) -> bool:
-    return any(getattr(module, f"_forward{kind}_hooks") for kind in ("", "_pre"))

@@ -8,6 +8,7 @@ import contextlib
 import os
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import distributed
@@ -178,6 +179,30 @@ class Captured:
             if self.graph is None:
                 self.graph = self.team.capture(self.function)
             self.graph.replay()
+
+
+class Branch:
+    """Runs the kernels of a ``with`` block on a second CUDA stream, beside those that follow until ``join``.
+
+    Backward passes run on the streams of their forward passes. On a CPU, this does nothing.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._entered = torch.cuda.StreamContext(self.stream)
+
+    def __enter__(self) -> None:
+        if self.stream is not None:
+            self.stream.wait_stream(torch.cuda.current_stream(self.stream.device))
+        self._entered.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._entered.__exit__(*error)
+
+    def join(self) -> None:
+        """Let the current stream wait for the second stream."""
+        if self.stream is not None:
+            torch.cuda.current_stream(self.stream.device).wait_stream(self.stream)
 
 
 @contextlib.contextmanager

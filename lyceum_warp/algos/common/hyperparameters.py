@@ -9,6 +9,9 @@ from typing import Any, Literal, TypeAlias
 
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, finite_number, layer_sizes, whole_number
 
+Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
+"""The name of an activation function of a network."""
+
 Bound: TypeAlias = float | tuple[float, float]
 """The minimum of a number, or its minimum and its maximum."""
 

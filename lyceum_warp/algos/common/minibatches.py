@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 import torch
 
 from lyceum_warp.algos.common.distributed import Captured, Team
+from lyceum_warp.algos.common.networks import MLP
 
 Samples = Mapping[str, torch.Tensor]
 
@@ -72,11 +73,13 @@ class Minibatches:
 
 
 @contextlib.contextmanager
-def precision(*, tf32: bool) -> Iterator[None]:
-    """Use TensorFloat-32 for matrix products on a GPU if ``tf32`` is set."""
+def precision(*, tf32: bool, half: bool = False) -> Iterator[None]:
+    """Use TensorFloat-32 for matrix products on a GPU if ``tf32`` is set, and float16 in networks if ``half`` is."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("high" if tf32 else before)
+    MLP.in_half = half
     try:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
+        MLP.in_half = False

@@ -3,20 +3,20 @@
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import torch
 import warp as wp
 from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
+from lyceum_warp.algos.common.half import activation_of, half_layers
+from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, described
 from lyceum_warp.support.warp_log import start_warp
 
 Module = TypeVar("Module", bound=nn.Module)
-
-Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {
     "tanh": nn.Tanh, "relu": nn.ReLU, "leaky_relu": nn.LeakyReLU, "elu": nn.ELU, "selu": nn.SELU, "gelu": nn.GELU,
@@ -39,13 +39,27 @@ def check_memory(sizes: Sequence[int], networks: int = 1) -> None:
         )
 
 
+class MLP(nn.Sequential):
+    """Fully connected layers with activations between them, as ``mlp`` makes them."""
+
+    in_half: ClassVar[bool] = False
+    """Whether networks compute in half precision; their outputs can then be differentiated once."""
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Compute the outputs, (..., outputs)."""
+        if MLP.in_half and (activation := activation_of(self)):
+            return half_layers(self, activation, x)
+        outputs: torch.Tensor = super().forward(x)
+        return outputs
+
+
 def mlp(
     sizes: Sequence[int],
     *,
     activation: Activation = "tanh",
     last_scale: float = 1.0,
     generator: torch.Generator | None = None,
-) -> nn.Sequential:
+) -> MLP:
     """Make a fully connected network with Glorot-uniform weights and zero biases.
 
     ``sizes`` includes the input and the output. ``last_scale`` multiplies the last layer's initial weights.
@@ -66,7 +80,7 @@ def mlp(
             layers.append(kind())
     with torch.no_grad():
         linear.weight.mul_(last_scale)
-    return nn.Sequential(*layers)
+    return MLP(*layers)
 
 
 class GRU(nn.Module):
@@ -161,7 +175,7 @@ class Normalizer(nn.Module):
         self.register_buffer("square", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("shift", torch.zeros(size))
         self.register_buffer("scale", torch.ones(size))
-        self._seen: int | None = None  # ``count`` on the host, because reading a GPU's number waits for the device
+        self._first: bool | None = None  # whether ``count`` is 0; reading a GPU's number would wait for the device
 
     @torch.no_grad()
     def update(self, obs: torch.Tensor, team: Team | None = None, *, eps: float = 0.0) -> None:
@@ -172,10 +186,10 @@ class Normalizer(nn.Module):
         team = team or Team()
         obs = obs.reshape(-1, obs.shape[-1]).double()
         n = obs.shape[0] * team.size
-        if self._seen is None:
-            self._seen = int(self.count)
+        if self._first is None:
+            self._first = int(self.count) == 0
         obs = obs.clamp(*self._bounds(obs, team))
-        self._seen += n
+        self._first = False
         mean = team.sum(obs.sum(0)) / n
         square = team.sum((obs - mean).square().sum(0))
         total, delta = self.count + n, mean - self.mean
@@ -187,19 +201,20 @@ class Normalizer(nn.Module):
 
     def _bounds(self, obs: torch.Tensor, team: Team) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the limits of observations in an update from earlier observations, or else from trimmed ranges."""
-        mean, square, count = self.mean, self.square, self._seen
-        if not count:
-            ordered, count = obs.sort(0).values, len(obs)
-            trimmed = min(max(1, int(_TRIMMED * count)), (count - 1) // 2)
+        mean, square, count = self.mean, self.square, self.count
+        if self._first:
+            ordered, last = obs.sort(0).values, len(obs) - 1
+            trimmed = min(max(1, int(_TRIMMED * len(obs))), last // 2)
             low = team.sum(ordered[trimmed].clone()) / team.size
-            high = team.sum(ordered[count - 1 - trimmed].clone()) / team.size
+            high = team.sum(ordered[last - trimmed].clone()) / team.size
+            count = torch.full_like(count, len(obs))
             mean, square = (low + high) / 2.0, count * ((high - low) / 4.0).square()
         reach = _OUTLIER * ((square + _PRIOR) * (1.0 / (count + _PRIOR))).sqrt()
         return mean - reach, mean + reach
 
     def _load_from_state_dict(self, *args: Any) -> None:
         super()._load_from_state_dict(*args)
-        self._seen = None
+        self._first = None
 
     @torch.no_grad()
     def interpolate(self, before: _Applied, after: _Applied, part: torch.Tensor) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.common.networks import GRU, LIMIT, Activation, Normalized, check_memory, mlp, unrolled
+from lyceum_warp.algos.common.hyperparameters import Activation
+from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes

@@ -17,7 +17,8 @@ from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.validate import described, first_sentence, repeatable
+from lyceum_warp.support.tensors import repeatable
+from lyceum_warp.support.validate import described, first_sentence
 
 EXTRA = "pip install 'lyceum-warp[export]'"
 

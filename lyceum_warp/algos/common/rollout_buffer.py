@@ -68,6 +68,8 @@ class Rollout:
     metrics: dict[str, torch.Tensor]
     """Each metric of the task at each step, (steps, nworld)."""
 
+    index: torch.Tensor
+    """The next step to store, (1,) int32."""
     running_return: torch.Tensor
     """Sum of the rewards of each world's current episode, (nworld,); NaN in episodes that the statistics exclude."""
     faults: torch.Tensor
@@ -96,6 +98,7 @@ class Rollout:
             self._index = wp.zeros(1, dtype=int)
             self._return = wp.zeros(n, dtype=float)
             self._fault = wp.zeros(n, dtype=int)
+        self.index = torch_view(self._index)
         self.running_return, self.faults = torch_view(self._return), torch_view(self._fault)
         self._rows_before: list[_Pair] = []
         self._rows_after: list[_Pair] = []
@@ -116,6 +119,10 @@ class Rollout:
         graphs = Graphs(env.device, enabled=env.options.graphs)
         self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
+
+    def store_too(self, source: torch.Tensor) -> torch.Tensor:
+        """Let ``store_inputs`` also store a tensor, (nworld, size), and return the buffer, (steps, nworld, size)."""
+        return self._stored(source, self._rows_before)
 
     def _stored(self, source: torch.Tensor, into: list[_Pair]) -> torch.Tensor:
         rows: wp.array = wp.zeros((self.steps, *source.shape), dtype=float, device=self.env.device)

@@ -6,7 +6,8 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.algos.common.networks import LIMIT, Activation, Normalized, check_memory, initialize_as_torch, mlp
+from lyceum_warp.algos.common.hyperparameters import Activation
+from lyceum_warp.algos.common.networks import LIMIT, Normalized, check_memory, initialize_as_torch, mlp
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes

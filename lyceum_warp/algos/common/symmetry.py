@@ -44,9 +44,15 @@ class PolicyMirror(nn.Module):
         """Make the actions of a function symmetric.
 
         The function also acts on the mirrored observations, and these actions are mirrored back. The result is the mean
-        of both actions. A mirrored observation then gives the mirrored action, bit for bit.
+        of both actions. A mirrored observation then gives the mirrored action, bit for bit; on a GPU, only without
+        gradients.
         """
-        return 0.5 * (function(obs) + self.action(function(self.obs(obs))))
+        image = self.obs(obs)
+        if obs.is_cuda and torch.is_grad_enabled():  # one call is faster, but may round images differently
+            own, mirrored = function(torch.cat([obs, image])).chunk(2)
+        else:
+            own, mirrored = function(obs), function(image)
+        return 0.5 * (own + self.action(mirrored))
 
 
 def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:

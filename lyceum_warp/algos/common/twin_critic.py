@@ -12,7 +12,8 @@ from typing import Any
 import torch
 from torch import nn
 
-from lyceum_warp.algos.common.networks import ACTIVATIONS, LIMIT, Activation, Normalized, check_memory
+from lyceum_warp.algos.common.hyperparameters import Activation
+from lyceum_warp.algos.common.networks import ACTIVATIONS, LIMIT, Normalized, check_memory
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_word, layer_sizes, whole_number
 

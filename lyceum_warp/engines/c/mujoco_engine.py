@@ -26,8 +26,8 @@ from lyceum_warp.engines.c.native_rollout import NativeRollout, is_exact
 from lyceum_warp.engines.c.world_models import WorldModels, bytes_per_world as model_bytes_per_world
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_rows64, fill_rows64, narrow_bool, narrow_four, widen, widen_bool, widen_four
-from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, launch_worlds
+from lyceum_warp.kernels.state import copy_rows64, narrow_bool, narrow_four, widen, widen_bool, widen_four
+from lyceum_warp.support.arrays import flat, launch_rows, launch_several_rows, launch_worlds, repeated
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.mujoco_log import quiet
 from lyceum_warp.support.validate import whole_number
@@ -247,7 +247,7 @@ class MujocoEngine(Engine):
         launch_worlds(faults.faults_of_rows, self.nworld, args, self.device)
 
     def reset(self, mask: wp.array) -> None:
-        launch_rows(fill_rows64, mask, self._initial, self._rows)
+        launch_rows(copy_rows64, mask, repeated(self._initial, self.nworld), self._rows)
         self._read(self._state_fields, mask)
 
     def _read(self, fields: Iterable[Field], mask: wp.array) -> None:

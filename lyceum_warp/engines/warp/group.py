@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 import warp as wp
 
 from lyceum_warp.engines.warp import warp_kernels as kernels
+from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.support.arrays import flat
 
 _ALIGNED = 512
@@ -77,16 +78,18 @@ class Turns:
             wp.launch(kernels.next_group, 1, [self._count, 0, self._first, self._left])
 
             def body() -> None:
-                self._memory.open()
-                wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
-                turn()
-                wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
+                with self._memory():
+                    self._memory.open()
+                    wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
+                    turn()
+                    wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
 
             if not self._loop:
                 body()
                 return
-            with self._memory():
-                wp.capture_while(self._left, while_body=body)
+            # outside a graph, the host repeats the turns: from the second on, it replays one that it has captured
+            calls = Graphs(self.device, enabled=not self.device.is_capturing).sequence([Phase("turn", body)])
+            wp.capture_while(self._left, while_body=calls[0])
 
     def take(self, source: wp.array, target: wp.array) -> None:
         """Copy the group's rows from an array of all worlds (nworld, ...) to an array of the group (size, ...)."""

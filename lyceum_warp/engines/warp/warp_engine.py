@@ -26,8 +26,8 @@ from lyceum_warp.engines.warp.varied_model import (
     put_varied_model,
 )
 from lyceum_warp.kernels import faults
-from lyceum_warp.kernels.state import copy_columns, copy_rows, fill_rows, narrow, widen, zero_columns
-from lyceum_warp.support.arrays import alias, flat, launch_rows
+from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
+from lyceum_warp.support.arrays import alias, flat, launch_rows, repeated
 from lyceum_warp.support.upstream import has_sdf_functions, quicken_mujoco_warp
 
 _SPEC = mujoco.mjtState.mjSTATE_INTEGRATION.value
@@ -253,9 +253,9 @@ class WarpEngine(Engine):
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
             mjw.reset_data(self.m, self.d, reset=mask)
-            launch_rows(fill_rows, mask, self._zeros, self._jacobian)
+            launch_rows(copy_rows, mask, repeated(self._zeros, self.nworld), self._jacobian)
             if self._start is not None:
-                launch_rows(fill_rows, mask, self._start, self._state)
+                launch_rows(copy_rows, mask, repeated(self._start, self.nworld), self._state)
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)
 
     def commit(self, mask: wp.array, names: Collection[str] | None = None) -> None:

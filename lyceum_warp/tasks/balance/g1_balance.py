@@ -67,8 +67,12 @@ class G1Stand(balancing.Balance):
     physics = {
         "fast": lw.PhysicsOptions(
             timestep=0.01, frame_skip=2, solver={"iterations": 4, "ls_iterations": 5}, discardvisual=True
-        )
-    }
+        ),
+        "discrete": lw.PhysicsOptions(
+            integrator="discrete", timestep=0.02, frame_skip=1, solver={"iterations": 4, "ls_iterations": 5},
+            discardvisual=True,
+        ),
+    }  # fmt: skip
     planning = lw.Planning(
         settings=dict(horizon=30, samples=12, knots=6, noise=0.08, temperature=0.0075), options={"physics": "fast"}
     )

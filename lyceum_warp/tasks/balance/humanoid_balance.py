@@ -46,7 +46,10 @@ def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
 class HumanoidStand(balancing.Balance):
     model, frame_skip, horizon = "humanoid.xml", 5, 1333  # 20 s
     obs, actions = {"position": 22, "velocity": 23}, {"joint_target": "motors"}
-    physics = {"fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1)}
+    physics = {
+        "fast": lw.PhysicsOptions(integrator="implicitfast", timestep=0.015, frame_skip=1),
+        "discrete": lw.PhysicsOptions(integrator="discrete", timestep=0.015, frame_skip=1),
+    }
     planning = lw.Planning(
         settings=dict(horizon=40, samples=24, knots=8, noise=0.15, temperature=0.0075), options={"physics": "fast"}
     )

@@ -22,3 +22,7 @@ class Params(walking.BipedParams):
 class T1Velocity(walking.Biped):
     model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
     edit_model = walking.playground_model_edit(FEET)
+    training = lw.Training(
+        algorithm="ppo", settings={"log_std": -0.7, "symmetry": "exact"}, iterations=800, physics="coarse"
+    )
+    rewards = walking.Biped.rewards | {"track_linear_velocity": 4.0, "action_rate_l2": -0.02, "single_stance": 1.0}

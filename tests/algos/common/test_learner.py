@@ -11,7 +11,8 @@ from torch import nn
 
 import lyceum_warp as lw
 from lyceum_warp.algos import Team
-from lyceum_warp.cli.display import Display, console, curve_table
+from lyceum_warp.cli.display import console, curve_table
+from lyceum_warp.cli.progress import Display
 from lyceum_warp.training import Run
 
 

@@ -8,6 +8,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
+from lyceum_warp.algos.common.distributed import unflatten
 from lyceum_warp.algos.common.symmetry import PolicyMirror, reflections
 
 CONFIG = lw.PPOConfig(hidden=(16,), value_hidden=(16,), num_steps=16, mean_every=2, mean_episodes=2)
@@ -71,7 +72,7 @@ def test_mirrored_samples_add_the_mirrored_gradient(env: lw.Env) -> None:
     ppo.sample()
     samples = {name: part.flatten(0, 1) for name, part in ppo.evaluated_samples().items()}
     ppo.learn(samples, torch.full((len(samples["obs"]),), 1.0 / len(samples["obs"])))
-    weight = ppo.policy.network[0].weight.grad
+    weight = unflatten(ppo.optimizer.gradient, ppo._parameters)[1]  # after the standard deviations
     signs = torch.tensor([1.0, -1.0])
     rows, columns = signs, signs.repeat(3)
     assert weight.abs().min() < 1e-6 * weight.abs().max()
