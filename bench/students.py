@@ -36,7 +36,7 @@ class Options(experiment.Options):
     parts: tuple[str, ...] = ()
     """go1, hidden and clone; by default all."""
     iterations: int | None = None
-    """Iterations of each learner; by default 150 of a Go1's student, 300 of PPO and 200 of a clone."""
+    """Iterations of each learner; by default 150 of a Go1's student, 200 of PPO and of a clone."""
     nworld: int | None = None
     """Number of worlds; by default 4096 for a Go1 on a GPU, 128 on the CPU, and 64 for the other parts."""
 
@@ -55,12 +55,12 @@ class Case:
 def cases(options: Options) -> list[Case]:
     parts = choose(options.parts, PARTS, what="part")
     worlds = {"go1": 4096 if options.device.startswith("cuda") else 128, "hidden": 64, "clone": 64}
-    iterations = dict.fromkeys(PARTS, 2) if options.short else {"go1": 150, "hidden": 300, "clone": 200}
+    iterations = dict.fromkeys(PARTS, 2) if options.short else {"go1": 150, "hidden": 200, "clone": 200}
     kinds = {"go1": ("teacher", "GRU 256", "no memory"), "hidden": ("GRU 64", "no memory"), "clone": ("no memory",)}
     return [
         Case(part, kind, seed, options.iterations or iterations[part], options.nworld or worlds[part], options.device)
         for part in parts for seed in options.seeds or ((42,) if options.short else (42, 43, 44))
-        for kind in kinds[part]
+        for kind in kinds[part] if kind in options.contestants or not options.contestants
     ]  # fmt: skip
 
 
