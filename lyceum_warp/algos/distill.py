@@ -222,7 +222,8 @@ class Distill(Learner):
         steps, nworld = config.num_steps, env.nworld * team.size
         self.count = steps * nworld
         self.rollout = Rollout(env, steps)
-        self.label = torch.zeros_like(self.rollout.action)
+        self._label = torch.zeros_like(env.action)
+        self.label = self.rollout.store_too(self._label)
         """The teacher's actions, (steps, nworld, nact)."""
         self.noise = torch.empty(steps, nworld, env.action_space.size, device=device)
         self._player = Player(self.policy, env)
@@ -231,6 +232,8 @@ class Distill(Learner):
         self._step = GradientStep(learned, config.learning_rate, team, max_norm=config.max_grad_norm)
         self._loss = torch.zeros(1, device=device)
         self._epoch = Captured(self.learn, team, device)
+        self._act = Captured(self._choose, team, device)
+        self._observe = Captured(lambda: self.policy.observe(env.obs, team, eps=_EPS), team, device)
         self._evaluate_mean = MeanPolicyEvaluation(env, config, team)
         self.rollout.restart()
         players = [self._player]
@@ -294,19 +297,24 @@ class Distill(Learner):
 
         After each step, the normaliser is updated with the step's observations.
         """
-        env, rollout, std = self.env, self.rollout, self.policy.log_std.exp()
+        rollout = self.rollout
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            noise = self.noise[:, self.own_worlds]
             self._state.copy_(self._player.state)
             rollout.begin()
-            for t in range(rollout.steps):
-                torch.addcmul(self._player(env.obs), noise[t], std, out=env.action)
-                self.label[t] = self._labels(env.obs_groups[self.group])
+            for _ in range(rollout.steps):
+                self._act()
                 rollout.store_inputs()
-                env.step()
+                self.env.step()
                 rollout.store_outputs()
-                self.policy.observe(env.obs, self.team, eps=_EPS)
+                self._observe()
+
+    @torch.no_grad()
+    def _choose(self) -> None:
+        """Draw the student's actions, and ask the teacher."""
+        env, noise = self.env, self.noise.index_select(0, self.rollout.index)[0, self.own_worlds]
+        torch.addcmul(self._player(env.obs), noise, self.policy.log_std.exp(), out=env.action)
+        self._label.copy_(self._labels(env.obs_groups[self.group]))
 
     def recall(self) -> None:
         """Take the next steps of the episodes. Each world has its own place in them, and continues at their end."""

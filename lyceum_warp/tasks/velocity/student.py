@@ -44,4 +44,4 @@ def observe_teacher(s: walking.World, p: walking.Params, obs: walking.Policy):
 class Go1StudentVelocity(go1.Go1Velocity):
     """A Go1 that walks by its encoders and its inertial sensor; a policy of go1_velocity is its teacher."""
 
-    training = lw.Training(algorithm="distill", settings={"recurrent": 256}, iterations=300, physics="coarse")
+    training = lw.Training(algorithm="distill", settings={"recurrent": 256}, iterations=150, physics="coarse")

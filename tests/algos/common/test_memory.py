@@ -16,7 +16,7 @@ from lyceum_warp.env import Player
 from lyceum_warp.tuning.trial import SHORT, Trials
 from lyceum_warp.viewer.session.drivers import PolicyControl
 
-SMALL = lw.PPOConfig(hidden=(8,), value_hidden=(8,), num_steps=12, recurrent=6, mean_every=0)
+SMALL = lw.PPOConfig(hidden=(8,), value_hidden=(8,), num_steps=12, epochs=2, recurrent=6, mean_every=0)
 
 
 def in_viewer(env: lw.Env) -> None:
