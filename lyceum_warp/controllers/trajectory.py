@@ -98,7 +98,7 @@ class Trajectory:
     engine: str
     """Name of the plant's engine."""
     params: Mapping[str, Any]
-    """Parameters of the task."""
+    """Parameters of the task, without large tables that were not given."""
     versions: Mapping[str, Any]
     """Versions of packages and Python, the machine, and the commit."""
     seed: int | None
@@ -229,7 +229,11 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
 
 def provenance(env: Env) -> dict[str, Any]:
     """Collect the attributes of a trajectory that depend only on the environment."""
-    params = {name: np.asarray(value).tolist() for name, value in env.task.params.items()}
+    params = {
+        name: np.asarray(value).tolist()
+        for name, value in env.task.params.items()
+        if name in env.given_params or np.size(value) <= _LARGE
+    }
     return {
         "task": env.task.name, "engine": env.engine.name, "params": params, "versions": versions(env.device.alias),
         "state_parts": {name: [part.start, part.stop] for name, part in env.state_space.parts.items()},
@@ -237,6 +241,9 @@ def provenance(env: Env) -> dict[str, Any]:
         "action_names": env.action_space.columns, "source": source(env),
     }  # fmt: skip
 
+
+_LARGE = 10_000
+"""Largest number of elements of a table that is stored although it was not given."""
 
 _PLACEMENT = ("engine", "device", "nthread", "nworld", "seed", "first_world", "autoreset", "graphs", "fields")
 """Options that change neither the physics nor the states, and are not stored."""

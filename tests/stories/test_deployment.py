@@ -87,7 +87,7 @@ def test_control_loop_in_the_documentation_reproduces_steps_of_the_environment(
 def test_tracking_loop_in_the_documentation_reproduces_steps_of_the_environment(task: str, tmp_path: Path) -> None:
     page = program_of("tracking.md", "tracking_loop.py", tmp_path)
     torch.manual_seed(0)
-    env = lw.make(task, randomness=0.0, start_clip=1, start_frame=30)
+    env = lw.make(task, randomness=0.0, start_clip=1, start_frame=30, reference_share=0.5)
     policy = walking_policy(env)
     with torch.no_grad():
         policy.network[-1].weight *= 0.5

@@ -261,6 +261,15 @@ def test_evaluation_plays_each_clip_once(shared_env: SharedEnv) -> None:
         lw.evaluate_clips(shared_env("point_mass"), lambda obs: obs)
 
 
+def test_saved_episodes_hold_no_table_of_the_package(tmp_path: Path) -> None:
+    env = lw.make("go1_tracking", autoreset=False, start_clip=1)
+    episode = lw.control(env, lambda state, obs: torch.zeros(12), steps=10)
+    assert "reference_position" not in episode.params and episode.params["start_clip"] == 1
+    assert episode.save(tmp_path / "episode.npz").stat().st_size < 100_000
+    clip = lw.load_clips(tmp_path, env.model).qpos[0]
+    np.testing.assert_allclose(clip, episode.part("qpos"), atol=1e-6)
+
+
 def test_velocities_of_the_reference_are_differences(shared_env: SharedEnv) -> None:
     env = shared_env("go1_tracking", nworld=1)
     params = env.task.params
