@@ -188,11 +188,9 @@ class _Reader:
                     self._note(place, node, follows=False)
             return self.places.get(node.id)
         if isinstance(node, ast.Attribute):
-            named = isinstance(node.value, ast.Name)
-            owner = self.places.get(node.value.id) if named else self._read(node.value)
-            if owner:
-                return owner.attribute(node.attr)
-            return self.places.get(f"{node.value.id}.{node.attr}") if named else None
+            local = node.value.id if isinstance(node.value, ast.Name) else None
+            owner = self._read(node.value) if local is None else self.places.get(local)
+            return owner.attribute(node.attr) if owner else self.places.get(f"{local}.{node.attr}")
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
