@@ -15,6 +15,7 @@ from lyceum_warp.algos.common.evaluation import (
 )
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (
+    LEARNER_KERNELS as LEARNER_KERNELS,
     METRIC_COLUMN as METRIC_COLUMN,
     Iteration as Iteration,
     Learner as Learner,

@@ -21,6 +21,7 @@ _COMMANDS = {
     "new": ("new_task", "Write a task file for a model."),
     "check": ("check", "Check that a task follows the package's rules."),
     "train": ("train", "Train a policy on a task, with NPG, PPO or SAC."),
+    "compile": ("compile", "Compile the kernels of a task ahead of time, also for the GPU of another machine."),
     "eval": ("evaluate", "Evaluate a run's policy, and print statistics of its episodes."),
     "gate": ("gate", "Test whether a run's policy passes the gate of its task, such as whether a robot walks."),
     "export": ("export", "Write a run's policy to an ONNX or .pt2 file."),

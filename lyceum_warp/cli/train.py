@@ -243,7 +243,7 @@ class Train:
         for name, default in _SETTINGS.items():
             settings[name] = saved.get(name, default) if (value := getattr(self, name)) is None else value
         if not saved and self.exact_from is None:
-            settings["exact_from"] = self._training().exact_from
+            settings["exact_from"] = self.suggested().exact_from
         if self.resume is None:
             settings["target_return"] = self.target_return
         return settings
@@ -320,7 +320,7 @@ class Train:
 
     def _suggestion(self, team: "algos.Team") -> "training.Configuration":
         """Return the configuration that the task suggests."""
-        suggested, hyperparameters = self._training(), None
+        suggested, hyperparameters = self.suggested(), None
         try:
             if suggested.settings:
                 hyperparameters = training.ALGORITHMS[suggested.algorithm][1](**suggested.settings)
@@ -336,7 +336,7 @@ class Train:
             iterations=suggested.iterations,
         )
 
-    def _training(self) -> "core.Training":
+    def suggested(self) -> "core.Training":
         """Return the task's suggestions, or the defaults if a flag chooses another algorithm."""
         assert self.task is not None
         suggested = binding.find_task(self.task).training

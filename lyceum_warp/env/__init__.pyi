@@ -5,6 +5,7 @@ from lyceum_warp.env.curriculum import (
 )
 from lyceum_warp.env.env import (
     Env as Env,
+    compile_kernels as compile_kernels,
     make as make,
 )
 from lyceum_warp.env.openloop import OpenLoop as OpenLoop

@@ -14,7 +14,7 @@ import warp as wp
 from lyceum_warp.binding.attributes import check_fields
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
-from lyceum_warp.binding.registry import errors_of, find_task
+from lyceum_warp.binding.registry import errors_of, find_task, task_name
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
@@ -23,10 +23,10 @@ from lyceum_warp.core.options import OPTIONS, EnvOptions, PhysicsOptions
 from lyceum_warp.core.spaces import Space
 from lyceum_warp.core.task import Task
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.placement import find_device, open_engine, options_for_few_worlds
+from lyceum_warp.engines.placement import options_for_few_worlds
 from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.probe import Probe
-from lyceum_warp.env.worlds import Worlds
+from lyceum_warp.env.worlds import Worlds, open_worlds
 from lyceum_warp.graphs.compilation import compile_ahead
 from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
@@ -35,7 +35,8 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.suggestions import Named, did_you_mean
 from lyceum_warp.support.tensors import check_tensor
-from lyceum_warp.support.validate import check_group, check_kind, whole_number
+from lyceum_warp.support.validate import check_group, check_kind, check_word, whole_number
+from lyceum_warp.support.warp_log import start_warp
 
 _BUFFERS = (*step_types.OUTCOMES, "obs", "final_obs", "action")
 
@@ -191,19 +192,10 @@ class Env:
         self._scratch: Env | None = None
         with errors_of(task), without_collection():
             self.options = options = options.changed({"physics": options.physics.resolved(task.physics)})
-            self.nworld = options.nworld
-            self.task = BoundTask(
-                task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
-                physics=options.physics, params=params,
-            )  # fmt: skip
-            self.timestep, self.device = self.task.timestep, find_device(options.device)
-            self.engine = open_engine(
-                options.engine, self.task.model, self.nworld, self.device, self.task.fields,
-                dynamics=self.task.dynamics, initial=self.task.initial, reserved=own_bytes_per_world(self.task),
-                **options.for_engine(),
-            )  # fmt: skip
+            self.worlds = worlds = open_worlds(task, options, params)
+            self.task, self.engine, self.device = worlds.task, worlds.engine, worlds.device
+            self.nworld, self.timestep = options.nworld, self.task.timestep
             try:
-                self.worlds = worlds = Worlds(self.task, self.engine, options)
                 call_once_gone(self, worlds.drop_programs)
                 for name, buffer in worlds.buffers.items():
                     setattr(self, name, buffer)
@@ -647,6 +639,44 @@ class Env:
         """Count the faults of each kind since construction. This waits for the device."""
         counts = self.worlds.episodes.fault_count.numpy().sum(axis=0)
         return {bit.name.lower(): int(counts[bit.bit_length() - 1]) for bit in FAULTS}  # type: ignore[union-attr]
+
+
+def compile_kernels(
+    task: str | Path | type[Task],
+    options: EnvOptions,
+    params: Mapping[str, Any],
+    *,
+    arch: str,
+    kernels: Iterable[wp.Kernel] = (),
+) -> None:
+    """Compile the kernels that an environment launches on a GPU into Warp's cache, on a machine without that GPU.
+
+    Args:
+        task: See ``Env``.
+        options: The options of the environment. Its kernels do not depend on the number of worlds.
+        params: Parameters of the task by name.
+        arch: The CUDA architecture of the GPU, such as "sm_90".
+        kernels: More kernels, whose modules are compiled, too.
+
+    Raises:
+        ValueError: An argument is not valid, ``deterministic`` is set, or MuJoCo Warp does not support the task's
+            model.
+    """
+    task, _ = find_task(task), start_warp()
+    numbers = {f"sm_{number}": number for number in wp.get_cuda_supported_archs()}
+    check_word("arch", arch, list(numbers))
+    if options.physics.deterministic:
+        raise ValueError("deterministic=True needs the GPU to compile its kernels: compile on the GPU's machine")
+    with errors_of(task):
+        placement = {"physics": options.physics.resolved(task.physics), "engine": "warp", "device": "cpu"}
+        options = options.changed(placement)
+
+        def launch() -> None:
+            open_worlds(task, options, params).rehearsal()
+            for kernel in kernels:
+                wp.launch(kernel, 1)
+
+        compile_ahead(launch, None, task_name(task), arch=numbers[arch])
 
 
 def _copied(values: torch.Tensor, out: torch.Tensor | None) -> torch.Tensor:

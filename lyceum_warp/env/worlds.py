@@ -1,7 +1,9 @@
 """Run the phases of a step, of a reset, and of reading and restoring states."""
 
 import dataclasses
+from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import torch
 import warp as wp
@@ -9,8 +11,10 @@ import warp as wp
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.core.fields import Stage
 from lyceum_warp.core.options import EnvOptions
-from lyceum_warp.core.task import MEMORIES
+from lyceum_warp.core.task import MEMORIES, Task
 from lyceum_warp.engines.base import Engine
+from lyceum_warp.engines.placement import find_device, open_engine
+from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.resets import Resets
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
@@ -34,6 +38,19 @@ class Programs:
     rand_reset: Calls
     read_state: Calls
     restore_state: Calls
+
+
+def open_worlds(task: type[Task], options: EnvOptions, params: Mapping[str, Any]) -> "Worlds":
+    """Bind a task to its model and parameters, open its engine, and allocate the arrays of its worlds."""
+    bound = BoundTask(
+        task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
+        physics=options.physics, params=params,
+    )  # fmt: skip
+    engine = open_engine(
+        options.engine, bound.model, options.nworld, find_device(options.device), bound.fields,
+        dynamics=bound.dynamics, initial=bound.initial, reserved=own_bytes_per_world(bound), **options.for_engine(),
+    )  # fmt: skip
+    return Worlds(bound, engine, options)
 
 
 class Worlds(Resets):

@@ -87,8 +87,26 @@ def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any
         wp.launch(kernel, size, [*args, first], device=device, **options)
 
 
+_AS_ON_CUDA: ContextVar[bool] = ContextVar("_AS_ON_CUDA", default=False)
+"""Whether to launch on the CPU with the block sizes of a CUDA device."""
+
+
+@contextlib.contextmanager
+def launches_as_on_cuda() -> Iterator[None]:
+    """Give the launches of this module the block sizes of a CUDA device, to list the modules that they need there."""
+    token = _AS_ON_CUDA.set(True)
+    try:
+        yield
+    finally:
+        _AS_ON_CUDA.reset(token)
+
+
+def _on_cuda(device: wp.Device | None) -> bool:
+    return _AS_ON_CUDA.get() or wp.get_device(device).is_cuda
+
+
 def _block(device: wp.Device | None) -> int:
-    return WORLDS_A_BLOCK if wp.get_device(device).is_cuda else 1
+    return WORLDS_A_BLOCK if _on_cuda(device) else 1
 
 
 def launch_worlds(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp.Device | None) -> None:
@@ -107,15 +125,16 @@ def launch_lanes(kernel: wp.Kernel, nworld: int, args: Sequence[Any], device: wp
     Its last arguments are the number of lanes and the first world's index. Lanes are threads that share the work on a
     world. The CPU uses one lane. A GPU uses 32 lanes, so that memory access is coalesced.
     """
-    lanes = 32 if device.is_cuda else 1
-    _launch(kernel, (nworld, lanes), 0, [*args, lanes], device)
+    lanes = 32 if _on_cuda(device) else 1
+    # the block size of launch_worlds, because Warp compiles a task's module for each block size
+    _launch(kernel, (nworld, lanes), 0, [*args, lanes], device, block_dim=_block(device))
 
 
 def launch_rows(kernel: wp.Kernel, mask: wp.array, source: wp.array, target: wp.array) -> None:
     """Launch a copying kernel of ``kernels.state`` over the selected rows of the target, (nworld, n)."""
     if target.size == 0:
         return
-    lanes = min(32, target.shape[1]) if wp.get_device(target.device).is_cuda else 1
+    lanes = min(32, target.shape[1]) if _on_cuda(target.device) else 1
     _launch(kernel, (target.shape[0], lanes), 0, [mask, source, target, lanes], target.device)
 
 

@@ -90,19 +90,30 @@ def refuse_integer_divisions(prefix: str) -> None:
     codegen.Adjoint.add_builtin_call = checked
 
 
-def is_compiled(module: Any, block: int, device: wp.Device) -> bool:
+def is_compiled(module: Any, block: int, device: wp.Device | None, arch: int | None = None) -> bool:
     """Return whether Warp has loaded a module for a block size, or has it in its cache.
 
-    If Warp's internals have changed, the result is always False. A wrong False only costs time.
+    With ``arch``, the device is None, and the result is about any device of this CUDA architecture. If Warp's internals
+    have changed, the result is always False. A wrong False only costs time.
     """
-    if (device.context, block) in module.execs:
+    if device is not None and (device.context, block) in module.execs:
         return True
     try:
         module.get_module_hash(block)
         folder = Path(wp.config.kernel_cache_dir or "", module.get_module_identifier(block))
-        return (folder / module._get_compile_output_name(device, block_dim=block)).is_file()
+        return (folder / module._get_compile_output_name(device, arch, block_dim=block)).is_file()
     except AttributeError:
         return False
+
+
+def compile_module(module: Any, block: int, device: wp.Device | None, arch: int | None = None) -> None:
+    """Compile a module for a block size into Warp's cache; for the arguments, see ``is_compiled``."""
+    if device is not None:
+        wp.force_load(device, modules=[module], block_dim=block, max_workers=0)
+        return
+    # wp.compile_aot_module compiles for the module's own block size only
+    module.get_module_hash(block)
+    module._compile(None, output_arch=arch, options=module.resolved_options[block])
 
 
 # the C engine does not need MuJoCo Warp

@@ -36,6 +36,7 @@ SMALL: dict[str, dict[str, tuple[str, ...]]] = {
     },
     "train --resume good": {"--iterations": ("2",), "--no-video": (), "--no-plot": ()},
     "train --from good": {"--iterations": ("1",), "--no-video": (), "--no-plot": ()},
+    "compile": {"--horizon": ("4",)},
     "eval": {"--episodes": ("2",)},
     "export": {"--to": ("policy.pt2",)},
     "plan": {

@@ -12,8 +12,12 @@ import torch
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.replay import Replay
 from lyceum_warp.env.env import Env
+from lyceum_warp.kernels import collect, returns
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, whole_number
+
+LEARNER_KERNELS = (collect.store_steps, returns.advantages)
+"""A kernel of each module that learners launch."""
 
 METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
 """Prefixes of the metrics' columns in metrics.csv: sums over an episode, and means over all samples."""
