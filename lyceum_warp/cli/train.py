@@ -28,6 +28,7 @@ from lyceum_warp.core import EnvOptions, PhysicsOptions, Training
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
+from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training import (
     ALGORITHMS,
     EPISODES,
@@ -104,6 +105,8 @@ class Train:
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
+    $ lyceum-warp train hopper --out runs/mine --continue
+    $ lyceum-warp train hopper --seeds 5 --jobs 2 --out runs/five
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
@@ -115,7 +118,10 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "device")
+    USUAL = (
+        "algorithm", "iterations", "minutes", "seed", "seeds", "jobs", "out", "go_on", "resume", "nworld", "param",
+        "device",
+    )  # fmt: skip
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
@@ -131,10 +137,19 @@ class Train:
     """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
+    seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N|SEED ...", help_behavior_hint="")] = ()
+    """Train this number of seeds, counted from 0, or these seeds, each in a process and a run of its own in --out. The
+    same command continues an interrupted training."""
+    jobs: int = 1
+    """Number of seeds that train at the same time, with --seeds. They share the CPU cores and the GPUs."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, which must be new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Resume the run in the given folder from its exact state and with its settings, up to --iterations."""
+    go_on: Annotated[bool, tyro.conf.arg(name="continue")] = False
+    """Start the run in --out, or resume it if it has begun, so that a job can be killed and started again with the same
+    command. If the run is complete, only its report is printed.
+    """
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of another run. The other run's settings
     are the defaults. However, a different TASK has its own parameters, and a different --algorithm has its own
@@ -195,36 +210,70 @@ class Train:
 
     def run(self) -> int:
         self._check_flags()
+        if self.seeds:
+            return self._run_seeds()
         folder = self.resume or self.from_run
         source = None if folder is None else Run.open(folder)
+        with join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
+            if not team.leads:  # only one process prints messages
+                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
+            if self.out is not None and self.go_on and team.largest(int(team.leads and Run.begun(self.out)))[0]:
+                source = Run.open(self.out)
+                return self._continued(source)._run(source, team)
+            return self._run(source, team)
+
+    def _run_seeds(self) -> int:
+        from lyceum_warp.cli.seeds import settings_of, train_and_show
+
+        assert self.task is not None
+        seeds = self.seeds
+        if len(seeds) == 1:
+            seeds = tuple(range(whole_number("--seeds", seeds[0], low=1)))
+        folder = self.out or _new_folder(task_name(find_task(self.task)))
+        settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on"))
+        return train_and_show(self.task, folder, seeds, self.jobs, settings)
+
+    def _run(self, source: Run | None, team: Team) -> int:
         settings = self._settings({} if source is None else source.config)
         camera = parsed_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
-        with join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
-            if not team.leads:  # only one process prints messages
-                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
-            with team.together():  # check all options before the folder is created
-                configuration = self.configuration(source, team)
-                learner, folder, entries = self._learner(configuration, source, team)
-                find_camera(learner.env.model, camera)
-                callbacks = self._callbacks(settings)
-            total = configuration.iterations
-            hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-            try:
-                run = train(
-                    learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
-                    **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
-                    take_over=self.take_over, entries=settings | entries,
-                )  # fmt: skip
-            except Interrupted as signalled:
-                if team.leads and (folder / "policy.pt").exists():
-                    self._say_interrupted(folder, signalled, total, hint)
-                return 128 + signalled.number
-            if not team.leads:
-                return 0
-            self._say_end(run, learner.iteration, total, hint)
-            return self._report(run, learner)
+        with team.together():  # check all options before the folder is created
+            configuration = self.configuration(source, team)
+            learner, folder, entries = self._learner(configuration, source, team)
+            find_camera(learner.env.model, camera)
+            callbacks = self._callbacks(settings)
+        total = configuration.iterations
+        hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+        if source is not None and self.go_on and self.resume and _is_complete(source, total, settings):
+            if team.leads:
+                say(f"the run in {folder} is complete")
+            return self._report(source, learner) if team.leads else 0
+        try:
+            run = train(
+                learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
+                **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
+                take_over=self.take_over and self.resume is not None, entries=settings | entries,
+            )  # fmt: skip
+        except Interrupted as signalled:
+            if team.leads and (folder / "policy.pt").exists():
+                self._say_interrupted(folder, signalled, total, hint)
+            return 128 + signalled.number
+        if not team.leads:
+            return 0
+        self._say_end(run, learner.iteration, total, hint)
+        return self._report(run, learner)
+
+    def _continued(self, source: Run) -> "Train":
+        """Return the command that resumes the run in --out, which must have the settings of the given flags."""
+        kept = dict.fromkeys(("algorithm", "seed", "threads"))
+        for name in kept:
+            if (value := getattr(self, name)) not in (None, source.config[name]):
+                raise ValueError(
+                    f"{source.folder} has {name} {source.config[name]}, not {value}: omit --{name}, or start a new run "
+                    "in another folder"
+                )
+        return dataclasses.replace(self, resume=self.out, out=None, from_run=None, **kept)
 
     def _check_flags(self) -> None:
         if self.resume is not None:
@@ -233,8 +282,14 @@ class Train:
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
-        if self.take_over and self.resume is None:
-            raise ValueError("--take-over has no effect without --resume: omit it")
+        if self.seeds and (self.resume is not None or self.seed is not None or not self.task):
+            raise ValueError("--seeds takes a task, and neither --seed nor --resume: the same command continues its runs")
+        if self.jobs != 1 and not self.seeds:
+            raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
+        if self.go_on and self.out is None:
+            raise ValueError("--continue needs the run's folder: add --out FOLDER")
+        if self.take_over and self.resume is None and not self.go_on:
+            raise ValueError("--take-over has no effect without --resume or --continue: omit it")
 
     def _settings(self, saved: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings of ``_SETTINGS``: the flags, those of the source run, or the task's suggestions."""
@@ -366,8 +421,7 @@ class Train:
                     )
         if source is not None and self.task is None and self.resume is None:
             note_changes(source, learner.env)
-        name = f"{file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        return learner, self.resume or self.out or Path("runs", name), entries
+        return learner, self.resume or self.out or _new_folder(learner.env.task.name), entries
 
     def _report(self, run: Run, learner: Learner) -> int:
         env = learner.env
@@ -398,3 +452,16 @@ class Train:
             note(f"the {choice.which} policy returns {score.mean:.1f}; {demand}")
             return 1
         return 0
+
+
+def _new_folder(task: str) -> Path:
+    return Path("runs", f"{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+
+
+def _is_complete(run: Run, total: int, settings: Mapping[str, Any]) -> bool:
+    """Return whether a run has all its iterations, has reached its target return, or has passed its gate."""
+    reached, target = run.config.get("reached"), settings["target_return"]
+    if reached is not None and target is not None and reached["return"] >= target:
+        return True
+    passed = settings["gate_every"] and "passed" in run.config
+    return bool(passed) or run.read()["iteration"] >= total

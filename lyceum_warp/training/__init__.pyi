@@ -5,6 +5,16 @@ from lyceum_warp.training.callbacks import (
     TransferTest as TransferTest,
     Videos as Videos,
 )
+from lyceum_warp.training.comparison import (
+    RunCurve as RunCurve,
+    RunGroup as RunGroup,
+    comparison_figure as comparison_figure,
+    differing as differing,
+    group_runs as group_runs,
+    mean_curve as mean_curve,
+    read_curve as read_curve,
+    read_curves as read_curves,
+)
 from lyceum_warp.training.curve import learning_curve as learning_curve
 from lyceum_warp.training.gating import PassGate as PassGate
 from lyceum_warp.training.loop import train as train
@@ -39,4 +49,5 @@ from lyceum_warp.training.runs.task_copy import (
     run_env as run_env,
     task_copy as task_copy,
 )
+from lyceum_warp.training.seeds import SeedRun as SeedRun, flag_words as flag_words, train_seeds as train_seeds
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard

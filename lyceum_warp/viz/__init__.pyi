@@ -20,6 +20,7 @@ from lyceum_warp.viz.render import (
 from lyceum_warp.viz.style import (
     ACCENT as ACCENT,
     LINE as LINE,
+    STYLES as STYLES,
     finish_axes as finish_axes,
     new_figure as new_figure,
     save_png as save_png,

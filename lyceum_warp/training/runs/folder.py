@@ -115,6 +115,20 @@ class Run:
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _UNFINISHED):
             raise ValueError(f"{folder} exists and is not an empty folder: use another folder")
 
+    @staticmethod
+    def begun(folder: Path) -> bool:
+        """Return whether a folder has a run that can be resumed.
+
+        If a process was killed while it created a run, before the first save, what it has left is deleted.
+        """
+        if (folder / "checkpoint.pt").exists() or (folder / "previous.pt").exists():
+            return True
+        left = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if _CONFIG in left and "metrics.csv" not in left:
+            Run.open(folder)  # raises an error in a planner's folder
+            shutil.rmtree(folder)
+        return False
+
     @classmethod
     def create(
         cls,
