@@ -13,6 +13,7 @@ from lyceum_warp.algos.common.evaluation import (
 from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (
     METRIC_COLUMN as METRIC_COLUMN,
+    STEP_METRIC_COLUMN as STEP_METRIC_COLUMN,
     Iteration as Iteration,
     Learner as Learner,
 )

@@ -22,6 +22,8 @@ _COMMANDS = {
     "check": ("check", "Check that a task follows the package's rules."),
     "train": ("train", "Train a policy on a task, with NPG, PPO or SAC."),
     "eval": ("evaluate", "Evaluate a run's policy, and print statistics of its episodes."),
+    "plot": ("plot", "Plot runs, and compare their returns, settings and versions."),
+    "report": ("report", "Write a page on a run: settings, curves, verdicts and an episode."),
     "gate": ("gate", "Test whether a run's policy passes the gate of its task, such as whether a robot walks."),
     "export": ("export", "Write a run's policy to an ONNX or .pt2 file."),
     "plan": ("plan", "Control a task with a planner, and report rewards, success and planning times."),

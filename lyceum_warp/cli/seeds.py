@@ -11,6 +11,7 @@ from rich.table import Table
 
 from lyceum_warp import training
 from lyceum_warp.cli.display import console, say, table, tried
+from lyceum_warp.cli.plot import print_groups
 
 
 def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, settings: Mapping[str, Any]) -> int:
@@ -29,7 +30,7 @@ def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, set
         runs = training.train_seeds(task, folder, seeds, jobs=jobs, watch=watch, **settings)
     console.print(_progress(runs))
     groups = training.group_runs(training.read_curves([folder]))
-    print_summary(groups)
+    print_groups(groups)
     failed = [run for run in runs if run.state != "complete"]
     content = {
         "states": {run.seed: run.state for run in runs},
@@ -55,31 +56,6 @@ def _progress(runs: Sequence[Any]) -> Table:
         ])  # fmt: skip
     headings = ("seed", "state", "iter", "samples", "return", "mean\npolicy", "error")
     return table(dict(zip(headings, zip(*rows, strict=True), strict=True)))
-
-
-def print_summary(groups: Sequence[Any]) -> None:
-    """Print the final returns of groups of runs, with their gates and their verdicts on transfer."""
-    rows = []
-    for group in groups:
-        summary = group.summary()
-
-        def interval(name: str, summary: Mapping[str, Any] = summary) -> str:
-            if name not in summary:
-                return ""
-            low, high = summary[f"{name}_interval"]
-            return f"{summary[name]:.5g}" + (f" [{low:.5g}, {high:.5g}]" if low == low else "")
-
-        passed = [run for run in group.runs if run.gate.startswith("passed")]
-        tested = [run for run in group.runs if run.gate]
-        rows.append([
-            group.task, group.label, str(len(group.runs)),
-            interval("mean"), interval("interquartile_mean"), f"{len(passed)} of {len(tested)} passed" if tested else "",
-            "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
-        ])  # fmt: skip
-    headings = ("task", "settings", "runs", "final return\n[95 %, t]", "interquartile mean\n[95 %, bootstrap]", "gate",
-                "transfer")  # fmt: skip
-    columns = dict(zip(headings, zip(*rows, strict=True), strict=True))
-    console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
 
 
 def settings_of(command: Any, omit: Sequence[str]) -> dict[str, Any]:

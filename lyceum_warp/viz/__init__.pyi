@@ -5,7 +5,7 @@ from lyceum_warp.viz.cameras import (
     parsed_camera as parsed_camera,
 )
 from lyceum_warp.viz.extra import NoVideoError as NoVideoError
-from lyceum_warp.viz.page import write_states as write_states
+from lyceum_warp.viz.page import write_page as write_page, write_states as write_states
 from lyceum_warp.viz.pictures import WorldPictures as WorldPictures
 from lyceum_warp.viz.policy_videos import (
     NamedProgress as NamedProgress,

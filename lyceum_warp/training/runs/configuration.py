@@ -33,10 +33,13 @@ def describe(learner: Learner) -> dict[str, Any]:
     if isinstance(options.model, str | Path):
         entries["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
+    task = env.task.definition
+    weights = {name: float(env.given_params.get(name, weight)) for name, weight in task.rewards.items()}
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.definition),
         "params": {name: json_value(name, value) for name, value in env.given_params.items()},
+        "terms": {"rewards": weights, "ends": [*task.terminations, *task.truncations]},
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",

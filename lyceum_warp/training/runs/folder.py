@@ -37,7 +37,7 @@ _ENTRIES: dict[str, Any] = {
     "algorithm": str, "nworld": _COUNT, "threads": _COUNT, "seed": _COUNT, "iterations": _COUNT, "keep_every": _COUNT,
     "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
     "reached": {"iteration": _COUNT, "return": float | int}, "exact_from": int | None, "gate_every": _COUNT,
-    "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list,
+    "terms": {"rewards": dict, "ends": list}, "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list,
     "kept": {
         "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
         "modules": dict, "program": bool,
