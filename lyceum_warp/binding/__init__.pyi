@@ -10,6 +10,7 @@ from lyceum_warp.binding.opened_files import (
 )
 from lyceum_warp.binding.parameters import defaults as defaults
 from lyceum_warp.binding.registry import (
+    class_in_file as class_in_file,
     errors_of as errors_of,
     file_name as file_name,
     find_task as find_task,

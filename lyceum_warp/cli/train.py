@@ -20,7 +20,9 @@ from lyceum_warp.cli.arguments import (
     OptionFlags,
     ParamWords,
     Physics,
+    Repeated,
     given,
+    parameter,
     parameters,
 )
 from lyceum_warp.cli.display import Display, console, curve_table, note, say, tried
@@ -42,6 +44,7 @@ from lyceum_warp.training import (
     TransferTest,
     Videos,
     choose_policy,
+    learner_classes,
     learning_curve,
     load,
     note_changes,
@@ -77,8 +80,7 @@ class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.v
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""
-        if algorithm not in ALGORITHMS:
-            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(ALGORITHMS)}")
+        kind = learner_classes(algorithm)[1]
         flags = given(self)
         owners = {
             name: [key for key, (_, kind) in ALGORITHMS.items() if name in kind.__dataclass_fields__] for name in flags
@@ -89,7 +91,7 @@ class Hyperparameters(OptionFlags, options=[config for _, config in ALGORITHMS.v
                     f"--{name.replace('_', '-')} is a setting of {' or '.join(algorithms)}, not of {algorithm}: "
                     f"omit it, or give --algorithm {' or '.join(algorithms)}"
                 )
-        return dataclasses.replace(config or ALGORITHMS[algorithm][1](), **flags)
+        return config if kind is None else dataclasses.replace(config or kind(), **flags)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -127,10 +129,13 @@ class Train:
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
     --resume, it replaces the file of the run's own task.
     """
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac")] = None
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac|FILE")] = None
     """npg (the natural policy gradient), ppo, or sac (soft actor-critic with a replay buffer). The default is the
-    algorithm that the task suggests: ppo for walking robots, npg for others.
+    algorithm that the task suggests: ppo for walking robots, npg for others. path/to/file.py:Class is a learner of your
+    own, a subclass of lw.Learner. --resume needs this word again.
     """
+    setting: Repeated = ()
+    """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
     suggests, or 100.
@@ -266,9 +271,12 @@ class Train:
 
     def _continued(self, source: Run) -> "Train":
         """Return the command that resumes the run in --out, which must have the settings of the given flags."""
-        kept = dict.fromkeys(("algorithm", "seed", "threads"))
+        kept: dict[str, Any] = dict.fromkeys(("algorithm", "seed", "threads"))
         for name in kept:
-            if (value := getattr(self, name)) not in (None, source.config[name]):
+            value = getattr(self, name)
+            if name == "algorithm" and ".py:" in str(value):
+                kept[name], value = value, learner_classes(value)[0].algorithm
+            if value not in (None, source.config[name]):
                 raise ValueError(
                     f"{source.folder} has {name} {source.config[name]}, not {value}: omit --{name}, or start a new run "
                     "in another folder"
@@ -278,7 +286,7 @@ class Train:
     def _check_flags(self) -> None:
         if self.resume is not None:
             for name, flag in _RUN_FLAGS.items():
-                if getattr(self, name) is not None:
+                if getattr(self, name) is not None and not (name == "algorithm" and ".py:" in str(self.algorithm)):
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
@@ -345,9 +353,9 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: resume "
-                "it in Python by lw.train(learner, lw.Run.open(folder), ...), or begin a new run from its policy by "
-                "--from and --algorithm"
+                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: name its "
+                "class, as in --algorithm path/to/file.py:Class, or begin a new run from its policy by --from and "
+                "--algorithm"
             )
         options = self._given("nworld", "seed") | given(self.env) | given(self.physics)
         if "solver" in options:
@@ -356,6 +364,8 @@ class Train:
         if source is None or self.task is None or task_name(find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
+        if self.setting or algorithm not in ALGORITHMS:
+            hyperparameters = self._own_settings(algorithm, source)
         return dataclasses.replace(
             base,
             **self._given("task", "threads", "iterations"),
@@ -365,6 +375,17 @@ class Train:
             hyperparameters=self.hyperparameters.on_top_of(hyperparameters, algorithm),
             seed=base.seed if self.seed is None else None,
         )
+
+    def _own_settings(self, algorithm: str, source: Run | None) -> Any:
+        """Return the hyperparameters of the user's own learner: the given ones on top of the source run's."""
+        kind, config = learner_classes(algorithm)
+        if algorithm in ALGORITHMS or (config is None and self.setting):
+            raise ValueError(f"--setting has no effect with {algorithm}: use the flags of its hyperparameters")
+        saved = {} if source is None or source.config["algorithm"] != kind.algorithm else source.config[kind.algorithm]
+        try:
+            return None if config is None else config(**{**saved, **dict(map(parameter, self.setting))})
+        except TypeError as error:
+            raise ValueError(f"--setting {' '.join(self.setting)}: {error}") from error
 
     def _suggestion(self, team: Team) -> Configuration:
         """Return the configuration that the task suggests."""
@@ -403,7 +424,8 @@ class Train:
         if source is not None:
             policy, value, iteration = saved_networks(source, self.which if self.resume is None else None)
             algorithm = configuration.algorithm
-            if policy is not None and isinstance(policy, SquashedPolicy) != (algorithm == "sac"):
+            known = algorithm in ALGORITHMS
+            if known and policy is not None and isinstance(policy, SquashedPolicy) != (algorithm == "sac"):
                 raise ValueError(
                     f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit "
                     f"{algorithm}: omit --algorithm {algorithm}"

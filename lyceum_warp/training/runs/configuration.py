@@ -1,6 +1,8 @@
 """Convert between a learner and the config.json of its run."""
 
 import dataclasses
+import inspect
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +10,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos import LIMIT, NPG, PPO, SAC, Learner, NPGConfig, PPOConfig, SACConfig, Team
-from lyceum_warp.binding import spelled_task
+from lyceum_warp.binding import class_in_file, spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
@@ -21,6 +23,25 @@ from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copie
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {"npg": (NPG, NPGConfig), "ppo": (PPO, PPOConfig), "sac": (SAC, SACConfig)}
 """Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
+
+
+def learner_classes(algorithm: str) -> tuple[Any, Any]:
+    """Return the classes of an algorithm and of its hyperparameters.
+
+    A class of the user's, ``path/to/file.py:Class``, has the hyperparameters that its constructor's argument ``config``
+    is annotated with, or None.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: There is no such algorithm or class.
+    """
+    if algorithm in ALGORITHMS:
+        return ALGORITHMS[algorithm]
+    if ".py:" not in algorithm:
+        raise ValueError(f"there is no algorithm {algorithm!r}: use {', '.join(ALGORITHMS)} or path/to/file.py:Class")
+    kind = class_in_file(algorithm, Learner)
+    hint = typing.get_type_hints(kind.__init__).get("config")
+    return kind, next(filter(dataclasses.is_dataclass, (hint, *typing.get_args(hint))), None)
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -124,7 +145,16 @@ class Configuration:
                 # only rank 0 checks trust, because other machines may have no record of the run
                 env = run_env(run, options, self.params, task=task, trust=not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
-            learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
+            kind, _ = learner_classes(self.algorithm)
+            arguments = dict(zip(("policy", "value", "config"), (*networks, self.hyperparameters), strict=True))
+            arguments = {name: value for name, value in arguments.items() if value is not None} | {"seed": seed}
+            if team.size > 1 or "team" in inspect.signature(kind).parameters:
+                arguments["team"] = team
+            try:
+                inspect.signature(kind).bind(env, **arguments)
+            except TypeError as error:
+                raise ValueError(f"{self.algorithm} cannot be made with {', '.join(arguments)}: {error}") from error
+            learner: Learner = kind(env, **arguments)
             return learner
         except (ValueError, FileNotFoundError) as error:
             if run is not None:
