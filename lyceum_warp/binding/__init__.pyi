@@ -14,6 +14,7 @@ from lyceum_warp.binding.registry import (
     errors_of as errors_of,
     file_name as file_name,
     find_task as find_task,
+    object_in_file as object_in_file,
     package_task_names as package_task_names,
     register as register,
     snake_case as snake_case,

@@ -257,13 +257,25 @@ def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be run, or has no such class.
     """
+    found = object_in_file(spelled)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ValueError(f"{spelled} is not a class that extends lw.{base.__name__}")
+    return found
+
+
+def object_in_file(spelled: str) -> Any:
+    """Load a class or a function from ``path/to/file.py:name``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be run, or has no such name.
+    """
     file, _, name = spelled.rpartition(":")
     with _LOADING:
         module = _module_of_file(Path(file))
-    found = vars(module).get(name)
-    if not isinstance(found, type) or not issubclass(found, base):
-        raise ValueError(f"{file} has no class {name!r} that extends lw.{base.__name__}: write file.py:Class")
-    return found
+    if name not in vars(module):
+        raise ValueError(f"{file} has no {name!r}: write path/to/file.py:name")
+    return vars(module)[name]
 
 
 def kernel_name(task: type[Task]) -> str:

@@ -21,6 +21,7 @@ _COMMANDS = {
     "new": ("new_task", "Write a task file for a model."),
     "check": ("check", "Check that a task follows the package's rules."),
     "train": ("train", "Train a policy on a task, with NPG, PPO or SAC."),
+    "sweep": ("sweep", "Search settings of training with Optuna."),
     "eval": ("evaluate", "Evaluate a run's policy, and print statistics of its episodes."),
     "plot": ("plot", "Plot runs, and compare their returns, settings and versions."),
     "report": ("report", "Write a page on a run: settings, curves, verdicts and an episode."),

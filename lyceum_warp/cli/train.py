@@ -6,7 +6,7 @@ import functools
 import json
 import logging
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -43,6 +43,7 @@ from lyceum_warp.training import (
     TensorBoard,
     TransferTest,
     Videos,
+    WandB,
     choose_policy,
     learner_classes,
     learning_curve,
@@ -55,7 +56,7 @@ from lyceum_warp.training import (
 from lyceum_warp.viz import find_camera, parsed_camera, policy_video
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
-             "gate_every": 0, "exact_from": None}  # fmt: skip
+             "gate_every": 0, "exact_from": None, "wandb": None}  # fmt: skip
 """Settings that --resume may change, with their default values."""
 
 _RUN_FLAGS = {
@@ -183,6 +184,8 @@ class Train:
     """
     tensorboard: Annotated[bool | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
+    wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None
+    """The project of Weights & Biases to which the run's settings, metrics and videos are logged."""
     nworld: int | None = None
     """Total number of worlds in all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
     samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment of it.
@@ -213,7 +216,7 @@ class Train:
     physics: Physics = Physics()
     hyperparameters: Annotated[Hyperparameters, tyro.conf.arg(name="hyperparameter")] = Hyperparameters()
 
-    def run(self) -> int:
+    def run(self, callbacks: Sequence[Callable[[Any], object]] = ()) -> int:
         self._check_flags()
         if self.seeds:
             return self._run_seeds()
@@ -224,8 +227,8 @@ class Train:
                 logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
             if self.out is not None and self.go_on and team.largest(int(team.leads and Run.begun(self.out)))[0]:
                 source = Run.open(self.out)
-                return self._continued(source)._run(source, team)
-            return self._run(source, team)
+                return self._continued(source)._run(source, team, callbacks)
+            return self._run(source, team, callbacks)
 
     def _run_seeds(self) -> int:
         from lyceum_warp.cli.seeds import settings_of, train_and_show
@@ -238,7 +241,7 @@ class Train:
         settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on"))
         return train_and_show(self.task, folder, seeds, self.jobs, settings)
 
-    def _run(self, source: Run | None, team: Team) -> int:
+    def _run(self, source: Run | None, team: Team, more: Sequence[Callable[[Any], object]]) -> int:
         settings = self._settings({} if source is None else source.config)
         camera = parsed_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
@@ -247,7 +250,7 @@ class Train:
             configuration = self.configuration(source, team)
             learner, folder, entries = self._learner(configuration, source, team)
             find_camera(learner.env.model, camera)
-            callbacks = self._callbacks(settings)
+            callbacks = [*self._callbacks(settings), *more]
         total = configuration.iterations
         hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
         if source is not None and self.go_on and self.resume and _is_complete(source, total, settings):
@@ -335,10 +338,12 @@ class Train:
         callbacks: list[Callback] = [display]
         if settings["target_return"] is not None:
             callbacks.insert(0, TargetReturn(settings["target_return"]))
-        if settings["tensorboard"]:
-            callbacks.append(TensorBoard())
         if every := settings["video_every"]:
             callbacks.append(Videos(every, camera=parsed_camera(self.camera), progress=display.work))
+        if settings["tensorboard"]:
+            callbacks.append(TensorBoard())
+        if settings["wandb"] is not None:
+            callbacks.append(WandB(settings["wandb"]))
         if every := settings["gate_every"]:
             callbacks.append(PassGate(every))
         if self.transfer:

@@ -53,3 +53,4 @@ from lyceum_warp.training.runs.task_copy import (
 )
 from lyceum_warp.training.seeds import SeedRun as SeedRun, flag_words as flag_words, train_seeds as train_seeds
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
+from lyceum_warp.training.weights_and_biases import WandB as WandB

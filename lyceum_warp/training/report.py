@@ -178,7 +178,7 @@ def _ticks(low: float, high: float) -> Sequence[float]:
 
 
 def _number(value: float) -> str:
-    for limit, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+    for limit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
             return f"{value / (1e3 if letter == 'k' else limit):.3g}{letter}"
     return f"{value:.3g}" if abs(value) > 1e-12 else "0"
