@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -65,11 +65,11 @@ def print_groups(groups: "list[training.RunGroup]") -> None:
     console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
 
 
-def _interval(summary: dict[str, object], name: str) -> str:
+def _interval(summary: dict[str, Any], name: str) -> str:
     if name not in summary:
         return ""
-    low, high = summary[f"{name}_interval"]  # type: ignore[misc]
-    return f"{summary[name]:.5g}" + ("" if summary["with_a_return"] == 1 else f" [{low:.5g}, {high:.5g}]")
+    interval = [f"{end:.5g}" for end in summary.get(f"{name}_interval", ())]
+    return f"{summary[name]:.5g}" + (f" [{', '.join(interval)}]" if interval else "")
 
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:

@@ -24,7 +24,8 @@ def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, set
                 say(f"seed {run.seed}: {run.state}{f', {run.error}' if run.error else ''} ({run.log})")
             states[run.seed] = run.state
 
-    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}; the same command continues them")
+    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}; if interrupted, the same command with --out {folder} "
+        "continues them")  # fmt: skip
     with Live(console=console, refresh_per_second=2, transient=True) as live:
         watch = (lambda runs: live.update(_progress(runs))) if console.is_terminal else note_changes
         runs = training.train_seeds(task, folder, seeds, jobs=jobs, watch=watch, **settings)
@@ -49,11 +50,9 @@ def _progress(runs: Sequence[Any]) -> Table:
         lines = training.Run.open(run.folder).rows() if metrics.exists() else []
         last: dict[str, float | None] = lines[-1] if lines else {}
         returns = [value for line in lines if (value := line.get("mean_return")) is not None]
-        rows.append([
-            str(run.seed), run.state, *(f"{last[name]:,.0f}" if name in last else "" for name in ("iteration", "samples")),
-            f"{last['return_mean']:.5g}" if last.get("return_mean") is not None else "",
-            f"{returns[-1]:.5g}" if returns else "", run.error,
-        ])  # fmt: skip
+        counts = [f"{last[name]:,.0f}" if name in last else "" for name in ("iteration", "samples")]
+        result = "" if last.get("return_mean") is None else f"{last['return_mean']:.5g}"
+        rows.append([str(run.seed), run.state, *counts, result, f"{returns[-1]:.5g}" if returns else "", run.error])
     headings = ("seed", "state", "iter", "samples", "return", "mean\npolicy", "error")
     return table(dict(zip(headings, zip(*rows, strict=True), strict=True)))
 

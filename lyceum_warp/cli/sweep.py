@@ -172,4 +172,6 @@ def _gate_seconds(run: Any) -> float:
     if passed is None:
         return math.inf
     rows = run.rows()[: passed["iteration"]]
-    return sum(value or 0.0 for row in rows for name, value in row.items() if name.startswith("time_") and name != "time_mean")
+    return sum(
+        value or 0.0 for row in rows for name, value in row.items() if name.startswith("time_") and name != "time_mean"
+    )

@@ -250,7 +250,7 @@ class Train:
             configuration = self.configuration(source, team)
             learner, folder, entries = self._learner(configuration, source, team)
             find_camera(learner.env.model, camera)
-            callbacks = [*self._callbacks(settings), *more]
+            callbacks: list[Callable[[Any], object]] = [*self._callbacks(settings), *more]
         total = configuration.iterations
         hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
         if source is not None and self.go_on and self.resume and _is_complete(source, total, settings):
@@ -294,7 +294,9 @@ class Train:
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(task_names())}, or path/to/file.py")
         if self.seeds and (self.resume is not None or self.seed is not None or not self.task):
-            raise ValueError("--seeds takes a task, and neither --seed nor --resume: the same command continues its runs")
+            raise ValueError(
+                "--seeds takes a task, and neither --seed nor --resume: the same command continues its runs"
+            )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
         if self.go_on and self.out is None:
@@ -472,6 +474,7 @@ class Train:
             camera, path = parsed_camera(self.camera), run.folder / "video.mp4"
             policy, seed = load(run, which=choice.which), evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(policy_video, env, policy, path, seed, camera=camera)
+        paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
         for name, place in paths.items():
             say(f"{name + ':':<12}{place}")
         if self.require_return is not None and not score.mean > self.require_return:

@@ -72,10 +72,10 @@ class RunGroup:
         result: dict[str, Any] = {"runs": len(self.runs), "with_a_return": len(finals)}
         if len(finals):
             mean, half = mean_interval(finals)
-            low, high = bootstrap_interval(finals, interquartile_mean)
-            result |= {"mean": mean, "mean_interval": [mean - half, mean + half]}
-            result |= {"interquartile_mean": float(interquartile_mean(finals))}
-            result |= {"interquartile_mean_interval": [low, high], "finals": finals.tolist()}
+            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(finals)), "finals": finals.tolist()}
+            if len(finals) > 1:
+                result["mean_interval"] = [mean - half, mean + half]
+                result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
         return result
 
 

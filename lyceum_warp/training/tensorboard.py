@@ -49,7 +49,9 @@ class TensorBoard(Callback):
     episode/, mean_policy/, policy/, value/, time/ and metrics/.
 
     With ``lw.train``, the run's settings are shown as hyperparameters, and the videos of ``Videos``, which must come
-    before this callback, as moving pictures. Existing curves in the folder are continued. Values from the first new iteration on are overwritten.
+    before this callback, as moving pictures.
+
+    Existing curves in the folder are continued. Values from the first new iteration on are overwritten.
 
     Example:
         >>> lw.train(NPG(env), "runs/mine", callbacks=[lw.TensorBoard()])

@@ -35,9 +35,10 @@ _COUNT = 0
 _ENTRIES: dict[str, Any] = {
     "task": str | None, "params": dict, "options": dict, "physics": dict, "engine": str, "device": str,
     "algorithm": str, "nworld": _COUNT, "threads": _COUNT, "seed": _COUNT, "iterations": _COUNT, "keep_every": _COUNT,
-    "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "wandb": str | None, "target_return": float | int | None,
+    "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
     "reached": {"iteration": _COUNT, "return": float | int}, "exact_from": int | None, "gate_every": _COUNT,
-    "terms": {"rewards": dict, "ends": list}, "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list,
+    "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list, "wandb": str | None,
+    "terms": {"rewards": dict, "ends": list},
     "kept": {
         "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
         "modules": dict, "program": bool,
