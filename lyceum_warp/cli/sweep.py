@@ -61,7 +61,7 @@ class Sweep:
         out = Path(sweep["out"])
         out.mkdir(parents=True, exist_ok=True)
         beat = sweep.get("heartbeat", 60)
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # heartbeats are experimental
         storage = optuna.storages.RDBStorage(
             sweep.get("storage", f"sqlite:///{out.resolve()}/sweep.db"), heartbeat_interval=beat, grace_period=2 * beat,

@@ -74,6 +74,7 @@ def test_report_shows_a_planners_episodes(tmp_path: Path) -> None:
 
 LEARNER = """
 import dataclasses
+import lyceum_warp as lw
 
 @dataclasses.dataclass(frozen=True)
 class Config:

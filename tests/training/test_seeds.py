@@ -32,6 +32,7 @@ def test_seeds_side_by_side_equal_single_runs_and_are_summarised(
     assert "lyceum-warp plot" in capsys.readouterr().out
 
 
+@pytest.mark.long  # tests/cli/test_train.py covers --continue
 def test_interrupted_seeds_continue_with_the_same_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     command = [sys.executable, "-m", "lyceum_warp.cli", "train", *WORDS[:-1], "400", "--seeds", "1", "--out", "x"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
@@ -51,6 +52,7 @@ def test_interrupted_seeds_continue_with_the_same_command(tmp_path: Path, monkey
     assert len(metrics(tmp_path / "x" / "seed-0")) == done + 1
 
 
+@pytest.mark.long
 def test_bad_options_end_all_seeds_with_the_error_of_the_first(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
