@@ -121,10 +121,7 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = (
-        "algorithm", "iterations", "minutes", "seed", "seeds", "jobs", "out", "go_on", "resume", "nworld", "param",
-        "device",
-    )  # fmt: skip
+    USUAL = ("algorithm", "iterations", "seed", "seeds", "out", "go_on", "resume", "nworld", "param", "device")
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
@@ -236,7 +233,7 @@ class Train:
         assert self.task is not None
         seeds = self.seeds
         if len(seeds) == 1:
-            seeds = tuple(range(whole_number("--seeds", seeds[0], low=1)))
+            seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
         folder = self.out or _new_folder(task_name(find_task(self.task)))
         settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on"))
         return train_and_show(self.task, folder, seeds, self.jobs, settings)

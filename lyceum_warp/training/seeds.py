@@ -70,7 +70,7 @@ def train_seeds(
     Raises:
         ValueError: An argument is out of range, or a run fails before its first iteration.
     """
-    numbers = range(whole_number("seeds", seeds, low=1)) if isinstance(seeds, int) else sorted(set(seeds))
+    numbers = range(whole_number("seeds", seeds, low=1, high=1000)) if isinstance(seeds, int) else sorted(set(seeds))
     runs = [SeedRun(seed, Path(folder, f"seed-{whole_number('a seed', seed, low=0)}")) for seed in numbers]
     words = [str(task), *flag_words(settings)]
     places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
