@@ -326,6 +326,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
     if options.video:
         camera = parsed_camera(options.camera)
         paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
+    paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
     for name, path in paths.items():
         say(f"{name + ':':<12}{path}")
 

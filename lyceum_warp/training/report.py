@@ -5,6 +5,7 @@ import html
 import itertools
 import json
 import math
+import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -111,7 +112,8 @@ def _episode(folder: Path, *, planned: bool) -> str:
         with tempfile.TemporaryDirectory() as temporary:
             text = write_page(env, states, Path(temporary, "episode.html")).read_text()
     except Exception as error:  # a report without an episode is worth having
-        return f'<p class="soft">no episode: {html.escape(one_line(error))}</p>'
+        reason = re.sub(r"/\S*/", "", one_line(error))  # without folders
+        return f'<p class="soft">no episode: {html.escape(reason)}</p>'
     return "\n".join(_section("Episode", f'<iframe title="an episode" srcdoc="{html.escape(text)}"></iframe>'))
 
 

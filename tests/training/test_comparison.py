@@ -65,6 +65,13 @@ def test_report_is_one_page_without_paths(runs: Path) -> None:
     assert str(runs) not in text and not re.findall(r'(?:src|href)="', text)
 
 
+def test_report_without_an_episode_names_the_reason_but_no_folder(tmp_path: Path) -> None:
+    assert train(tmp_path / "run", "--iterations", "1") == 0
+    (tmp_path / "run" / "policy.pt").write_bytes(b"damaged")
+    text = write_report(tmp_path / "run").read_text()
+    assert "no episode: the checkpoint policy.pt is damaged" in text and str(tmp_path) not in text
+
+
 def test_report_shows_a_planners_episodes(tmp_path: Path) -> None:
     words = ["plan", "point_mass", "--steps", "3", "--samples", "4", "--no-video", "--out", str(tmp_path / "plan")]
     assert cli.main(words) == 0
