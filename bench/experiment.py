@@ -51,12 +51,6 @@ GPU_QUERY = {
 SOFTWARE = ("python", "mujoco", "mujoco_warp", "warp_lang", "torch", "numpy", "gymnasium")
 """Results are compared only if the versions of these packages are equal."""
 
-STYLES = (
-    ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
-    ("#E69F00", "v", (0, (5, 1))), ("#56B4E9", "P", (0, (3, 1, 1, 1))), ("#000000", "X", "-"),
-)  # fmt: skip
-"""Colours (Okabe and Ito's palette for colour-blind readers), markers and line styles."""
-
 
 class Skipped(Exception):  # noqa: N818
     """This machine cannot measure a case."""

@@ -20,11 +20,11 @@ from typing import Any, Literal
 
 import experiment
 import torch
-from experiment import STYLES, Experiment, Row, Table, choose
+from experiment import Experiment, Row, Table, choose
 
 import lyceum_warp as lw
 from lyceum_warp.algos import moved
-from lyceum_warp.viz import finish_axes, new_figure
+from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
 TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {
     "go1_velocity": ("ppo", 80.0, 4096, None, 0),

@@ -20,11 +20,11 @@ import contestants
 import experiment
 import kept
 from contestants import LABELS
-from experiment import STYLES, Experiment, Row, Table, choose, median_and_range
+from experiment import Experiment, Row, Table, choose, median_and_range
 
 import lyceum_warp as lw
 from lyceum_warp.support.machine import cpu_cores
-from lyceum_warp.viz import finish_axes, new_figure
+from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
 TASKS = (
     "cartpole", "hopper", "walker2d", "half_cheetah", "swimmer", "ant", "humanoid", "herb_reach", "humanoid_standup",

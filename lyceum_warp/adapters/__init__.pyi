@@ -1,3 +1,4 @@
+from lyceum_warp.adapters.datasets import write_lerobot as write_lerobot, write_minari as write_minari
 from lyceum_warp.adapters.gymnasium_single import GymnasiumEnv as GymnasiumEnv
 from lyceum_warp.adapters.gymnasium_vector import GymnasiumVectorEnv as GymnasiumVectorEnv
 from lyceum_warp.adapters.rsl_rl_config import runner_config as runner_config

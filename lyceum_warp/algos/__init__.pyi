@@ -17,6 +17,7 @@ from lyceum_warp.algos.common.gate import gate as gate
 from lyceum_warp.algos.common.learner import (
     LEARNER_KERNELS as LEARNER_KERNELS,
     METRIC_COLUMN as METRIC_COLUMN,
+    STEP_METRIC_COLUMN as STEP_METRIC_COLUMN,
     Iteration as Iteration,
     Learner as Learner,
 )

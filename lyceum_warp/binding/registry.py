@@ -211,7 +211,7 @@ def _run(path: Path, name: str, source: bytes) -> None:
             raise
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
-        where = f"the task file {path}" if line is None else f"the task file {path}, line {line}"
+        where = f"the file {path}" if line is None else f"the file {path}, line {line}"
         if isinstance(error, ImportError):
             raise ImportError(
                 f"{where}: {error}: install the missing module, or put it into the same folder"
@@ -252,6 +252,34 @@ def _task_of_file(path: Path, attribute: str) -> type[Task]:
     return next(iter(found.values()))
 
 
+def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
+    """Load a subclass of ``base`` from ``path/to/file.py:Class``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be run, or has no such class.
+    """
+    found = object_in_file(spelled)
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise ValueError(f"{spelled} is not a class that extends lw.{base.__name__}")
+    return found
+
+
+def object_in_file(spelled: str) -> Any:
+    """Load a class or a function from ``path/to/file.py:name``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be run, or has no such name.
+    """
+    file, _, name = spelled.rpartition(":")
+    with _LOADING:
+        module = _module_of_file(Path(file))
+    if name not in vars(module):
+        raise ValueError(f"{file} has no {name!r}: write path/to/file.py:name")
+    return vars(module)[name]
+
+
 def kernel_name(task: type[Task]) -> str:
     """Return the task's name in Warp's cache. It contains a hash of the file, so copies of a file share kernels."""
     module = task.__module__
@@ -263,7 +291,7 @@ def kernel_name(task: type[Task]) -> str:
 def _module_of_file(path: Path) -> ModuleType:
     """Return the module of a task's file. Run the file again if it or one of its local modules has changed."""
     if not path.is_file():
-        raise FileNotFoundError(f"there is no task file {str(path)!r}")
+        raise FileNotFoundError(f"there is no file {str(path)!r}")
     name = f"{_FILE}{path.stem}_{zlib.crc32(os.fsencode(path.resolve())):08x}"
     if name not in sys.modules or name not in _loaded or _loaded[name] != stamps(_loaded[name]):
         modules = local_modules(path)

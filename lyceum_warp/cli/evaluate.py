@@ -164,6 +164,8 @@ class Eval:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
             seed = evaluation_seed(self.seed)
             say(f"video: {tried(policy_video, env, policy, path, seed, curriculum=curricula[0], camera=camera)}")
+        place = f"{self.folder} --pretrained" if self.pretrained else self.folder
+        say(f"next: lyceum-warp view {place}")
 
     def _curricula(self, run: Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
         """Return the curricula at which to play, one for each value of --memory, and where they come from."""

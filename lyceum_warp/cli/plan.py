@@ -15,8 +15,8 @@ import torch
 import tyro
 from rich.markup import escape
 
-from lyceum_warp.algos import MPPI, MPPIConfig, task_config
-from lyceum_warp.binding import file_name, find_task, spelled_task, task_name
+from lyceum_warp.algos import MPPI, MPPIConfig, PlanUpdate, task_config
+from lyceum_warp.binding import class_in_file, file_name, find_task, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     OptionFlags,
@@ -53,6 +53,10 @@ from lyceum_warp.viz import find_camera, parsed_camera, write_video
 class Settings(OptionFlags, options=[MPPIConfig]):
     """Settings of the planner. The defaults come from the task."""
 
+    update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling|FILE")] = None
+    """How to compute the new plan: mppi (the default), cem (the cross-entropy method), predictive_sampling, or
+    path/to/file.py:Class, a subclass of lw.PlanUpdate whose constructor needs no arguments."""
+
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
     The Python API also accepts a covariance matrix."""
@@ -62,12 +66,22 @@ class Settings(OptionFlags, options=[MPPIConfig]):
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
         """Override a configuration's settings with the given flags."""
         settings = given(self)
+        if ".py:" in settings.get("update", ""):
+            settings["update"] = _own_update(settings["update"])
         if self.fill is not None:
             settings["fill"] = _fill(self.fill)
         for name in ("noise", "min_noise"):
             if name in settings and len(settings[name]) == 1:
                 settings[name] = settings[name][0]
         return config.changed(settings)
+
+
+def _own_update(spelled: str) -> PlanUpdate:
+    kind = class_in_file(spelled, PlanUpdate)
+    try:
+        return kind()
+    except TypeError as error:
+        raise ValueError(f"--update {spelled} makes {kind.__name__}(): {error}: give its arguments defaults") from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -312,6 +326,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
     if options.video:
         camera = parsed_camera(options.camera)
         paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
+    paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
     for name, path in paths.items():
         say(f"{name + ':':<12}{path}")
 

@@ -6,7 +6,7 @@ import functools
 import json
 import logging
 import signal
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +19,9 @@ from lyceum_warp.cli.arguments import (
     OptionFlags,
     ParamWords,
     Physics,
+    Repeated,
     given,
+    parameter,
     parameters,
 )
 from lyceum_warp.cli.display import console, curve_table, note, say, tried
@@ -27,6 +29,7 @@ from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.outlines import outline
+from lyceum_warp.support.validate import whole_number
 
 _CONFIGS = {
     name.removesuffix("Config").lower(): outline("lyceum_warp.algos", name)
@@ -35,7 +38,7 @@ _CONFIGS = {
 """The hyperparameters of each of ``training.ALGORITHMS``. Their own classes come with torch."""
 
 _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboard": False, "video_every": 0,
-             "gate_every": 0, "exact_from": None}  # fmt: skip
+             "gate_every": 0, "exact_from": None, "wandb": None}  # fmt: skip
 """Settings that --resume may change, with their default values."""
 
 _RUN_FLAGS = {
@@ -61,8 +64,7 @@ class Hyperparameters(OptionFlags, options=[*_CONFIGS.values()], defaults=_defau
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""
-        if algorithm not in _CONFIGS:
-            raise ValueError(f"there is no algorithm {algorithm!r}: use {' or '.join(_CONFIGS)}")
+        kind = training.learner_classes(algorithm)[1]
         flags = given(self)
         owners = {
             name: [key for key, config in _CONFIGS.items() if name in config.__dataclass_fields__] for name in flags
@@ -73,7 +75,7 @@ class Hyperparameters(OptionFlags, options=[*_CONFIGS.values()], defaults=_defau
                     f"--{name.replace('_', '-')} is a setting of {' or '.join(algorithms)}, not of {algorithm}: "
                     f"omit it, or give --algorithm {' or '.join(algorithms)}"
                 )
-        return dataclasses.replace(config or training.ALGORITHMS[algorithm][1](), **flags)
+        return config if kind is None else dataclasses.replace(config or kind(), **flags)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,8 @@ class Train:
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
     $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
+    $ lyceum-warp train hopper --out runs/mine --continue
+    $ lyceum-warp train hopper --seeds 5 --jobs 2 --out runs/five
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
@@ -103,16 +107,17 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = ("algorithm", "iterations", "minutes", "seed", "out", "resume", "nworld", "param", "clips", "device")
+    USUAL = ("algorithm", "iterations", "minutes", "seed", "seeds", "out", "go_on", "resume", "nworld", "param",
+             "clips", "device")  # fmt: skip
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With
     --resume, it replaces the file of the run's own task.
     """
-    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac|distill")] = None
+    algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac|distill|FILE")] = None
     """npg (the natural policy gradient), ppo, sac (soft actor-critic with a replay buffer), or distill (imitation of
     --teacher or --demonstrations). The default is the algorithm that the task suggests: ppo for walking robots, npg for
-    others.
+    others. path/to/file.py:Class is a learner of your own, a subclass of lw.Learner. --resume needs this word again.
     """
     teacher: Annotated[str | None, tyro.conf.arg(metavar="RUN|FILE|TASK")] = None
     """The policy that distill imitates: a run's folder (its last policy), a policy's file in this folder, or the name
@@ -120,16 +125,27 @@ class Train:
     """
     demonstrations: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE...")] = None
     """The episodes that distill imitates instead, as written by eval --episodes-to or plan: files or folders."""
+    setting: Repeated = ()
+    """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
     suggests, or 100.
     """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Seed of the networks, the noise and the worlds' initial states."""
+    seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N|SEED ...", help_behavior_hint="")] = ()
+    """Train this number of seeds, counted from 0, or these seeds, each in a process and a run of its own in --out. The
+    same command continues an interrupted training."""
+    jobs: int = 1
+    """Number of seeds that train at the same time, with --seeds. They share the CPU cores and the GPUs."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """The run's folder, which must be new or empty; by default runs/TASK-DATE."""
     resume: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """Resume the run in the given folder from its exact state and with its settings, up to --iterations."""
+    go_on: Annotated[bool, tyro.conf.arg(name="continue")] = False
+    """Start the run in --out, or resume it if it has begun, so that a job can be killed and started again with the same
+    command. If the run is complete, only its report is printed.
+    """
     from_run: Annotated[Path | None, tyro.conf.arg(name="from", metavar="RUN")] = None
     """Start a new run from the policy, the value function and the normaliser of another run. The other run's settings
     are the defaults. However, a different TASK has its own parameters, and a different --algorithm has its own
@@ -158,6 +174,8 @@ class Train:
     """
     tensorboard: Annotated[bool | None, tyro.conf.arg(help_behavior_hint="")] = None
     """Whether to also write metrics for TensorBoard into the run's folder."""
+    wandb: Annotated[str | None, tyro.conf.arg(metavar="PROJECT")] = None
+    """The project of Weights & Biases to which the run's settings, metrics and videos are logged."""
     nworld: int | None = None
     """Total number of worlds in all processes. By default 64 (8 with sac), or 4096 per GPU. With npg, each world makes
     samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment of it.
@@ -194,48 +212,94 @@ class Train:
     physics: Physics = Physics()
     hyperparameters: Annotated[Hyperparameters, tyro.conf.arg(name="hyperparameter")] = Hyperparameters()
 
-    def run(self) -> int:
+    def run(self, callbacks: Sequence[Callable[[Any], object]] = ()) -> int:
         self._check_flags()
+        if self.seeds:
+            return self._run_seeds()
         folder = self.resume or self.from_run
         source = None if folder is None else training.Run.open(folder)
+        with algos.join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
+            if not team.leads:  # only one process prints messages
+                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
+            begun = self.out is not None and self.go_on and team.leads and training.Run.begun(self.out)
+            if self.out is not None and team.largest(int(begun))[0]:
+                source = training.Run.open(self.out)
+                return self._continued(source)._run(source, team, callbacks)
+            return self._run(source, team, callbacks)
+
+    def _run_seeds(self) -> int:
+        from lyceum_warp.cli.seeds import settings_of, train_and_show
+
+        assert self.task is not None
+        seeds = self.seeds
+        if len(seeds) == 1:
+            seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
+        folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
+        settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on"))
+        return train_and_show(self.task, folder, seeds, self.jobs, settings)
+
+    def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:
         settings = self._settings({} if source is None else source.config)
         camera = viz.parsed_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
-        with algos.join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
-            if not team.leads:  # only one process prints messages
-                logging.getLogger("lyceum_warp").setLevel(logging.ERROR)
-            with team.together():  # check all options before the folder is created
-                configuration = self.configuration(source, team)
-                learner, folder, entries = self._learner(configuration, source, team)
-                viz.find_camera(learner.env.model, camera)
-                callbacks = self._callbacks(settings)
-            total = configuration.iterations
-            hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
-            try:
-                run = training.train(
-                    learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
-                    **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
-                    take_over=self.take_over, entries=settings | entries,
-                )  # fmt: skip
-            except Interrupted as signalled:
-                if team.leads and (folder / "policy.pt").exists():
-                    self._say_interrupted(folder, signalled, total, hint)
-                return 128 + signalled.number
-            if not team.leads:
-                return 0
-            self._say_end(run, learner.iteration, total, hint)
-            return self._report(run, learner)
+        with team.together():  # check all options before the folder is created
+            configuration = self.configuration(source, team)
+            learner, folder, entries = self._learner(configuration, source, team)
+            viz.find_camera(learner.env.model, camera)
+            callbacks: list[Callable[[Any], object]] = [*self._callbacks(settings), *more]
+        total = configuration.iterations
+        hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+        if source is not None and self.go_on and self.resume and _is_complete(source, total, settings):
+            if team.leads:
+                say(f"the run in {folder} is complete")
+            return self._report(source, learner) if team.leads else 0
+        try:
+            run = training.train(
+                learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
+                **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
+                take_over=self.take_over and self.resume is not None, entries=settings | entries,
+            )  # fmt: skip
+        except Interrupted as signalled:
+            if team.leads and (folder / "policy.pt").exists():
+                self._say_interrupted(folder, signalled, total, hint)
+            return 128 + signalled.number
+        if not team.leads:
+            return 0
+        self._say_end(run, learner.iteration, total, hint)
+        return self._report(run, learner)
+
+    def _continued(self, source: "training.Run") -> "Train":
+        """Return the command that resumes the run in --out, which must have the settings of the given flags."""
+        kept: dict[str, Any] = dict.fromkeys(("algorithm", "seed", "threads"))
+        for name in kept:
+            value = getattr(self, name)
+            if name == "algorithm" and ".py:" in str(value):
+                kept[name], value = value, training.learner_classes(value)[0].algorithm
+            if value not in (None, source.config[name]):
+                raise ValueError(
+                    f"{source.folder} has {name} {source.config[name]}, not {value}: omit --{name}, or start a new run "
+                    "in another folder"
+                )
+        return dataclasses.replace(self, resume=self.out, out=None, from_run=None, **kept)
 
     def _check_flags(self) -> None:
         if self.resume is not None:
             for name, flag in _RUN_FLAGS.items():
-                if getattr(self, name) is not None:
+                if getattr(self, name) is not None and not (name == "algorithm" and ".py:" in str(self.algorithm)):
                     raise ValueError(f"{flag} has no effect with --resume, which keeps the run's settings: omit it")
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(binding.task_names())}, or path/to/file.py")
-        if self.take_over and self.resume is None:
-            raise ValueError("--take-over has no effect without --resume: omit it")
+        if self.seeds and (self.resume is not None or self.seed is not None or not self.task):
+            raise ValueError(
+                "--seeds takes a task, and neither --seed nor --resume: the same command continues its runs"
+            )
+        if self.jobs != 1 and not self.seeds:
+            raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
+        if self.go_on and self.out is None:
+            raise ValueError("--continue needs the run's folder: add --out FOLDER")
+        if self.take_over and self.resume is None and not self.go_on:
+            raise ValueError("--take-over has no effect without --resume or --continue: omit it")
 
     def _settings(self, saved: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings of ``_SETTINGS``: the flags, those of the source run, or the task's suggestions."""
@@ -275,10 +339,12 @@ class Train:
         callbacks: list[training.Callback] = [display]
         if settings["target_return"] is not None:
             callbacks.insert(0, training.TargetReturn(settings["target_return"]))
-        if settings["tensorboard"]:
-            callbacks.append(training.TensorBoard())
         if every := settings["video_every"]:
             callbacks.append(training.Videos(every, camera=viz.parsed_camera(self.camera), progress=display.work))
+        if settings["tensorboard"]:
+            callbacks.append(training.TensorBoard())
+        if settings["wandb"] is not None:
+            callbacks.append(training.WandB(settings["wandb"]))
         if every := settings["gate_every"]:
             callbacks.append(training.PassGate(every))
         if self.transfer:
@@ -293,9 +359,9 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if source is not None and self.algorithm is None and algorithm not in training.ALGORITHMS:
             raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: resume "
-                "it in Python by lw.train(learner, lw.Run.open(folder), ...), or begin a new run from its policy by "
-                "--from and --algorithm"
+                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: name its "
+                "class, as in --algorithm path/to/file.py:Class, or begin a new run from its policy by --from and "
+                "--algorithm"
             )
         flags = self._given("nworld", "seed") | given(self.env) | given(self.physics)
         if "solver" in flags:
@@ -308,6 +374,8 @@ class Train:
         if source is None or self.task is None or binding.task_name(binding.find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
+        if self.setting or algorithm not in training.ALGORITHMS:
+            hyperparameters = self._own_settings(algorithm, source)
         return dataclasses.replace(
             base,
             **self._given("task", "threads", "iterations"),
@@ -317,6 +385,17 @@ class Train:
             hyperparameters=self.hyperparameters.on_top_of(hyperparameters, algorithm),
             seed=base.seed if self.seed is None else None,
         )
+
+    def _own_settings(self, algorithm: str, source: "training.Run | None") -> Any:
+        """Return the hyperparameters of the user's own learner: the given ones on top of the source run's."""
+        kind, config = training.learner_classes(algorithm)
+        if algorithm in training.ALGORITHMS or (config is None and self.setting):
+            raise ValueError(f"--setting has no effect with {algorithm}: use the flags of its hyperparameters")
+        saved = {} if source is None or source.config["algorithm"] != kind.algorithm else source.config[kind.algorithm]
+        try:
+            return None if config is None else config(**{**saved, **dict(map(parameter, self.setting))})
+        except TypeError as error:
+            raise ValueError(f"--setting {' '.join(self.setting)}: {error}") from error
 
     def _suggestion(self, team: "algos.Team") -> "training.Configuration":
         """Return the configuration that the task suggests."""
@@ -357,7 +436,8 @@ class Train:
         if source is not None:
             policy, value, iteration = training.saved_networks(source, self.which if self.resume is None else None)
             algorithm = configuration.algorithm
-            if policy is not None and isinstance(policy, algos.SquashedPolicy) != (algorithm == "sac"):
+            named = algorithm in training.ALGORITHMS
+            if named and policy is not None and isinstance(policy, algos.SquashedPolicy) != (algorithm == "sac"):
                 raise ValueError(
                     f"{source.folder} was trained by {source.config['algorithm']}, whose networks do not fit "
                     f"{algorithm}: omit --algorithm {algorithm}"
@@ -384,8 +464,7 @@ class Train:
                     )
         if source is not None and self.task is None and self.resume is None:
             training.note_changes(source, learner.env)
-        name = f"{binding.file_name(learner.env.task.name)}-{datetime.datetime.now():%Y%m%d-%H%M%S}"
-        return learner, self.resume or self.out or Path("runs", name), entries
+        return learner, self.resume or self.out or _new_folder(learner.env.task.name), entries
 
     def _teacher(self, algorithm: str, source: "training.Run | None") -> "tuple[Any, Mapping[str, slice] | None]":
         """Load what distill imitates, and the parts of its observations if they are to be checked."""
@@ -428,6 +507,7 @@ class Train:
             camera, path = viz.parsed_camera(self.camera), run.folder / "video.mp4"
             policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
+        paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
         for name, place in paths.items():
             say(f"{name + ':':<12}{place}")
         if choice is None:
@@ -450,3 +530,16 @@ class Train:
         if len(choice.scores) > 1:
             say(choice.text)
         return choice
+
+
+def _new_folder(task: str) -> Path:
+    return Path("runs", f"{binding.file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
+
+
+def _is_complete(run: "training.Run", total: int, settings: Mapping[str, Any]) -> bool:
+    """Return whether a run has all its iterations, has reached its target return, or has passed its gate."""
+    reached, target = run.config.get("reached"), settings["target_return"]
+    if reached is not None and target is not None and reached["return"] >= target:
+        return True
+    passed = settings["gate_every"] and "passed" in run.config
+    return bool(passed) or run.read()["iteration"] >= total

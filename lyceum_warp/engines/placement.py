@@ -149,7 +149,7 @@ def place_samples(
 
 def options_on_cores() -> dict[str, Any]:
     """Return the options that move an environment to the C engine. Options that the C engine lacks become None."""
-    names = _options_of(_engine_class("mujoco", wp.get_device("cpu"), False)) or []
+    names = _options_of(_engine_class("mujoco", find_device("cpu"), False)) or []
     defaults = EnvOptions().for_engine()
     unused = {name: None for name, default in defaults.items() if default is None and name not in names}
     return {"engine": "mujoco", "device": "cpu", **unused}

@@ -38,6 +38,37 @@ def mean_interval(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     return float(array.mean()), quantile * float(array.std(ddof=1)) / math.sqrt(len(array))
 
 
+def interquartile_mean(values: np.ndarray) -> np.ndarray:
+    """Compute the mean of the middle half of the values along the last axis.
+
+    A quarter of the values, rounded down, is left out at either end (Agarwal et al. 2021, "Deep reinforcement learning
+    at the edge of the statistical precipice").
+    """
+    left_out = values.shape[-1] // 4
+    return np.sort(values, axis=-1)[..., left_out : values.shape[-1] - left_out].mean(-1)
+
+
+def bootstrap_interval(
+    values: Sequence[float] | np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], *, resamples: int = 10_000
+) -> tuple[float, float]:
+    """Compute the 95 % percentile bootstrap interval of a statistic; NaN for a single value.
+
+    The resamples have a fixed seed. The interval of few values is too narrow (Efron and Tibshirani 1993, "An
+    introduction to the bootstrap", chapter 13).
+
+    Args:
+        values: The values.
+        statistic: Maps arrays (resamples, values) to (resamples,).
+        resamples: Number of resamples with replacement.
+    """
+    array = np.asarray(values, float)
+    if len(array) < 2:
+        return math.nan, math.nan
+    index = np.random.default_rng(0).integers(len(array), size=(resamples, len(array)))
+    low, high = np.percentile(statistic(array[index]), (2.5, 97.5))
+    return float(low), float(high)
+
+
 def clear_losses(first: np.ndarray, second: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:
     """Find the pairs in which one value is clearly smaller than the other.
 

@@ -3,9 +3,20 @@ from lyceum_warp.training.callbacks import (
     TransferTest as TransferTest,
     Videos as Videos,
 )
+from lyceum_warp.training.comparison import (
+    RunCurve as RunCurve,
+    RunGroup as RunGroup,
+    comparison_figure as comparison_figure,
+    differing as differing,
+    group_runs as group_runs,
+    mean_curve as mean_curve,
+    read_curve as read_curve,
+    read_curves as read_curves,
+)
 from lyceum_warp.training.curve import learning_curve as learning_curve
 from lyceum_warp.training.gating import PassGate as PassGate
 from lyceum_warp.training.loop import train as train
+from lyceum_warp.training.report import write_report as write_report
 from lyceum_warp.training.runs.checkpoints import (
     network_of as network_of,
     read_checkpoint as read_checkpoint,
@@ -19,6 +30,7 @@ from lyceum_warp.training.runs.choice import (
 from lyceum_warp.training.runs.configuration import (
     ALGORITHMS as ALGORITHMS,
     Configuration as Configuration,
+    learner_classes as learner_classes,
     saved_networks as saved_networks,
 )
 from lyceum_warp.training.runs.folder import (
@@ -39,8 +51,10 @@ from lyceum_warp.training.runs.task_copy import (
     run_env as run_env,
     task_copy as task_copy,
 )
+from lyceum_warp.training.seeds import SeedRun as SeedRun, flag_words as flag_words, train_seeds as train_seeds
 from lyceum_warp.training.stopping import (
     Minutes as Minutes,
     TargetReturn as TargetReturn,
 )
 from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
+from lyceum_warp.training.weights_and_biases import WandB as WandB

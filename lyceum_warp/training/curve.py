@@ -1,19 +1,96 @@
-"""Plot the learning curve of a run."""
+"""Plot the learning curve of a run, in small multiples."""
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.algos import METRIC_COLUMN
+from lyceum_warp.algos import METRIC_COLUMN, STEP_METRIC_COLUMN, Iteration
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_png
+
+RETURNS, TERMS, METRICS, ENDS, FAULTS, LEARNING = (
+    "returns", "reward terms", "metrics", "ends of episodes", "faults", "learning",
+)  # fmt: skip
+"""Groups of panels."""
+
+_SAMPLED, _MEAN = "stochastic policy", "mean policy"
+
+_RETURNS = {
+    "return": ("sum of rewards", "return_mean", "mean_return"),
+    "evaluation": ("at the end of an episode", "eval_mean", "mean_eval"),
+    "length": ("steps of an episode", "length_mean", "mean_length"),
+    "success": ("fraction of episodes", "success", "mean_success"),
+}
+"""Panels of episodes: the title, the unit, and the columns of the stochastic and of the mean policy."""
+
+_FAULTS = ("faults", "outliers", "skipped_updates")
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """Curves of one quantity over samples."""
+
+    group: str
+    title: str
+    unit: str
+    curves: Mapping[str, Sequence[tuple[float, float]]]
+    """Points (samples, value) by the name of the curve. Each curve has at least one point."""
+
+
+def curve_panels(run: Run) -> list[Panel]:
+    """Make the panels of a run's curves. A quantity without a finite value has no panel.
+
+    Raises:
+        FileNotFoundError: The run has no metrics yet.
+        ValueError: The run's metrics.csv cannot be read, or has no row.
+    """
+    rows = run.rows()
+    if not rows:
+        raise ValueError(f"{run.folder} has no complete iteration to plot: continue its training")
+
+    def panel(group: str, title: str, unit: str, **columns: str) -> Iterator[Panel]:
+        curves = {}
+        for name, column in columns.items():
+            values = [(row["samples"] or 0.0, row.get(column)) for row in rows]
+            points = [(x, y) for x, y in values if y is not None and math.isfinite(y)]
+            if points and (group != FAULTS or any(y for _, y in points)):
+                curves[name.replace("_", " ")] = points
+        if curves:
+            yield Panel(group, title, unit, curves)
+
+    terms = run.config.get("terms", {})
+    weights, ends = terms.get("rewards", {}), terms.get("ends", [])
+    panels: list[Panel] = []
+    for title, (unit, sampled, mean) in _RETURNS.items():
+        panels += panel(RETURNS, title, unit, stochastic_policy=sampled, mean_policy=mean)
+    if not any(each.title == "return" for each in panels):  # no episode has ended yet
+        panels[:0] = panel(RETURNS, "reward", "of a step", stochastic_policy="reward_mean")
+    names = [column.removeprefix(METRIC_COLUMN) for column in rows[0] if column.startswith(METRIC_COLUMN)]
+    for name in names:
+        column = METRIC_COLUMN + name
+        if name in weights:
+            panels += panel(TERMS, name, f"weight {weights[name]:g}, sum of an episode", term=column)
+        elif name in ends:
+            panels += panel(ENDS, name, "fraction of episodes", end=column)
+        else:
+            panels += panel(METRICS, name, "mean of a step", metric=STEP_METRIC_COLUMN + name)
+    for name in _FAULTS:
+        panels += panel(FAULTS, name.replace("_", " "), "per iteration", count=name)
+    known = {field.name for field in dataclasses.fields(Iteration)} | {*_FAULTS, "samples_per_second"}
+    for column in rows[0]:
+        if column not in known and "/" not in column and not column.startswith("time_"):
+            panels += panel(LEARNING, column.replace("_", " "), "", value=column)
+    order = (RETURNS, TERMS, METRICS, ENDS, FAULTS, LEARNING)
+    return sorted(panels, key=lambda each: order.index(each.group))
 
 
 def learning_curve(run: str | Path | Run) -> Path:
     """Plot a run's returns and metrics against the number of samples, as ``curve.png`` in the run's folder.
 
-    If no episode has a return, the plot shows the mean reward per step instead.
+    Each reward term, each other metric, and each reason for an end has a panel of its own. If no episode has a return,
+    the plot shows the mean reward per step instead.
 
     Args:
         run: A run, or its folder.
@@ -23,54 +100,33 @@ def learning_curve(run: str | Path | Run) -> Path:
         ValueError: The run's metrics.csv cannot be read, or has no row.
         ImportError: matplotlib is not installed.
     """
-    figure = new_figure("a learning curve", 7.5, 6.0)
-    from matplotlib import colormaps
+    run = run if isinstance(run, Run) else Run.open(run)
+    first, *others = [panel for panel in curve_panels(run) if panel.group != LEARNING]
+    columns = min(4, max(1, len(others)))
+    height = 1 + math.ceil(len(others) / columns) if others else 1
+    figure = new_figure("a learning curve", 7.5 if columns < 4 else 10.0, 3.0 + 1.8 * (height - 1))
     from matplotlib.ticker import EngFormatter
 
-    run = run if isinstance(run, Run) else Run.open(run)
-    rows = run.rows()
-    if not rows:
-        raise ValueError(f"{run.folder} has no complete iteration to plot: continue its training")
-
-    metrics = [name for name in rows[0] if name.startswith(METRIC_COLUMN)]
-    figure.set_figheight(8.0 if metrics else 6.0)
-    heights = (2, 1, 2) if metrics else (2, 1)
-    panels = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
-    top, bottom = panels[:2]
-    samples = _column(rows, "samples")
-    middle, spread, quantity = _column(rows, "return_mean"), _column(rows, "return_std"), "return"
-    if not any(map(math.isfinite, middle + _column(rows, "mean_return"))):
-        middle, quantity = _column(rows, "reward_mean"), "reward of a step"
-    low = [m - s for m, s in zip(middle, spread, strict=True)]
-    high = [m + s for m, s in zip(middle, spread, strict=True)]
-    top.fill_between(samples, low, high, color=LINE, alpha=0.2, linewidth=0, label="± standard deviation")
-    line: Any = dict(color=LINE, marker="." if len(rows) < 3 else "")  # a line through a single point is invisible
-    top.plot(samples, middle, label="stochastic policy", **line)
-    _draw_mean_policy(top, rows, "mean_return")
-    top.set_ylabel(quantity)
-    top.legend(frameon=False, loc="best")
-    bottom.plot(samples, _column(rows, "eval_mean"), **line)
-    _draw_mean_policy(bottom, rows, "mean_eval")
-    bottom.set_ylabel("evaluation metric\nat the end")
-    for i, name in enumerate(metrics):
-        style = line | {"color": colormaps["viridis"](i / len(metrics)), "label": name.removeprefix(METRIC_COLUMN)}
-        panels[2].plot(samples, _column(rows, name), **style)
-    if metrics:
-        panels[2].set_ylabel("metrics,\nsums of an episode")
-        panels[2].legend(frameon=False, loc="best")
-    panels[-1].set_xlabel("samples")
-    panels[-1].xaxis.set_major_formatter(EngFormatter(sep=""))
-    finish_axes(panels)
-    top.set_title(f"{run.config['task']}, seed {run.config['seed']}", loc="left")
+    grid = figure.add_gridspec(height, columns, height_ratios=[1.7, *[1.0] * (height - 1)])
+    places = [grid[0, :], *(grid[1 + k // columns, k % columns] for k in range(len(others)))]
+    all_axes: list[Any] = []
+    for panel, place in zip((first, *others), places, strict=True):
+        axes = figure.add_subplot(place)
+        for name, points in panel.curves.items():
+            x, y = zip(*points, strict=True)
+            style: Any = {"color": ACCENT, "marker": "o", "markersize": 2.5} if name == _MEAN else {"color": LINE}
+            if len(x) < 3:  # a line through a single point is invisible
+                style["marker"] = "."
+            axes.plot(x, y, label=name, linewidth=1.3, **style)
+        small: Any = {} if panel is first else {"fontsize": "small"}
+        axes.set_title(panel.title if panel is not first else f"{run.task_name}, seed {run.config['seed']}",
+                       loc="left", **small)  # fmt: skip
+        axes.set_ylabel(f"{panel.title}, {panel.unit}" if panel is first else panel.unit.replace(", ", "\n"), **small)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if panel is not first:
+            axes.tick_params(labelsize="small")
+        all_axes.append(axes)
+    all_axes[0].legend(frameon=False, loc="best")
+    all_axes[0].set_xlabel("samples")
+    finish_axes(all_axes)
     return save_png(figure, run.folder / "curve.png")
-
-
-def _column(rows: Sequence[dict[str, float | None]], name: str) -> list[float]:
-    return [float("nan") if (value := row.get(name)) is None else value for row in rows]
-
-
-def _draw_mean_policy(axes: Any, rows: Sequence[dict[str, float | None]], name: str) -> None:
-    points = [(row["samples"], row[name]) for row in rows if row.get(name) is not None]
-    if points:
-        x, y = zip(*points, strict=True)
-        axes.plot(x, y, color=ACCENT, marker="o", markersize=4, label="mean policy")

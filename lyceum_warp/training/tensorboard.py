@@ -11,6 +11,7 @@ from typing import Any
 from lyceum_warp.algos import Iteration, Learner
 from lyceum_warp.env import Env
 from lyceum_warp.training.callbacks import Callback
+from lyceum_warp.training.comparison import flat_settings
 from lyceum_warp.training.runs.folder import Run
 
 _GROUPS = {
@@ -19,6 +20,9 @@ _GROUPS = {
 }  # fmt: skip
 """Maps the prefix of a column in metrics.csv to the curve's group. mjlab also uses Episode_Metrics for means per
 step."""
+
+_NO_SETTINGS = ("format", "kept", "terms", "versions", "resumed", "reached", "passed")
+"""Entries of config.json that are no settings."""
 
 _TAGS = {
     # names that rsl_rl uses
@@ -43,6 +47,9 @@ class TensorBoard(Callback):
     axes, so that runs can be overlaid. These curves are in the groups Train/, Loss/, Policy/, Perf/, Episode_Metrics/
     and, if ``env`` is given, Episode_Reward/ and Episode_Termination/. All other curves are in the groups return/,
     episode/, mean_policy/, policy/, value/, time/ and metrics/.
+
+    With ``lw.train``, the run's settings are shown as hyperparameters, and the videos of ``Videos``, which must come
+    before this callback, as moving pictures.
 
     Existing curves in the folder are continued. Values from the first new iteration on are overwritten.
 
@@ -73,10 +80,12 @@ class TensorBoard(Callback):
         self._folder = Path(folder)
         self._terms: dict[str, tuple[str, float]] = {} if env is None else _terms(env)
         self._file: Any = None
+        self._settings: dict[str, Any] = {}
 
     def begin(self, run: Run, learner: Learner, iterations: int) -> None:
         """Write into the run's folder."""
         self._folder, self._terms = run.folder, _terms(learner.env)
+        self._settings = flat_settings({name: value for name, value in run.config.items() if name not in _NO_SETTINGS})
 
     def __enter__(self) -> "TensorBoard":
         return self
@@ -97,6 +106,8 @@ class TensorBoard(Callback):
         if self._file is None:
             self._open(step)
         self._add(step=step, summary=Summary(value=values))
+        if (video := self._folder / "videos" / f"{iteration.iteration:06d}.mp4").is_file():
+            self._add(step=step, summary=_moving_picture(video))
         self._file.flush()
 
     def close(self) -> None:
@@ -117,11 +128,29 @@ class TensorBoard(Callback):
         self._add(file_version="brain.Event:2")
         # this event makes TensorBoard discard the points of earlier files from `step` on
         self._add(step=step, session_log=SessionLog(status=SessionLog.START))
+        if self._settings:
+            from torch.utils.tensorboard.summary import hparams
+
+            values = {name: x if isinstance(x, bool | int | float) else str(x) for name, x in self._settings.items()}
+            for summary in hparams(values, {tag("return_mean"): None, tag("mean_return"): None}):
+                self._add(step=step, summary=summary)
 
     def _add(self, **event: Any) -> None:
         from tensorboard.compat.proto.event_pb2 import Event
 
         self._file.write(Event(wall_time=time.time(), **event).SerializeToString())
+
+
+def _moving_picture(video: Path) -> Any:
+    """Convert a video to an animated GIF, which TensorBoard shows as an image, with a third of the frames."""
+    import imageio.v3
+    from tensorboard.compat.proto.summary_pb2 import Summary
+
+    frames = imageio.v3.imread(video)[::3, ::2, ::2]
+    rate = imageio.v3.immeta(video)["fps"] / 3
+    gif = imageio.v3.imwrite("<bytes>", frames, extension=".gif", duration=1000 / rate, loop=0)
+    image = Summary.Image(height=frames.shape[1], width=frames.shape[2], colorspace=3, encoded_image_string=gif)
+    return Summary(value=[Summary.Value(tag="video", image=image)])
 
 
 def _terms(env: Env) -> dict[str, tuple[str, float]]:

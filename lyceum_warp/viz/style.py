@@ -9,6 +9,13 @@ from lyceum_warp.viz.extra import EXTRA
 LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
 
+STYLES = (
+    ("#D55E00", "o", "-"), ("#0072B2", "s", "--"), ("#009E73", "^", "-."), ("#CC79A7", "D", ":"),
+    ("#E69F00", "v", (0, (5, 1))), ("#56B4E9", "P", (0, (3, 1, 1, 1))), ("#000000", "X", "-"),
+)  # fmt: skip
+"""Colours (Okabe and Ito's palette for colour-blind readers), markers and line styles."""
+
+
 def new_figure(purpose: str, width: float, height: float) -> Any:
     """Make a figure without pyplot. The figure needs no display, and shares no state with the user's figures."""
     try:

@@ -13,7 +13,22 @@ from lyceum_warp import cli
 from lyceum_warp.cli.arguments import NO_FLAGS, EnvFlags, Physics, Placement, given, parameter, parameters
 from lyceum_warp.core import EnvOptions, PhysicsOptions
 
-COMMANDS = ("tasks", "new", "check", "train", "compile", "eval", "export", "plan", "tune", "view", "bench")
+COMMANDS = (
+    "tasks",
+    "new",
+    "check",
+    "train",
+    "compile",
+    "plot",
+    "report",
+    "sweep",
+    "eval",
+    "export",
+    "plan",
+    "tune",
+    "view",
+    "bench",
+)
 
 
 def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:

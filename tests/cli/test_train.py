@@ -317,3 +317,25 @@ def test_second_interrupt_ends_a_run_immediately(
     assert f"curve:      {out / 'curve.png'}" in shown and (out / "curve.png").stat().st_size > 1000
     assert cli.main(["train", "--resume", str(out), "--iterations", "4", *QUIET]) == 0
     assert metrics(out) == metrics(trained)
+
+
+def test_continue_starts_a_run_then_continues_it_then_reports_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    assert train(tmp_path / "whole", "--iterations", "4") == 0
+    for total in ("2", "4", "4"):
+        assert train(out, "--iterations", total, "--continue") == 0
+    assert metrics(out) == metrics(tmp_path / "whole")
+    assert f"the run in {out} is complete" in capsys.readouterr().out
+    assert train(out, "--iterations", "9", "--continue", "--seed", "5") == 2
+    refused(capsys, "has seed 0, not 5", "omit --seed")
+
+
+def test_continue_replaces_what_a_kill_before_the_first_save_left(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert train(out, "--iterations", "1") == 0
+    for name in ("checkpoint.pt", "previous.pt", "metrics.csv"):
+        (out / name).unlink(missing_ok=True)
+    assert train(out, "--iterations", "1", "--continue") == 0
+    assert len(metrics(out)) == 1

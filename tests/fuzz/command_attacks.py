@@ -51,7 +51,7 @@ FIRST = {"tasks": "", "new": "my_task", "eval": "good", "export": "good"} | dict
     ("train --resume good", "train --from good"), ""
 )
 
-_OMIT = ("--help", "--video", "--video-every", "--frame-skip")
+_OMIT = ("--help", "--video", "--video-every", "--frame-skip", "--seeds", "--wandb")
 """Flags that no case uses, because they print help, start other processes, or make native calls run for hours."""
 
 

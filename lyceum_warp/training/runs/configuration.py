@@ -1,6 +1,8 @@
 """Convert between a learner and the config.json of its run."""
 
 import dataclasses
+import inspect
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +11,7 @@ import torch
 
 from lyceum_warp import algos
 from lyceum_warp.algos import LIMIT, Distill, Learner, Team
-from lyceum_warp.binding import spelled_task
+from lyceum_warp.binding import class_in_file, spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
@@ -27,6 +29,25 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {
 """Maps an algorithm's name in config.json to the classes of its learner and of its hyperparameters."""
 
 
+def learner_classes(algorithm: str) -> tuple[Any, Any]:
+    """Return the classes of an algorithm and of its hyperparameters.
+
+    A class of the user's, ``path/to/file.py:Class``, has the hyperparameters that its constructor's argument ``config``
+    is annotated with, or None.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: There is no such algorithm or class.
+    """
+    if algorithm in ALGORITHMS:
+        return ALGORITHMS[algorithm]
+    if ".py:" not in algorithm:
+        raise ValueError(f"there is no algorithm {algorithm!r}: use {', '.join(ALGORITHMS)} or path/to/file.py:Class")
+    kind = class_in_file(algorithm, Learner)
+    hint = typing.get_type_hints(kind.__init__).get("config")
+    return kind, next(filter(dataclasses.is_dataclass, (hint, *typing.get_args(hint))), None)
+
+
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
@@ -37,10 +58,13 @@ def describe(learner: Learner) -> dict[str, Any]:
     if isinstance(options.model, str | Path):
         entries["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
+    task = env.task.definition
+    weights = {name: float(env.given_params.get(name, weight)) for name, weight in task.rewards.items()}
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.definition),
         "params": {name: json_value(name, value) for name, value in env.given_params.items()},
+        "terms": {"rewards": weights, "ends": [*task.terminations, *task.truncations]},
         "physics": options.physics.given(),
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
@@ -128,7 +152,16 @@ class Configuration:
             seed = self.options.seed if self.seed is None else self.seed
             if teacher is not None:
                 return Distill(env, networks[0], self.hyperparameters, teacher=teacher, seed=seed, team=team)
-            learner: Learner = ALGORITHMS[self.algorithm][0](env, *networks, self.hyperparameters, seed=seed, team=team)
+            kind, _ = learner_classes(self.algorithm)
+            arguments = dict(zip(("policy", "value", "config"), (*networks, self.hyperparameters), strict=True))
+            arguments = {name: value for name, value in arguments.items() if value is not None} | {"seed": seed}
+            if team.size > 1 or "team" in inspect.signature(kind).parameters:
+                arguments["team"] = team
+            try:
+                inspect.signature(kind).bind(env, **arguments)
+            except TypeError as error:
+                raise ValueError(f"{self.algorithm} cannot be made with {', '.join(arguments)}: {error}") from error
+            learner: Learner = kind(env, **arguments)
             return learner
         except (ValueError, FileNotFoundError) as error:
             if run is not None:

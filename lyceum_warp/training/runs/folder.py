@@ -37,7 +37,8 @@ _ENTRIES: dict[str, Any] = {
     "algorithm": str, "nworld": _COUNT, "threads": _COUNT, "seed": _COUNT, "iterations": _COUNT, "keep_every": _COUNT,
     "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
     "reached": {"iteration": _COUNT, "return": float | int}, "exact_from": int | None, "gate_every": _COUNT,
-    "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list,
+    "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list, "wandb": str | None,
+    "terms": {"rewards": dict, "ends": list},
     "kept": {
         "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
         "modules": dict, "program": bool,
@@ -116,6 +117,20 @@ class Run:
             raise ValueError(f"{folder} contains a run: use another folder{way if trained else ''}")
         if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - _UNFINISHED):
             raise ValueError(f"{folder} exists and is not an empty folder: use another folder")
+
+    @staticmethod
+    def begun(folder: Path) -> bool:
+        """Return whether a folder has a run that can be resumed.
+
+        If a process was killed while it created a run, before the first save, what it has left is deleted.
+        """
+        if (folder / "checkpoint.pt").exists() or (folder / "previous.pt").exists():
+            return True
+        left = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+        if _CONFIG in left and "metrics.csv" not in left:
+            Run.open(folder)  # raises an error in a planner's folder
+            shutil.rmtree(folder)
+        return False
 
     @classmethod
     def create(

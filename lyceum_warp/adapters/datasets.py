@@ -1,0 +1,132 @@
+"""Write saved episodes as datasets for LeRobot and Minari."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lyceum_warp.controllers import Trajectory
+from lyceum_warp.core import Done
+
+_DATA, _EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
+
+
+def write_minari(episodes: Sequence[Trajectory], dataset_id: str, **options: Any) -> Any:
+    """Write episodes as a Minari dataset, with the extra ``minari``.
+
+    ``minari.load_dataset(dataset_id)`` loads it. An episode that a limit or a fault has ended is truncated.
+
+    Args:
+        episodes: Episodes of one task, such as ``list(load_episodes(folder).values())``.
+        dataset_id: The dataset's name, such as "hopper/npg-v0".
+        options: More arguments of ``minari.create_dataset_from_buffers``, such as ``description``.
+
+    Returns:
+        The ``minari.MinariDataset``.
+
+    Raises:
+        ValueError: There is no episode, or the dataset exists.
+        ImportError: Minari is not installed.
+    """
+    try:
+        import minari
+        from minari.data_collector import EpisodeBuffer
+    except ImportError as error:
+        raise ImportError("writing a Minari dataset needs minari: pip install 'lyceum-warp[minari]'") from error
+    from gymnasium.spaces import Box
+
+    spaces = [Box(-np.inf, np.inf, (rows.shape[1],)) for rows in (_first(episodes).obs, _first(episodes).actions)]
+    buffers = []
+    for number, episode in enumerate(episodes):
+        last = np.arange(episode.steps) == episode.steps - 1
+        terminated = bool(episode.done_reason & Done.TERMINATED)
+        buffers.append(
+            EpisodeBuffer(
+                id=number, seed=episode.seed, observations=episode.obs.numpy(), actions=episode.actions.numpy(),
+                rewards=episode.rewards.tolist(), terminations=(last & terminated).tolist(),
+                truncations=(last & (not terminated)).tolist(),
+            )
+        )  # fmt: skip
+    return minari.create_dataset_from_buffers(
+        dataset_id, buffers, observation_space=spaces[0], action_space=spaces[1], **options
+    )
+
+
+def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruction: str | None = None) -> Path:
+    """Write episodes as a dataset of LeRobot, format v3.0, without videos, with the extra ``lerobot``.
+
+    ``LeRobotDataset(repo_id, root=folder)`` loads it. A frame has the observation before a step, the action, and the
+    reward, the end and the success after it.
+
+    Args:
+        episodes: Episodes of one task, such as ``list(load_episodes(folder).values())``.
+        folder: A new folder.
+        instruction: The task in words; by default the task's name.
+
+    Raises:
+        ValueError: There is no episode.
+        FileExistsError: The folder exists.
+        ImportError: pandas or pyarrow is not installed.
+    """
+    try:
+        import pandas
+        import pyarrow  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            "writing a LeRobot dataset needs pandas and pyarrow: pip install 'lyceum-warp[lerobot]'"
+        ) from error
+    first, folder = _first(episodes), Path(folder)
+    lengths = np.array([episode.steps for episode in episodes])
+    ends, number = np.cumsum(lengths), np.repeat(np.arange(len(episodes)), lengths)
+    frame = np.concatenate([np.arange(length) for length in lengths])
+    rate = 1 / first.timestep
+    columns: dict[str, np.ndarray] = {
+        "observation.state": np.concatenate([episode.obs[:-1].numpy() for episode in episodes]),
+        "action": np.concatenate([episode.actions.numpy() for episode in episodes]),
+        "next.reward": np.concatenate([episode.rewards.numpy() for episode in episodes]),
+        "next.done": frame == lengths[number] - 1,
+        "next.success": np.concatenate([episode.success.numpy() for episode in episodes]),
+        "timestamp": (frame / rate).astype(np.float32), "frame_index": frame, "episode_index": number,
+        "index": np.arange(len(frame)), "task_index": np.zeros(len(frame), np.int64),
+    }  # fmt: skip
+    observed = [f"{part}_{k}" for part, (start, stop) in first.obs_parts.items() for k in range(stop - start)]
+    names = {"observation.state": observed, "action": list(first.action_names)}
+    info = {
+        "codebase_version": "v3.0", "robot_type": first.task, "total_episodes": len(episodes),
+        "total_frames": len(frame), "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200, "fps": round(rate) if abs(rate - round(rate)) < 1e-6 else rate,
+        "splits": {"train": f"0:{len(episodes)}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": None,
+        "features": {
+            name: {"dtype": str(rows.dtype), "shape": [*rows.shape[1:]] or [1], "names": names.get(name)}
+            for name, rows in columns.items()
+        },
+    }  # fmt: skip
+    stats = {
+        name: {key: np.atleast_1d(getattr(rows, key)(axis=0)).tolist() for key in ("min", "max", "mean", "std")}
+        | {"count": [len(rows)]}
+        for name, rows in columns.items()
+    }
+    words = instruction or first.task
+    table = pandas.DataFrame({
+        "episode_index": range(len(episodes)), "tasks": [[words]] * len(episodes), "length": lengths,
+        "data/chunk_index": 0, "data/file_index": 0, "dataset_from_index": ends - lengths, "dataset_to_index": ends,
+        "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
+    })  # fmt: skip
+    folder.mkdir(parents=True)
+    for name in (_DATA, _EPISODES):
+        (folder / name).parent.mkdir(parents=True)
+    pandas.DataFrame({name: list(rows) for name, rows in columns.items()}).to_parquet(folder / _DATA)
+    table.to_parquet(folder / _EPISODES)
+    pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")
+    for file, content in (("info.json", info), ("stats.json", stats)):
+        (folder / "meta" / file).write_text(json.dumps(content, indent=2))
+    return folder
+
+
+def _first(episodes: Sequence[Trajectory]) -> Trajectory:
+    if not episodes:
+        raise ValueError("there is no episode to write: pass at least one lw.Trajectory")
+    return episodes[0]

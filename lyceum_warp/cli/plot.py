@@ -1,0 +1,85 @@
+"""Plot runs and compare them: lyceum-warp plot."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from lyceum_warp import training
+from lyceum_warp.cli.display import console, say, table
+
+_COLUMNS = 4
+"""Maximum number of groups in the table of differences."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plot:
+    """Plot the curves of runs over samples and seconds, and compare their final returns, settings and versions.
+
+    Runs with the same settings are one group, whatever their seeds: the plot shows its mean and a 95 % interval
+    (Student's t). A folder stands for all runs in it. A folder with files for TensorBoard is read as a run of rsl_rl or
+    Stable-Baselines3. For a single run, the plot shows its reward terms, metrics and ends of episodes, too.
+
+    $ lyceum-warp plot runs/hopper-20260101-120000
+    $ lyceum-warp plot runs/hopper-npg runs/hopper-ppo --out comparison.png
+    $ lyceum-warp plot runs/go1 logs/rsl_rl/go1/2026-01-01_12-00-00
+    """
+
+    folders: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN|FOLDER ...")]
+    """Folders of runs, or folders that contain runs."""
+    out: Path = Path("comparison.png")
+    """The file of the plot of several runs. The curve of a single run is curve.png in its folder."""
+
+    def run(self) -> None:
+        if not self.folders:
+            raise ValueError("plot needs the folder of a run, or a folder of runs")
+        curves = training.read_curves(self.folders)
+        groups = training.group_runs(curves)
+        print_groups(groups)
+        if 1 < len(groups) <= _COLUMNS:
+            _print_differences(groups)
+        alone = len(curves) == 1 and (curves[0].folder / "config.json").is_file()
+        path = training.learning_curve(curves[0].folder) if alone else training.comparison_figure(groups, self.out)
+        say(f"figure:     {path}")
+        say(f"next:       lyceum-warp report {curves[0].folder}")
+
+
+def print_groups(groups: "list[training.RunGroup]") -> None:
+    """Print the final returns of groups of runs, with their gates and their verdicts on transfer."""
+    rows = []
+    for group in groups:
+        summary = group.summary()
+        tested = [run.gate for run in group.runs if run.gate]
+        passed = sum(text.startswith("passed") for text in tested)
+        rows.append([
+            group.task, group.label, str(len(group.runs)), _interval(summary, "mean"),
+            _interval(summary, "interquartile_mean"), f"{passed} of {len(tested)} passed" if tested else "",
+            "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
+        ])  # fmt: skip
+    headings = (
+        "task", "settings", "runs", "final return\n[95 %, t]", "interquartile mean\n[95 %, bootstrap]", "gate",
+        "transfer",
+    )  # fmt: skip
+    columns = dict(zip(headings, zip(*rows, strict=True), strict=True))
+    console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
+
+
+def _interval(summary: dict[str, Any], name: str) -> str:
+    if name not in summary:
+        return ""
+    interval = [f"{end:.5g}" for end in summary.get(f"{name}_interval", ())]
+    return f"{summary[name]:.5g}" + (f" [{', '.join(interval)}]" if interval else "")
+
+
+def _print_differences(groups: "list[training.RunGroup]") -> None:
+    """Print the settings and the versions in which groups differ, one group a column."""
+    runs = [group.runs[0] for group in groups]
+    names = [(kind, name) for kind in ("settings", "versions")
+             for name in training.differing([getattr(run, kind) for run in runs])]  # fmt: skip
+    if names:
+        columns = {"difference": [name for _, name in names]}
+        for k, run in enumerate(runs):
+            cells = [str(getattr(run, kind).get(name, "")) for kind, name in names]
+            columns[f"{k + 1}: {run.folder.name}"] = cells
+        console.print(table(columns))

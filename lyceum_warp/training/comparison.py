@@ -1,0 +1,239 @@
+"""Compare runs: curves over samples and seconds with intervals, final returns, and settings that differ."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval, student_quantile
+from lyceum_warp.training.runs.folder import Run, runs_in
+from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_png
+
+_SETTINGS = ("algorithm", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
+"""Entries of config.json that tell one kind of run from another, besides the algorithm's own."""
+
+_POINTS = 200
+"""Number of points of a mean curve."""
+
+_EVENTS = "events.out.tfevents.*"
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True)
+class RunCurve:
+    """The learning curve of a run, and what the run is."""
+
+    folder: Path
+    task: str
+    """Name of the task; empty for a run of another library."""
+    settings: Mapping[str, Any]
+    """Settings by name, without the seed."""
+    versions: Mapping[str, Any]
+    """Versions of packages, the machine and the commit."""
+    samples: np.ndarray
+    """Samples at each point, (n,)."""
+    seconds: np.ndarray
+    """Seconds of sampling and updates at each point, (n,), without evaluations. For another library, seconds since the
+    first point."""
+    returns: np.ndarray
+    """Return of the mean policy at each point, (n,), or that of the sampled episodes if there is no evaluation."""
+    gate: str = ""
+    """Whether a policy has passed the gate of the task, if it was tested."""
+    transfer: str = ""
+    """The verdict of the transfer test, if there was one."""
+
+    @property
+    def final(self) -> float:
+        """The last return."""
+        return float(self.returns[-1]) if len(self.returns) else math.nan
+
+
+@dataclasses.dataclass(frozen=True)
+class RunGroup:
+    """Runs with the same task and settings."""
+
+    task: str
+    label: str
+    """The settings that differ from those of other groups."""
+    runs: Sequence[RunCurve]
+
+    def summary(self) -> dict[str, Any]:
+        """Summarise the final returns of all runs, complete or not.
+
+        The interval of the mean is Student's t interval. That of the interquartile mean is a percentile bootstrap
+        interval, as in Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
+        """
+        finals = np.array([run.final for run in self.runs if not math.isnan(run.final)])
+        result: dict[str, Any] = {"runs": len(self.runs), "with_a_return": len(finals)}
+        if len(finals):
+            mean, half = mean_interval(finals)
+            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(finals)), "finals": finals.tolist()}
+            if len(finals) > 1:
+                result["mean_interval"] = [mean - half, mean + half]
+                result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
+        return result
+
+
+def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
+    """Read the curves of runs.
+
+    Args:
+        paths: Folders of runs, or folders that contain them. Folders with files for TensorBoard are read as runs of
+            rsl_rl or Stable-Baselines3.
+
+    Raises:
+        FileNotFoundError: A path has no run.
+        ValueError: A run cannot be read.
+        ImportError: Files for TensorBoard need the package tensorboard.
+    """
+    curves = []
+    for path in map(Path, paths):
+        folders = [path] if (path / "config.json").is_file() else list(map(Path, runs_in(path)))
+        others = [] if folders else sorted({file.parent for file in path.rglob(_EVENTS)})
+        if not folders and not others:
+            Run.open(path)  # raises an error that names what is there
+        curves += [read_curve(Run.open(folder)) for folder in folders] + [_read_events(folder) for folder in others]
+    return curves
+
+
+def read_curve(run: Run) -> RunCurve:
+    """Read the curve of a run. Iterations without a return are left out."""
+    rows = run.rows() if run.metrics.exists() else []
+    table = {name: np.array([row.get(name) for row in rows], dtype=float) for name in (rows[0] if rows else ())}
+    nothing = np.full(len(rows), math.nan)
+    times = [column for name, column in table.items() if name.startswith("time_") and name != "time_mean"]
+    seconds = np.cumsum(np.nansum([nothing, *times], axis=0))
+    evaluated = table.get("mean_return", nothing)
+    returns = evaluated if np.isfinite(evaluated).any() else table.get("return_mean", nothing)
+    known = np.isfinite(returns)
+    config, passed = run.config, run.config.get("passed")
+    gate = "not passed" if (run.folder / "gate.jsonl").exists() else ""
+    return RunCurve(
+        folder=run.folder,
+        task=run.task_name,
+        settings=flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))}),
+        versions={**config.get("versions", {}), "task source": run.manifest.get("source_hash", "")[:12]},
+        samples=table.get("samples", nothing)[known], seconds=seconds[known], returns=returns[known],
+        gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
+        transfer=json.loads(run.transfer.read_text()).get("line", "") if run.transfer.is_file() else "",
+    )  # fmt: skip
+
+
+def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Flatten nested settings to names such as "ppo.gamma"."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= flat_settings(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
+
+
+def _read_events(folder: Path) -> RunCurve:
+    """Read a run of rsl_rl or Stable-Baselines3 from its files for TensorBoard."""
+    try:
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+    except ImportError as error:
+        raise ImportError(f"reading {folder} needs tensorboard: pip install 'lyceum-warp[tensorboard]'") from error
+    events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    events.Reload()
+
+    def column(tag: str) -> np.ndarray:
+        if tag not in events.Tags()["scalars"]:
+            raise ValueError(f"{folder} has no curve {tag!r}, which rsl_rl and Stable-Baselines3 write")
+        return np.array([(event.step, event.wall_time, event.value) for event in events.Scalars(tag)])
+
+    if "rollout/ep_rew_mean" in events.Tags()["scalars"]:
+        points, library = column("rollout/ep_rew_mean"), "stable-baselines3"
+        samples = points[:, 0]
+    else:
+        points, library = column("Train/mean_reward"), "rsl_rl"
+        rate, sampling, learning = (column(f"Perf/{tag}") for tag in ("total_fps", "collection_time", "learning_time"))
+        # rsl_rl counts iterations, and rounds the rate down
+        each = np.round(np.median((rate[:, 2] + 0.5) * (sampling[:, 2] + learning[:, 2])))
+        samples = (points[:, 0] + 1) * each
+    seconds = points[:, 1] - points[0, 1]
+    return RunCurve(folder, "", {"algorithm": library}, {}, samples, seconds, points[:, 2])
+
+
+def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
+    """Group runs by task and settings. A group's label names the settings that differ from other groups'."""
+    tasks = list(dict.fromkeys(curve.task for curve in curves if curve.task)) or [""]
+    groups: list[RunGroup] = []
+    for task in tasks:
+        # a run of another library names no task, so it goes with the only task
+        members = [curve for curve in curves if curve.task == task or (not curve.task and len(tasks) == 1)]
+        kinds: dict[str, list[RunCurve]] = {}
+        for curve in members:
+            kinds.setdefault(json.dumps(curve.settings, sort_keys=True, default=str), []).append(curve)
+        settings = [kind[0].settings for kind in kinds.values()]
+        varied = [name for name in differing(settings) if all(name in each for each in settings)]
+        for kind in kinds.values():
+            values = {name: kind[0].settings[name] for name in varied}
+            algorithm = kind[0].settings.get("algorithm", "") if "algorithm" in varied or not varied else ""
+            words = [f"{name.rpartition('.')[2]} {value}" for name, value in values.items() if name != "algorithm"]
+            groups.append(RunGroup(task, ", ".join(filter(None, [str(algorithm), *words])), kind))
+    if lost := [curve for curve in curves if not curve.task] if len(tasks) > 1 else []:
+        raise ValueError(f"{lost[0].folder} names no task: compare it with runs of one task")
+    return groups
+
+
+def differing(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the names whose values differ between mappings. A name that one of them lacks differs, too."""
+    names = dict.fromkeys(name for mapping in mappings for name in mapping)
+    return [name for name in names if len({json.dumps(m.get(name), default=str) for m in mappings}) > 1]
+
+
+def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
+    """Plot the mean return of each group over samples and over seconds, with 95 % intervals (Student's t).
+
+    A run that ends before the others of its group counts with its last return from there on.
+
+    Raises:
+        ValueError: No run has a return.
+        ImportError: matplotlib is not installed.
+    """
+    known = [dataclasses.replace(g, runs=[run for run in g.runs if len(run.returns)]) for g in groups]
+    known = [group for group in known if group.runs]
+    if not known:
+        raise ValueError("no run has a return to plot: continue its training")
+    tasks = list(dict.fromkeys(group.task for group in known))
+    figure = new_figure("a comparison", 9.0, 0.6 + 2.9 * len(tasks))
+    from matplotlib.ticker import EngFormatter
+
+    for row, panels in zip(tasks, figure.subplots(len(tasks), 2, squeeze=False, sharey="row"), strict=True):
+        for k, group in enumerate(group for group in known if group.task == row):
+            colour, _, line = STYLES[k % len(STYLES)]
+            n = len(group.runs)
+            label = f"{group.label} ({n} run{'s' * (n > 1)})"
+            for axes, name in zip(panels, ("samples", "seconds"), strict=True):
+                x, mean, half = mean_curve(group.runs, name)
+                axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="." if len(x) < 3 else "")
+                axes.fill_between(x, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
+        panels[0].set_title(row, loc="left")
+        panels[0].set_ylabel("return")
+        panels[0].legend(frameon=False, loc="best", fontsize="small")
+        panels[0].set_xlabel("samples")
+        panels[1].set_xlabel("seconds of sampling and updates")
+        panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
+        finish_axes(panels)
+    return save_png(figure, out)
+
+
+def mean_curve(runs: Sequence[RunCurve], over: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the mean curve of runs, and the half-width of its 95 % interval (Student's t); 0 for a single run.
+
+    Args:
+        runs: The runs, each with at least one return.
+        over: "samples" or "seconds".
+    """
+    xs = [getattr(run, over) for run in runs]
+    n = len(runs)
+    x = xs[0] if n == 1 else np.linspace(max(each[0] for each in xs), max(each[-1] for each in xs), _POINTS)
+    values = np.array([np.interp(x, each, run.returns) for each, run in zip(xs, runs, strict=True)])
+    if n == 1:
+        return x, values[0], np.zeros(len(x))
+    return x, values.mean(0), student_quantile(0.975, n - 1) * values.std(0, ddof=1) / math.sqrt(n)

@@ -1,0 +1,171 @@
+"""Train a task with several seeds, each in a process of its own."""
+
+import ctypes
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.interrupts import postponed
+from lyceum_warp.support.machine import cpu_cores
+from lyceum_warp.support.validate import whole_number
+
+_POLL = 0.2  # seconds
+
+
+@document_attributes
+@dataclasses.dataclass
+class SeedRun:
+    """The run of one seed."""
+
+    seed: int
+    folder: Path
+    """The run's folder. The output of its process is in the file of the same name with the suffix ``.log``."""
+    state: str = "waiting"
+    """"waiting", "training", "complete", "stopped" or "failed"."""
+    error: str = ""
+    """The last line of a failed run's output."""
+
+    @property
+    def log(self) -> Path:
+        """The file with the output of the run's process."""
+        return self.folder.with_suffix(".log")
+
+
+def train_seeds(
+    task: str | Path,
+    folder: str | Path,
+    seeds: int | Sequence[int] = 5,
+    *,
+    jobs: int = 1,
+    watch: Callable[[Sequence[SeedRun]], object] | None = None,
+    **settings: Any,
+) -> list[SeedRun]:
+    """Train a task with several seeds, as ``lyceum-warp train TASK --seeds 5`` does.
+
+    Each seed is a run of its own in ``folder``, such as ``seed-0``, and a process of its own. The numbers are those of
+    ``lyceum-warp train`` with this seed. A run that fails does not end the others. If the call is interrupted or
+    killed, the same call continues all runs; a run that is complete stays as it is. After Ctrl-C or SIGTERM, all runs
+    finish their iterations and are saved.
+
+    Example:
+        >>> runs = lw.train_seeds("hopper", "runs/five", seeds=5, jobs=2, iterations=60, hidden=(32, 32))
+
+    Args:
+        task: A task's name or file.
+        folder: The folder of the runs.
+        seeds: The number of seeds, counted from 0, or the seeds themselves.
+        jobs: Number of runs that train at the same time. Each has its share of the CPU cores, and, with
+            ``device="cuda"``, the next GPU in turn.
+        watch: Called about five times a second with all runs.
+        settings: Options of ``lyceum-warp train``, such as ``iterations=60`` for ``--iterations 60``. A dict gives
+            several values by name: ``param={"ctrl_cost_weight": 0.05}``.
+
+    Raises:
+        ValueError: An argument is out of range, or a run fails before its first iteration.
+    """
+    numbers = range(whole_number("seeds", seeds, low=1, high=1000)) if isinstance(seeds, int) else sorted(set(seeds))
+    runs = [SeedRun(seed, Path(folder, f"seed-{whole_number('a seed', seed, low=0)}")) for seed in numbers]
+    words = [str(task), *flag_words(settings)]
+    places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    active: dict[int, tuple[SeedRun, subprocess.Popen[bytes]]] = {}
+    with postponed() as signals:
+        try:
+            while active or (not signals and any(run.state == "waiting" for run in runs)):
+                for slot, place in enumerate(places):
+                    run = next((run for run in runs if run.state == "waiting"), None)
+                    if slot not in active and run is not None and not signals:
+                        active[slot] = run, _start(run, words, *place)
+                        run.state = "training"
+                if signals:
+                    _end(active, signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
+                time.sleep(_POLL)
+                for slot, (run, process) in list(active.items()):
+                    if process.poll() is not None:
+                        del active[slot]
+                        _conclude(run, process.returncode, stopped=bool(signals))
+                if watch is not None:
+                    watch(runs)
+        finally:
+            _end(active, signal.SIGTERM)
+            for _, process in active.values():
+                process.wait()
+    return runs
+
+
+def flag_words(settings: Mapping[str, Any]) -> list[str]:
+    """Convert options to words of the command line, such as ``hidden=(8, 8)`` to ``--hidden 8 8``."""
+    words = []
+    for name, value in settings.items():
+        flag = f"--{name.replace('_', '-')}"
+        if isinstance(value, bool):
+            words.append(flag if value else flag.replace("--", "--no-", 1))
+        elif isinstance(value, Mapping):
+            for key, part in value.items():
+                text = ",".join(map(str, part)) if isinstance(part, Sequence) and not isinstance(part, str) else part
+                words += [flag, f"{key}={text}"]
+        elif isinstance(value, tuple | list) and any(isinstance(part, str) for part in value):
+            words += [word for part in value for word in (flag, part)]
+        else:
+            words += [flag, *map(str, value if isinstance(value, tuple | list) else [value])]
+    return words
+
+
+def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int] | None, str | None]]:
+    """Divide the CPU cores, and distribute the GPUs in turn: the cores and CUDA_VISIBLE_DEVICES of each job."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    gpus: list[str] = []
+    if device == "cuda":
+        import torch
+
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+        gpus = visible.split(",") if visible else list(map(str, range(torch.cuda.device_count())))
+    for slot in range(jobs):
+        share = set(cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs]) if jobs <= cpu_cores() else None
+        yield share or None, gpus[slot % len(gpus)] if gpus else None
+
+
+def _start(run: SeedRun, words: Sequence[str], cores: set[int] | None, gpu: str | None) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "lyceum_warp.cli", "train", *words, "--seed", str(run.seed)]
+    libc = ctypes.CDLL(None)
+
+    def prepare() -> None:
+        if cores is not None:
+            os.sched_setaffinity(0, cores)
+        if hasattr(libc, "prctl"):
+            libc.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: the run is saved if this process is killed
+
+    environment = os.environ | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
+    with run.log.open("ab") as log:
+        # in a session of its own, because Ctrl-C must reach the run once
+        return subprocess.Popen(
+            [*command, "--continue", "--out", str(run.folder)], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+            env=environment, start_new_session=True, preexec_fn=prepare,
+        )  # fmt: skip
+
+
+def _end(active: Mapping[int, tuple[SeedRun, subprocess.Popen[bytes]]], number: signal.Signals) -> None:
+    """Send a signal to each run, once."""
+    for run, process in active.values():
+        if run.state == "training" or number == signal.SIGKILL:
+            process.send_signal(number)
+            run.state = "stopped"
+
+
+def _conclude(run: SeedRun, code: int, *, stopped: bool) -> None:
+    """Note how a run has ended."""
+    if code == 0:
+        run.state = "complete"
+    elif not stopped:
+        run.state = "failed"
+        lines = run.log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
+        run.error = lines[-1].removeprefix("lyceum-warp: ")
+        if not (run.folder / "metrics.csv").exists():
+            raise ValueError(f"{run.error} (seed {run.seed}; see {run.log})")

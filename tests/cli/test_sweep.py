@@ -1,0 +1,50 @@
+from pathlib import Path
+
+import pytest
+from training_runs import refused
+
+from lyceum_warp import cli
+from lyceum_warp.training import Run
+
+SWEEP = """
+task = "point_mass"
+trials = {trials}
+out = "sweep"
+heartbeat = 1
+objective = "{objective}"
+settings = {{ iterations = 1, samples = 512, nworld = 2, value_hidden = [8], mean_every = 1, mean_episodes = 1 }}
+[ranges]
+gamma = {{ low = 0.9, high = 0.99 }}
+hidden = {{ choices = [[8], [8, 8]] }}
+"""
+
+
+def test_sweep_continues_and_names_its_best_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna")
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("def gamma(run):\n    return run.config['npg']['gamma']\n")
+    for trials in (1, 3):
+        Path("sweep.toml").write_text(SWEEP.format(trials=trials, objective="mine.py:gamma"))
+        assert cli.main(["sweep", "sweep.toml"]) == 0
+    runs = [Run.open(folder) for folder in sorted(Path("sweep").glob("trial-*/"))]
+    gammas = [run.config["npg"]["gamma"] for run in runs]
+    shown = capsys.readouterr().out
+    assert len(set(gammas)) == 3 and f"best:       trial {gammas.index(max(gammas))}, " in shown
+    assert "--seeds 5" in shown
+
+
+def test_sweep_with_a_wrong_key_or_range_prints_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna")
+    monkeypatch.chdir(tmp_path)
+    text = SWEEP.format(trials=1, objective="return")
+    for wrong, words in [
+        (text.replace("trials", "trails"), "trails = 1 is not one of task, trials"),
+        (text.replace("low", "lo"), "the range gamma = "),
+    ]:
+        Path("sweep.toml").write_text(wrong)
+        assert cli.main(["sweep", "sweep.toml"]) == 2
+        refused(capsys, words)

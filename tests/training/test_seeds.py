@@ -1,0 +1,75 @@
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training_runs import QUIET, TINY, metrics, refused, train
+
+import lyceum_warp as lw
+from lyceum_warp import cli
+from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean
+from lyceum_warp.training import flag_words
+
+WORDS = ["point_mass", *TINY, *QUIET, "--iterations", "3"]
+
+
+def test_seeds_side_by_side_equal_single_runs_and_are_summarised(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["train", *WORDS, "--seeds", "0", "3", "--jobs", "2", "--out", str(tmp_path / "both")]) == 0
+    for seed in ("0", "3"):
+        assert train(tmp_path / seed, "--iterations", "3", "--seed", seed) == 0
+        assert metrics(tmp_path / "both" / f"seed-{seed}") == metrics(tmp_path / seed)
+    summary = json.loads((tmp_path / "both" / "summary.json").read_text())
+    assert summary["states"] == {"0": "complete", "3": "complete"}
+    finals = [float(metrics(tmp_path / seed)[-2]["mean_return"]) for seed in ("0", "3")]
+    assert summary["groups"][0]["finals"] == pytest.approx(finals)
+    assert (tmp_path / "both" / "curves.png").stat().st_size > 1000
+    assert "lyceum-warp plot" in capsys.readouterr().out
+
+
+@pytest.mark.long  # tests/cli/test_train.py covers --continue
+def test_interrupted_seeds_continue_with_the_same_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = [sys.executable, "-m", "lyceum_warp.cli", "train", *WORDS[:-1], "400", "--seeds", "1", "--out", "x"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    while not (tmp_path / "x" / "seed-0" / "metrics.csv").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait() == 128 + signal.SIGTERM
+    done = len(metrics(tmp_path / "x" / "seed-0"))
+    assert done < 400
+    monkeypatch.chdir(tmp_path)
+    runs = lw.train_seeds(
+        "point_mass", "x", 1, iterations=done + 1, samples=512, nworld=2, hidden=(8,), value_hidden=(8,), mean_every=2,
+        mean_episodes=2, plot=False,
+    )  # fmt: skip
+    assert [run.state for run in runs] == ["complete"]
+    assert len(metrics(tmp_path / "x" / "seed-0")) == done + 1
+
+
+@pytest.mark.long
+def test_bad_options_end_all_seeds_with_the_error_of_the_first(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["train", *WORDS, "--gamma", "7", "--seeds", "3", "--out", str(tmp_path / "x")]
+    assert cli.main(argv) == 2
+    refused(capsys, "gamma", "seed-0.log")
+    assert not list(tmp_path.glob("x/*/config.json"))
+
+
+def test_options_become_words_of_the_command_line() -> None:
+    settings = {"hidden": (8, 8), "plot": False, "param": {"gain": 2.0, "goal": [1, 2]}, "camera": ("a=1", "b=2")}
+    words = "--hidden 8 8 --no-plot --param gain=2.0 --param goal=1,2 --camera a=1 --camera b=2"
+    assert " ".join(flag_words(settings)) == words
+
+
+def test_interquartile_mean_leaves_out_a_quarter_at_either_end() -> None:
+    values = np.array([100.0, 1.0, 2.0, 3.0, -50.0])
+    assert interquartile_mean(values) == 2.0
+    low, high = bootstrap_interval(np.arange(40.0), interquartile_mean)
+    assert 8 < low < 19.5 < high < 31
