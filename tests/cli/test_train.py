@@ -177,7 +177,7 @@ def test_damaged_best_policy_is_replaced_with_a_message(
         ("point_mass", ["--device", "cuda:77"], ["'cuda:77'"]),
         ("point_mass", ["--threads", "0"], ["threads", "0"]),
         ("point_mass", ["--iterations", "0"], ["iterations", "0"]),
-        ("point_mass", ["--algorithm", "rsl-rl"], ["'rsl-rl'", "npg or ppo"]),
+        ("point_mass", ["--algorithm", "rsl-rl"], ["'rsl-rl'", "npg, ppo, sac or"]),
         ("point_mass", ["--gamma", "1.5"], ["gamma", "1.5"]),
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
         ("point_mass", ["--learning-rate", "3"], ["--learning-rate", "ppo or sac", "npg"]),
