@@ -23,7 +23,7 @@ import torch
 from experiment import Experiment, Row, Table, choose
 
 import lyceum_warp as lw
-from lyceum_warp.algos import moved
+from lyceum_warp.env import moved
 from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
 TARGETS: dict[str, tuple[str, float, int, int | None, int]] = {

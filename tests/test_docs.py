@@ -129,7 +129,8 @@ class Walkthrough:
                     return
                 kinds = [f"{command} {option}" for option in KINDS if option in options]
                 kind = kinds[0] if kinds else command
-                more = QUICK.get(kind, []) if self.quick else []
+                own = any(option.endswith(".py:Climber") for option in options)  # has no hyperparameters
+                more = QUICK.get(kind, []) if self.quick and not own else []
                 assert cli.main([command, *options, *more]) == 0, command_line
             case _:
                 pytest.fail(f"this test does not know the command {command_line}")

@@ -62,8 +62,7 @@ class Eval:
     """
 
     USUAL = (
-        "pretrained", "which", "episodes", "seed", "nworld", "memory", "video", "transfer", "clips", "episodes_to",
-        "device",
+        "pretrained", "which", "episodes", "seed", "nworld", "memory", "video", "transfer", "episodes_to", "device",
     )  # fmt: skip
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]

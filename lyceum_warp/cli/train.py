@@ -107,8 +107,7 @@ class Train:
     --shutdown-timeout.
     """
 
-    USUAL = ("algorithm", "iterations", "minutes", "seed", "seeds", "out", "go_on", "resume", "nworld", "param",
-             "clips", "device")  # fmt: skip
+    USUAL = ("algorithm", "iterations", "seed", "seeds", "out", "go_on", "resume", "nworld", "param", "device")
 
     task: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="TASK")] = None
     """A task's name (see lyceum-warp tasks), or the file of a task: path/to/file.py, or path/to/file.py:Class. With

@@ -71,7 +71,7 @@ def test_resume_with_other_settings_prints_an_error(
         (["--iterations", "9", "--gamma", "0.9"], ["gamma 0.995, not 0.9", "start a new run in another folder"]),
         (["--iterations", "9", "--nworld", "4"], ["has nworld 2, not 4"]),
         (["--iterations", "9", "--param", "success_distance=1"], ["success_distance None, not 1"]),
-        (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo or sac, not of npg"]),
+        (["--iterations", "9", "--num-steps", "4"], ["--num-steps is a setting of ppo or sac or distill, not of npg"]),
         (["--iterations", "9", "--seed", "0"], ["--seed has no effect with --resume", "omit it"]),
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
         (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
@@ -156,8 +156,8 @@ def test_every_hyperparameter_has_a_flag(algorithm: str) -> None:
     _, config = ALGORITHMS[algorithm]
     assert {*vars(config())} <= {*vars(Hyperparameters())}
     assert given(Hyperparameters()) == {} and Hyperparameters().on_top_of(None, algorithm) == config()
-    changed = Hyperparameters(gamma=0.5, normalize=False)
-    assert changed.on_top_of(config(hidden=(3,)), algorithm) == config(hidden=(3,), gamma=0.5, normalize=False)
+    changed = Hyperparameters(mean_every=7, normalize=False)
+    assert changed.on_top_of(config(hidden=(3,)), algorithm) == config(hidden=(3,), mean_every=7, normalize=False)
 
 
 def test_damaged_best_policy_is_replaced_with_a_message(
@@ -177,7 +177,7 @@ def test_damaged_best_policy_is_replaced_with_a_message(
         ("point_mass", ["--device", "cuda:77"], ["'cuda:77'"]),
         ("point_mass", ["--threads", "0"], ["threads", "0"]),
         ("point_mass", ["--iterations", "0"], ["iterations", "0"]),
-        ("point_mass", ["--algorithm", "rsl-rl"], ["'rsl-rl'", "npg, ppo, sac or"]),
+        ("point_mass", ["--algorithm", "rsl-rl"], ["'rsl-rl'", "npg, ppo, sac, distill or"]),
         ("point_mass", ["--gamma", "1.5"], ["gamma", "1.5"]),
         ("point_mass", ["--solver", "iterations"], ["'iterations'", "NAME=VALUE"]),
         ("point_mass", ["--learning-rate", "3"], ["--learning-rate", "ppo or sac", "npg"]),

@@ -233,7 +233,7 @@ def _make(folder: Path) -> None:
     write_csv(folder / "clips/clip.csv", qpos)
     write_pickle(folder / "clips/clip.pkl", qpos, 50.0)
     np.save(folder / "table.npy", np.linspace(0.0, 1.0, 80, dtype=np.float32).reshape(40, 2))
-    options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
+    options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1", "--evaluate"]
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
     command("train", folder / "slide.py", "--out", folder / "kept", "--param", motion, *options)

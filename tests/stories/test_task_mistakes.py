@@ -35,11 +35,11 @@ MISTAKES: dict[str, tuple[list[tuple[str, str]], str]] = {
     # the file
     "missing import": (
         [("import warp as wp", "import warp as wp\nimport not_installed.sub")],
-        r"task file .*tiny\.py, line 3: No module named 'not_installed': install the missing module, or put it into",
+        r"file .*tiny\.py, line 3: No module named 'not_installed': install the missing module, or put it into",
     ),
     "syntax": (
         [("obs[0] = s.qpos[0]", "obs[0] = s.qpos[0")],
-        r"task file .*tiny\.py, line \d+: SyntaxError: '\[' was never closed",
+        r"file .*tiny\.py, line \d+: SyntaxError: '\[' was never closed",
     ),
     "a class without lw.Task": (
         [("class Tiny(lw.Task)", "@lw.register\nclass Tiny")],
