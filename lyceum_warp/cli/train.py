@@ -253,11 +253,13 @@ class Train:
             if team.leads:
                 say(f"the run in {folder} is complete")
             return self._report(source, learner) if team.leads else 0
+        changes = {name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")}
+        if settings["wandb"] is None:  # lw.train has no such setting
+            del settings["wandb"]
         try:
             run = training.train(
                 learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
-                **{name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")},
-                take_over=self.take_over and self.resume is not None, entries=settings | entries,
+                take_over=self.take_over and self.resume is not None, entries=settings | entries, **changes,
             )  # fmt: skip
         except Interrupted as signalled:
             if team.leads and (folder / "policy.pt").exists():
