@@ -21,6 +21,7 @@ PARTS = [*(f"{side}_{part}" for side in SIDES for part in LEG), *WAIST]
 JOINTS = [f"{part}_joint" for part in (*PARTS, *(f"{side}_{part}" for side in SIDES for part in ARM))]
 ENDS = [f"{side}_{part}_link" for part in ("ankle_roll", "wrist_yaw") for side in SIDES]
 OTHERS = [f"{side}_{part}_link" for part in ("hip_roll", "knee", "shoulder_roll", "elbow") for side in SIDES]
+LEG_POSE, ARM_POSE = [-0.312, 0.0, 0.0, 0.669, -0.363, 0.0], [0.2, 0.2, 0.0, 0.6, 0.0, 0.0, 0.0]  # mjlab's, rad
 FREQUENCY, DAMPING_RATIO = 2.0 * math.pi * 10.0, 2.0  # of the servos: rad/s
 
 
@@ -30,6 +31,7 @@ class Params(tracking.Params):
     bodies: wp.array[int] = lw.bodies("torso_link", *ENDS, "pelvis", *OTHERS)
     feet: wp.array[int] = lw.sites(*FEET)
     imu: wp.vec3 = wp.vec3(0.04525, 0.0, -0.08339)
+    default_pose: wp.array[float] = [*2 * LEG_POSE, *3 * [0.0], *ARM_POSE, 0.2, -0.2, *ARM_POSE[2:]]
     clips: wp.array2d[float] = str(Path(__file__).with_name("g1.npy"))
 
 
