@@ -12,6 +12,24 @@ from lyceum_warp.kernels.rotations import quat_rotate
 
 
 @wp.func
+def triangle(low: float, right: float, left: float, high: float, u: float, v: float) -> wp.vec3:
+    """Return the height at a point of a cell, and the slopes of the point's triangle along x and y.
+
+    Args:
+        low: Height at the corner with the smallest x and y.
+        right: Height at the corner with the largest x.
+        left: Height at the corner with the largest y.
+        high: Height at the corner with the largest x and y.
+        u: The point's x in the cell, between 0 and 1. The slopes are per cell, too.
+        v: The point's y in the cell.
+    """
+    along_x, along_y = right - low, high - right
+    if v > u:
+        along_x, along_y = high - left, left - low
+    return wp.vec3(low + u * along_x + v * along_y, along_x, along_y)
+
+
+@wp.func
 def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
     """Find the triangle below a point, and return its height at the point and its slopes along x and y."""
     ny, nx = ground.shape[0] - 1, ground.shape[1] - 1
@@ -22,11 +40,8 @@ def _triangle(ground: wp.array2d[float], x: float, y: float) -> wp.vec3:
     r = 1 + wp.clamp(int((py - y0) / (y1 - y0) * float(ny - 1)), 0, ny - 2)
     dx, dy = ground[0, c + 1] - ground[0, c], ground[r + 1, 0] - ground[r, 0]
     u, v = (px - ground[0, c]) / dx, (py - ground[r, 0]) / dy
-    low, high = ground[r, c], ground[r + 1, c + 1]
-    along_x, along_y = ground[r, c + 1] - low, high - ground[r, c + 1]
-    if v > u:
-        along_x, along_y = high - ground[r + 1, c], ground[r + 1, c] - low
-    return wp.vec3(low + u * along_x + v * along_y, along_x / dx, along_y / dy)
+    t = triangle(ground[r, c], ground[r, c + 1], ground[r + 1, c], ground[r + 1, c + 1], u, v)
+    return wp.vec3(t[0], t[1] / dx, t[2] / dy)
 
 
 @wp.func

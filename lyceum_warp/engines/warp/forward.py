@@ -15,6 +15,7 @@ from lyceum_warp.core.fields import Stage
 from lyceum_warp.engines.warp.group import Turns
 from lyceum_warp.engines.warp.sizes import report_pool_overflow
 from lyceum_warp.engines.warp.varied_model import ModelRows, StaticGeoms
+from lyceum_warp.engines.warp.warp_kernels import correct_ground_contacts
 from lyceum_warp.kernels.state import copy_rows
 from lyceum_warp.support.arrays import launch_rows
 from lyceum_warp.support.upstream import forward_functions
@@ -35,6 +36,11 @@ def forward(model: mjw.Model, data: mjw.Data) -> None:
     _without(frozenset())["forward"](model, data)
 
 
+def positions(model: mjw.Model, data: mjw.Data) -> None:
+    """Run the part of a forward pass that depends only on positions, for all worlds of a Data."""
+    _without(frozenset())["fwd_position"](model, data, factorize=False)
+
+
 def inertia(model: mjw.Model, data: mjw.Data) -> None:
     """Compute the inertia matrix, with the armature of tendons and of their actuators."""
     mjw.crb(model, data)
@@ -50,22 +56,34 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     For connect and weld constraints, ``mjw.make_constraint`` reads body velocities before MuJoCo Warp has computed
     them. It thus reads stale values of the last forward pass or, after a fault, NaN. In the copies, ``com_vel`` runs
     right after the positions, in every stage of a Runge-Kutta step.
+
+    If a sphere's centre or a capsule's axis lies in a height field, collision detection with 32-bit coordinates often
+    finds contacts that are metres deep, the more often the farther away the field's centre is. The copies correct them.
     """
     functions = vars(forward_functions()["smooth"])
     smooth = types.SimpleNamespace(**functions | {part.__name__: _nothing for part in done})
-    positions = _copy("fwd_kinematics", smooth=smooth)
+    kinematics = _copy("fwd_kinematics", smooth=smooth)
 
     def fwd_kinematics(model: mjw.Model, data: mjw.Data) -> None:
-        positions(model, data)
+        kinematics(model, data)
         if model.eq_connect_adr.size or model.eq_wld_adr.size:
             mjw.com_vel(model, data)
 
-    fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics)
+    def collision(model: mjw.Model, data: mjw.Data, **options: Any) -> None:
+        mjw.collision(model, data, **options)
+        if model.hfield_size.size:
+            c, geoms = data.contact, [model.geom_type, model.geom_dataid, model.geom_rbound, model.geom_size]
+            fields = [model.hfield_size, model.hfield_nrow, model.hfield_ncol, model.hfield_adr, model.hfield_data]
+            args = [*geoms, *fields, data.geom_xpos, data.geom_xmat, data.nacon, c.geom, c.worldid]
+            wp.launch(correct_ground_contacts, data.naconmax, [*args, c.dist, c.pos, c.frame])
+
+    driver = types.SimpleNamespace(collision=collision)
+    fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics, collision_driver=driver)
     inner = _copy("_forward", fwd_position=fwd_position)
     forward = _copy("forward", _forward=inner)
     stage = _without(frozenset())["_forward"] if done else inner
     step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=stage))
-    return {"_forward": inner, "forward": forward, "step": step}
+    return {"fwd_position": fwd_position, "_forward": inner, "forward": forward, "step": step}
 
 
 def _copy(function: str, **names: Any) -> Callable[..., Any]:

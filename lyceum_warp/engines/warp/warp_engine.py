@@ -196,7 +196,7 @@ class WarpEngine(Engine):
             else:
                 # MuJoCo Warp writes limit and contact sensors only while the limit or contact is active
                 wp.launch(zero_columns, (d.nworld, len(self._columns)), [self._columns, d.sensordata])
-                mjw.fwd_position(m, d, factorize=False)
+                forward.positions(m, d)
                 mjw.sensor_pos(m, d)
                 if stage == Stage.VELOCITY:
                     mjw.fwd_velocity(m, d)

@@ -1,12 +1,22 @@
-"""Define kernels of the Warp engine. They copy worlds into a group and back, place static geoms, and correct constants.
+"""Define kernels of the Warp engine. They copy worlds into a group and back, place static geoms, correct constants, and
+replace wrong contacts.
 
 Each masked world gets a number from 0, called its rank. The order of the ranks is arbitrary. A group holds the worlds
 with consecutive ranks, beginning with rank ``first``.
 """
 
+import mujoco
 import warp as wp
 
+from lyceum_warp.kernels.ground import triangle
 from lyceum_warp.kernels.rotations import quat_mul, quat_rotate, quat_to_mat
+
+HFIELD = wp.constant(int(mujoco.mjtGeom.mjGEOM_HFIELD))
+SPHERE = wp.constant(int(mujoco.mjtGeom.mjGEOM_SPHERE))
+CAPSULE = wp.constant(int(mujoco.mjtGeom.mjGEOM_CAPSULE))
+X, Y = wp.constant(wp.vec3(1.0, 0.0, 0.0)), wp.constant(wp.vec3(0.0, 1.0, 0.0))
+SEPARATE = wp.constant(1.0e6)
+"""Distance in m at which no contact is active."""
 
 
 @wp.kernel(enable_backward=False)
@@ -139,3 +149,65 @@ def correct_weights(
             dof_inout[w, i] = weight
     elif body_inout[w, body][0] == body_inout[w, body][1]:
         body_inout[w, body] = wp.cw_mul(body_inout[w, body], weighs_in[body])
+
+
+@wp.kernel(enable_backward=False)
+def correct_ground_contacts(
+    geom_type: wp.array[int],
+    geom_dataid: wp.array2d[int],
+    geom_rbound: wp.array2d[float],
+    geom_size: wp.array2d[wp.vec3],
+    hfield_size: wp.array[wp.vec4],
+    hfield_nrow: wp.array[int],
+    hfield_ncol: wp.array[int],
+    hfield_adr: wp.array[int],
+    hfield_data: wp.array[float],
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+    nacon_in: wp.array[int],
+    geom_in: wp.array[wp.vec2i],
+    world_in: wp.array[int],
+    dist_inout: wp.array[float],
+    pos_inout: wp.array[wp.vec3],
+    frame_inout: wp.array[wp.mat33],
+):
+    """Replace contacts with a height field that are deeper than the shapes are wide; launched over (naconmax,).
+
+    A height field consists of prisms, whose width is at most a cell's shorter side. A geom's width is at most twice the
+    radius of its bounding sphere. Spheres and capsules get the contact with the plane of the triangle below the centre
+    or below an end of the axis. Other geoms get none.
+    """
+    i = wp.tid()
+    if i >= nacon_in[0]:
+        return
+    w, field, geom = world_in[i], geom_in[i][0], geom_in[i][1]
+    if geom_type[field] != HFIELD:
+        return
+    grid = geom_dataid[w % geom_dataid.shape[0], field]
+    size, nrow, ncol = hfield_size[grid], hfield_nrow[grid], hfield_ncol[grid]
+    dx, dy = 2.0 * size[0] / float(ncol - 1), 2.0 * size[1] / float(nrow - 1)
+    if dist_inout[i] >= -2.0 * geom_rbound[w % geom_rbound.shape[0], geom] - wp.min(dx, dy):
+        return
+    dist_inout[i] = SEPARATE
+    if geom_type[geom] != SPHERE and geom_type[geom] != CAPSULE:
+        return
+    shape = geom_size[w % geom_size.shape[0], geom]
+    half = wp.where(geom_type[geom] == CAPSULE, shape[1], 0.0)
+    mat, axis = geom_xmat[w, field], geom_xmat[w, geom] @ wp.vec3(0.0, 0.0, half)
+    for end in range(2):
+        point = geom_xpos[w, geom] + (2.0 * float(end) - 1.0) * axis
+        local = wp.transpose(mat) @ (point - geom_xpos[w, field])
+        x, y = (local[0] + size[0]) / dx, (local[1] + size[1]) / dy
+        c, r = wp.clamp(int(x), 0, ncol - 2), wp.clamp(int(y), 0, nrow - 2)
+        first = hfield_adr[grid] + r * ncol + c
+        near = wp.vec2(hfield_data[first], hfield_data[first + 1])
+        far = wp.vec2(hfield_data[first + ncol], hfield_data[first + ncol + 1])
+        plane = triangle(near[0], near[1], far[0], far[1], x - float(c), y - float(r))
+        normal = wp.normalize(wp.vec3(-plane[1] * size[2] / dx, -plane[2] * size[2] / dy, 1.0))
+        height = (local[2] - plane[0] * size[2]) * normal[2]
+        if height - shape[0] < dist_inout[i]:
+            normal = mat @ normal
+            side = wp.normalize(wp.cross(normal, wp.where(wp.abs(normal[0]) < 0.5, X, Y)))
+            dist_inout[i] = height - shape[0]
+            pos_inout[i] = point - 0.5 * (height + shape[0]) * normal
+            frame_inout[i] = wp.matrix_from_rows(normal, side, wp.cross(normal, side))
