@@ -1,5 +1,6 @@
-"""Define kernels of the Warp engine. They copy worlds into a group and back, place static geoms, correct constants, and
-replace wrong contacts.
+"""Define kernels of the Warp engine.
+
+They copy worlds into a group and back, place static geoms, correct constants, and replace wrong contacts.
 
 Each masked world gets a number from 0, called its rank. The order of the ranks is arbitrary. A group holds the worlds
 with consecutive ranks, beginning with rank ``first``.

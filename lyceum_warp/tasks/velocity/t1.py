@@ -22,6 +22,7 @@ class Params(walking.BipedParams):
 class T1Velocity(walking.Biped):
     model = lw.playground_model("locomotion/t1/xmls/scene_mjx_feetonly_flat_terrain.xml")
     edit_model = walking.playground_model_edit(FEET)
+    physics = {"coarse": lw.PhysicsOptions(integrator="discrete", frame_skip=2, timestep=0.01)}
     training = lw.Training(
         algorithm="ppo", settings={"log_std": -0.7, "symmetry": "exact"}, iterations=800, physics="coarse"
     )
