@@ -1,5 +1,7 @@
 """G1RoughVelocity: a Unitree G1 walks at a commanded velocity on rough ground, and scans it."""
 
+import dataclasses
+
 import mujoco
 
 import lyceum_warp as lw
@@ -9,6 +11,8 @@ from lyceum_warp.tasks.velocity import g1, rough
 
 @lw.register
 class G1RoughVelocity(rough.Rough, g1.G1):
+    training = dataclasses.replace(g1.G1.training, iterations=1200, physics=None, exact_from=None)
+
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         walkers.round_feet(spec, g1.FEET)

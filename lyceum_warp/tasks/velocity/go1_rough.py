@@ -8,6 +8,8 @@ from lyceum_warp.tasks.velocity import go1, rough
 
 @lw.register
 class Go1RoughVelocity(rough.Rough, go1.Go1Velocity):
+    training = lw.Training(algorithm="ppo", settings={"symmetry": "exact"}, iterations=1200)
+
     @staticmethod
     def edit_model(spec: mujoco.MjSpec) -> None:
         rough.TERRAIN.add_to(spec)
