@@ -192,11 +192,11 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 def figure(rows: Sequence[Row]) -> Any:
     """Plot failures against minutes, a line for each seed."""
-    from lyceum_warp.viz import finish_axes, new_figure
+    from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
     plot = new_figure("failures of clips", 6.0, 4.0)
     axes = plot.subplots()
-    styles = dict(zip(SAMPLING, experiment.STYLES, strict=False))
+    styles = dict(zip(SAMPLING, STYLES, strict=False))
     for row in rows:
         colour, marker, line = styles[row.case["sampling"]]
         points = [(one["minutes"], one["failures"]) for one in row.result["policies"]]
