@@ -13,10 +13,10 @@ def test_velocity_error_of_a_standing_robot_equals_its_command(shared_env: Share
     env.reset()
     play = gates.Play(env, [(0.8, 0.6, 0.0), (0.0, 0.0, 0.5)], env.get_state())
     play.step(lambda obs: torch.zeros(2, 12), 50)
-    velocity_error, yaw_rate_error, fell, _, _ = play.results()
+    velocity_error, yaw_rate_error, *_ = play.results()
     torch.testing.assert_close(velocity_error[30:].mean(0), torch.tensor([1.0, 0.0]), atol=0.1, rtol=0.0)
     torch.testing.assert_close(yaw_rate_error[30:].mean(0), torch.tensor([0.0, 0.5]), atol=0.1, rtol=0.0)
-    assert not fell.any()
+    assert not play.falls.any()
 
 
 @pytest.mark.parametrize("limit", [name for name, limit in gates.NanoG1.limits.items() if limit.range])
