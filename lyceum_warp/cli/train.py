@@ -43,9 +43,13 @@ _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboa
 
 _RUN_FLAGS = {
     "from_run": "--from", "algorithm": "--algorithm", "teacher": "--teacher", "demonstrations": "--demonstrations",
-    "seed": "--seed", "threads": "--threads", "out": "--out",
+    "network": "--network", "seed": "--seed", "threads": "--threads", "out": "--out",
 }  # fmt: skip
 """Flags that --resume refuses, because a run keeps these settings."""
+
+
+_SIZES = ("hidden", "activation", "recurrent")
+"""Hyperparameters of the policy's network."""
 
 
 def _default_texts() -> dict[str, str]:
@@ -124,6 +128,9 @@ class Train:
     """
     demonstrations: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE...")] = None
     """The episodes that distill imitates instead, as written by eval --episodes-to or plan: files or folders."""
+    network: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """A network of your own, path/to/file.py:Class: a torch module, made by Class(observations, actions), that computes
+    the mean actions of npg, ppo and distill. The run's folder has a copy of the file."""
     setting: Repeated = ()
     """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
@@ -272,15 +279,17 @@ class Train:
 
     def _continued(self, source: "training.Run") -> "Train":
         """Return the command that resumes the run in --out, which must have the settings of the given flags."""
-        kept: dict[str, Any] = dict.fromkeys(("algorithm", "seed", "threads"))
+        kept: dict[str, Any] = dict.fromkeys(("algorithm", "network", "seed", "threads"))
         for name in kept:
             value = getattr(self, name)
             if name == "algorithm" and ".py:" in str(value):
                 kept[name], value = value, training.learner_classes(value)[0].algorithm
-            if value not in (None, source.config[name]):
+            if name == "network" and value is not None:
+                value = Path(value).name
+            if value not in (None, source.config.get(name)):
                 raise ValueError(
-                    f"{source.folder} has {name} {source.config[name]}, not {value}: omit --{name}, or start a new run "
-                    "in another folder"
+                    f"{source.folder} has {name} {source.config.get(name)}, not {value}: omit --{name}, or start a new "
+                    "run in another folder"
                 )
         return dataclasses.replace(self, resume=self.out, out=None, from_run=None, **kept)
 
@@ -297,6 +306,9 @@ class Train:
             )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
+        replaced = {"from_run": self.from_run} | {name: getattr(self.hyperparameters, name) for name in _SIZES}
+        if self.network is not None and (other := next((name for name, x in replaced.items() if x is not None), None)):
+            raise ValueError(f"--network replaces {_flag(other)}: omit one of them")
         if self.go_on and self.out is None:
             raise ValueError("--continue needs the run's folder: add --out FOLDER")
         if self.take_over and self.resume is None and not self.go_on:
@@ -379,7 +391,7 @@ class Train:
             hyperparameters = self._own_settings(algorithm, source)
         return dataclasses.replace(
             base,
-            **self._given("task", "threads", "iterations"),
+            **self._given("task", "threads", "iterations", "network"),
             options=options,
             params=params,
             algorithm=algorithm,
@@ -531,6 +543,10 @@ class Train:
         if len(choice.scores) > 1:
             say(choice.text)
         return choice
+
+
+def _flag(name: str) -> str:
+    return _RUN_FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
 def _new_folder(task: str) -> Path:

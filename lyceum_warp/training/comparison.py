@@ -14,7 +14,7 @@ from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean
 from lyceum_warp.training.runs.folder import Run, runs_in
 from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_png
 
-_SETTINGS = ("algorithm", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
+_SETTINGS = ("algorithm", "network", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
 """Entries of config.json that tell one kind of run from another, besides the algorithm's own."""
 
 _POINTS = 200

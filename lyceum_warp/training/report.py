@@ -23,8 +23,9 @@ from lyceum_warp.training.runs.task_copy import run_env
 from lyceum_warp.viz import one_line, write_page
 
 _SETTINGS = (
-    "task", "algorithm", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from", "target_return",
-    "options", "params", "physics", "planner", "planner_params", "episodes", "steps", "replan_every", "real_time",
+    "task", "algorithm", "network", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from",
+    "target_return", "options", "params", "physics", "planner", "planner_params", "episodes", "steps", "replan_every",
+    "real_time",
 )  # fmt: skip
 """Entries of config.json on the page. All others, such as those of callbacks, are left out."""
 
