@@ -28,7 +28,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import console, counted, episode_result, say, tried
+from lyceum_warp.cli.display import console, counted, episode_result, say, say_entries, tried
 from lyceum_warp.controllers import (
     CheckedController,
     ControlReport,
@@ -319,8 +319,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
         camera = parsed_camera(options.camera)
         paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
     paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
-    for name, path in paths.items():
-        say(f"{name + ':':<12}{path}")
+    say_entries(**paths)
 
 
 def _file(run: Run, episode: int) -> Path:

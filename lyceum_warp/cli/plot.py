@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say, table
+from lyceum_warp.cli.display import console, say_entries, table
 
 _COLUMNS = 4
 """Maximum number of groups in the table of differences."""
@@ -41,8 +41,7 @@ class Plot:
             _print_differences(groups)
         alone = len(curves) == 1 and (curves[0].folder / "config.json").is_file()
         path = training.learning_curve(curves[0].folder) if alone else training.comparison_figure(groups, self.out)
-        say(f"figure:     {path}")
-        say(f"next:       lyceum-warp report {curves[0].folder}")
+        say_entries(figure=path, next=f"lyceum-warp report {curves[0].folder}")
 
 
 def print_groups(groups: "list[training.RunGroup]") -> None:

@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say, table, tried
+from lyceum_warp.cli.display import console, say, say_entries, table, tried
 from lyceum_warp.cli.plot import print_groups
 
 
@@ -38,8 +38,8 @@ def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, set
         "groups": [{"task": group.task, "label": group.label, **group.summary()} for group in groups],
     }
     (folder / "summary.json").write_text(json.dumps(content, indent=2))
-    say(f"curves:     {tried(training.comparison_figure, groups, folder / 'curves.png')}")
-    say(f"next:       lyceum-warp plot {folder} OTHER_FOLDER, or lyceum-warp report {runs[0].folder}")
+    figure = tried(training.comparison_figure, groups, folder / "curves.png")
+    say_entries(curves=figure, next=f"lyceum-warp plot {folder} OTHER, or lyceum-warp report {runs[0].folder}")
     return 1 if failed else 0
 
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import binding, training
-from lyceum_warp.cli.display import say
+from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.parsing import parse
 from lyceum_warp.support.interrupts import Interrupted
 
@@ -92,9 +92,11 @@ class Sweep:
         if not completed:
             raise ValueError(f"no trial of {self.file} has been completed: see the logs in {out}")
         best = study.best_trial
-        say(f"best:       trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}")
         words = " ".join([sweep["task"], *training.flag_words(best.user_attrs["settings"])])
-        say(f"next:       lyceum-warp train {words} --seeds 5, or lyceum-warp plot {out}")
+        say_entries(
+            best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
+            next=f"lyceum-warp train {words} --seeds 5, or lyceum-warp plot {out}",
+        )
 
 
 def _read(file: Path) -> dict[str, Any]:

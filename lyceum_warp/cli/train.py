@@ -24,7 +24,7 @@ from lyceum_warp.cli.arguments import (
     parameter,
     parameters,
 )
-from lyceum_warp.cli.display import console, curve_table, note, say, tried
+from lyceum_warp.cli.display import console, curve_table, note, say, say_entries, tried
 from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
@@ -331,7 +331,7 @@ class Train:
         say(f"interrupted by {name} after {done} of {total} iterations{f'; {hint}' if done < total else ''}")
         if self.plot and (folder / "metrics.csv").exists():
             with obeyed():
-                say(f"curve:      {tried(training.learning_curve, folder)}")
+                say_entries(curve=tried(training.learning_curve, folder))
 
     def _say_end(self, run: "training.Run", iteration: int, total: int, hint: str) -> None:
         """Say why the run has ended before its last iteration."""
@@ -521,11 +521,12 @@ class Train:
             policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
         paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
-        for name, place in paths.items():
-            say(f"{name + ':':<12}{place}")
         if choice is None:
-            say(f"{'evaluate:':<12}lyceum-warp eval {run.folder}")
-        elif self.require_return is not None and not choice.score.mean > self.require_return:
+            paths["evaluate"] = f"lyceum-warp eval {run.folder}"
+        say_entries(**paths)
+        if choice is None:
+            return 0
+        if self.require_return is not None and not choice.score.mean > self.require_return:
             demand = f"--require-return demands more than {self.require_return:g}"
             note(f"the {choice.which} policy returns {choice.score.mean:.1f}; {demand}")
             return 1
