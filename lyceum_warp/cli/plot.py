@@ -78,7 +78,6 @@ def _print_differences(groups: "list[training.RunGroup]") -> None:
              for name in training.differing([getattr(run, kind) for run in runs])]  # fmt: skip
     if names:
         columns = {"difference": [name for _, name in names]}
-        for k, run in enumerate(runs):
-            cells = [str(getattr(run, kind).get(name, "")) for kind, name in names]
-            columns[f"{k + 1}: {run.folder.name}"] = cells
+        for k, (group, run) in enumerate(zip(groups, runs, strict=True), 1):
+            columns[f"{k}: {group.label}"] = [str(getattr(run, kind).get(name, "")) for kind, name in names]
         console.print(table(columns))
