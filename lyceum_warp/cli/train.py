@@ -230,7 +230,7 @@ class Train:
             begun = self.out is not None and self.go_on and team.leads and training.Run.begun(self.out)
             if self.out is not None and team.largest(int(begun))[0]:
                 source = training.Run.open(self.out)
-                return self._continued(source)._run(source, team, callbacks)
+                return dataclasses.replace(self, resume=self.out, out=None, from_run=None)._run(source, team, callbacks)
             return self._run(source, team, callbacks)
 
     def _run_seeds(self) -> int:
@@ -276,22 +276,6 @@ class Train:
             return 0
         self._say_end(run, learner.iteration, total, hint)
         return self._report(run, learner)
-
-    def _continued(self, source: "training.Run") -> "Train":
-        """Return the command that resumes the run in --out, which must have the settings of the given flags."""
-        kept: dict[str, Any] = dict.fromkeys(("algorithm", "network", "seed", "threads"))
-        for name in kept:
-            value = getattr(self, name)
-            if name == "algorithm" and ".py:" in str(value):
-                kept[name], value = value, training.learner_classes(value)[0].algorithm
-            if name == "network" and value is not None:
-                value = Path(value).name
-            if value not in (None, source.config.get(name)):
-                raise ValueError(
-                    f"{source.folder} has {name} {source.config.get(name)}, not {value}: omit --{name}, or start a new "
-                    "run in another folder"
-                )
-        return dataclasses.replace(self, resume=self.out, out=None, from_run=None, **kept)
 
     def _check_flags(self) -> None:
         if self.resume is not None:

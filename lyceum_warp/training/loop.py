@@ -250,7 +250,7 @@ def _check_equal(run: Run, learner: Learner, done: int) -> None:
 
 def _fixed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a configuration that a run keeps, by their names in config.json."""
-    settings = {name: config.get(name) for name in ("task", "algorithm", "nworld")}
+    settings = {name: config.get(name) for name in ("task", "algorithm", "nworld", "seed", "network")}
     settings["engine"] = engine_name(config.get("engine", ""), config.get("device"))
     for name in ("horizon", "fields", "dynamics"):
         settings[name] = config.get("options", {}).get(name)
