@@ -7,7 +7,7 @@ import math
 import time
 import tomllib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -129,17 +129,22 @@ def _optimize(study: Any, objective: Callable[[Any], float], search: Search) -> 
         say(f"trial {last.number}: {last.state.name.lower()} {value} {last.params}")
 
 
-def suggestion(trial: Any, name: str, entry: Mapping[str, Any]) -> Any:
-    """Let a trial choose a value in a range, such as ``{"low": 0.1, "high": 1.0}`` or ``{"choices": [...]}``."""
-    try:
-        if "choices" in entry:
-            # Optuna stores only single values
-            words = {json.dumps(x) if isinstance(x, list) else x: x for x in entry["choices"]}
-            return words[trial.suggest_categorical(name, list(words))]
-        whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
-        return (trial.suggest_int if whole else trial.suggest_float)(name, **entry)
-    except (TypeError, KeyError, ValueError) as error:
-        raise ValueError(f"the range {name} = {entry!r} needs low and high, or choices: {error}") from error
+def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
+    """Return a trial's settings: those of the file, and values that the trial chooses in the ranges."""
+    settings = dict(search.settings)
+    for name, entry in search.ranges.items():
+        first, _, part = name.partition(".")
+        try:
+            if "choices" in entry:  # Optuna stores only single values
+                words = {json.dumps(x) if isinstance(x, list) else x: x for x in entry["choices"]}
+                value = words[trial.suggest_categorical(name, list(words))]
+            else:
+                whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+                value = (trial.suggest_int if whole else trial.suggest_float)(name, **entry)
+            settings[first] = {**settings.get(first, {}), part: value} if part else value
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
+            raise ValueError(f"the range {name} = {entry!r} needs low and high, or choices: {error}") from error
+    return settings
 
 
 def _objective(search: Search) -> Callable[[Any], float]:
@@ -151,10 +156,7 @@ def _objective(search: Search) -> Callable[[Any], float]:
     judge = judge or binding.object_in_file(search.objective)
 
     def objective(trial: Any) -> float:
-        settings = dict(search.settings)
-        for name, entry in search.ranges.items():
-            value, (first, _, part) = suggestion(trial, name, entry), name.partition(".")
-            settings[first] = {**settings.get(first, {}), part: value} if part else value
+        settings = trial_settings(search, trial)
         # a trial that was killed goes on
         folder = Path(trial.user_attrs.get("run", Path(search.out, f"trial-{trial.number:04d}")))
         trial.set_user_attr("run", str(folder))

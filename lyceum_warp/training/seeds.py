@@ -112,7 +112,7 @@ def flag_words(settings: Mapping[str, Any]) -> list[str]:
                 text = ",".join(map(str, part)) if isinstance(part, Sequence) and not isinstance(part, str) else part
                 words += [flag, f"{key}={text}"]
         elif isinstance(value, tuple | list) and any(isinstance(part, str) for part in value):
-            words += [word for part in value for word in (flag, part)]
+            words += [word for part in value for word in (flag, str(part))]
         else:
             words += [flag, *map(str, value if isinstance(value, tuple | list) else [value])]
     return words
