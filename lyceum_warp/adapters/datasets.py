@@ -111,8 +111,8 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
     })  # fmt: skip
     folder.mkdir(parents=True)
-    for name in (_DATA, _EPISODES):
-        (folder / name).parent.mkdir(parents=True)
+    for file in (_DATA, _EPISODES):
+        (folder / file).parent.mkdir(parents=True)
     pandas.DataFrame({name: list(rows) for name, rows in columns.items()}).to_parquet(folder / _DATA)
     table.to_parquet(folder / _EPISODES)
     pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")

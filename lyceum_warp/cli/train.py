@@ -48,7 +48,7 @@ _RUN_FLAGS = {
 """Flags that --resume refuses, because a run keeps these settings."""
 
 
-_SIZES = ("hidden", "activation", "recurrent")
+_SIZES = {"hidden", "activation", "recurrent"}
 """Hyperparameters of the policy's network."""
 
 
@@ -290,9 +290,8 @@ class Train:
             )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
-        replaced = {"from_run": self.from_run} | {name: getattr(self.hyperparameters, name) for name in _SIZES}
-        if self.network is not None and (other := next((name for name, x in replaced.items() if x is not None), None)):
-            raise ValueError(f"--network replaces {_flag(other)}: omit one of them")
+        if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
+            raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:
             raise ValueError("--continue needs the run's folder: add --out FOLDER")
         if self.take_over and self.resume is None and not self.go_on:
@@ -528,10 +527,6 @@ class Train:
         if len(choice.scores) > 1:
             say(choice.text)
         return choice
-
-
-def _flag(name: str) -> str:
-    return _RUN_FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
 def _new_folder(task: str) -> Path:

@@ -69,14 +69,14 @@ class RunGroup:
         The interval of the mean is Student's t interval. That of the interquartile mean is a percentile bootstrap
         interval, as in Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
         """
-        finals = np.array([run.final for run in self.runs if not math.isnan(run.final)])
-        result: dict[str, Any] = {"runs": len(self.runs), "with_a_return": len(finals)}
-        if len(finals):
+        finals = [run.final for run in self.runs if not math.isnan(run.final)]
+        result: dict[str, Any] = {"runs": len(self.runs), "finals": finals}
+        if finals:
             mean, half = mean_interval(finals)
-            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(finals)), "finals": finals.tolist()}
-            if len(finals) > 1:
-                result["mean_interval"] = [mean - half, mean + half]
-                result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
+            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(np.array(finals)))}
+        if len(finals) > 1:
+            result["mean_interval"] = [mean - half, mean + half]
+            result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
         return result
 
 
