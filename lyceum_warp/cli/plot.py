@@ -73,11 +73,15 @@ def _interval(summary: dict[str, Any], name: str) -> str:
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
-    runs = [group.runs[0] for group in groups]
-    names = [(kind, name) for kind in ("settings", "versions")
-             for name in training.differing([getattr(run, kind) for run in runs])]  # fmt: skip
-    if names:
-        columns = {"difference": [name for _, name in names]}
-        for k, (group, run) in enumerate(zip(groups, runs, strict=True), 1):
-            columns[f"{k}: {group.label}"] = [str(getattr(run, kind).get(name, "")) for kind, name in names]
+    entries = [_entries(group.runs[0]) for group in groups]
+    if names := training.differing(entries):
+        columns = {"difference": names}
+        for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1):
+            columns[f"{k}: {group.label}"] = [str(each.get(name, "")) for name in names]
         console.print(table(columns))
+
+
+def _entries(run: "training.RunCurve") -> dict[str, Any]:
+    """Return settings and versions. Hyperparameters have no prefix, so that those of two algorithms are in one row."""
+    prefix = f"{run.settings['algorithm']}."
+    return {name.removeprefix(prefix): value for name, value in run.settings.items()} | {**run.versions}

@@ -31,7 +31,7 @@ def test_runs_are_grouped_by_the_settings_that_differ(runs: Path, capsys: pytest
     assert half[-1] == pytest.approx(12.706 * np.std(finals, ddof=1) / math.sqrt(2), rel=1e-3)  # Student's t
     assert cli.main(["plot", str(runs), "--out", str(runs / "all.png")]) == 0
     shown = capsys.readouterr().out
-    assert re.search(r"npg\.gamma +0\.995 +0\.9", shown) and (runs / "all.png").stat().st_size > 1000
+    assert re.search(r"gamma +0\.995 +0\.9", shown) and (runs / "all.png").stat().st_size > 1000
 
 
 def test_a_run_of_rsl_rl_is_read_from_its_tensorboard_files(tmp_path: Path) -> None:
