@@ -13,8 +13,8 @@ A run is divided into chunks. Each chunk continues from the states that the prev
 ``--work``.
 
 Part "random": worlds of every task step under random actions, without injected faults. Part "memory": environments are
-made and deleted. Part "kills": training runs are killed and resumed, and must give the same results as an uninterrupted
-run.
+made and deleted. Part "kills": training runs get SIGTERM or SIGKILL at random times, are started again by the same
+command, and must give the same results as an uninterrupted run.
 """
 
 import collections
@@ -26,6 +26,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -65,11 +66,14 @@ SHORT = (64, 20_000, 2, 0.0)
 GPU_TASKS = {"half_cheetah": (16_384, 10**8, 10, 0.5)}
 SAME_BITS = {"half_cheetah": (4096, 10**6, 10, 20.0)}
 """Entries like those of ``TASKS``, for the deterministic mode."""
-TRAININGS = {
-    "hopper": "--iterations 400 --nthread 2",
-    "point_mass": "--algorithm ppo --iterations 300 --nworld 256 --nthread 2",
-}
-SHORT_TRAINING = "--algorithm ppo --iterations 60 --nworld 8 --nthread 1 --hidden 8 --save-every 5"
+TRAININGS = (
+    "--algorithm npg --iterations 600 --samples 800 --nworld 16",
+    "--algorithm ppo --iterations 1500 --num-steps 16 --nworld 16",
+    "--algorithm sac --iterations 300 --num-steps 8 --nworld 4 --warmup 200",
+)
+SHORT_TRAININGS = ("--algorithm ppo --iterations 60 --nworld 8 --save-every 5",)
+SMALL = "--horizon 50 --nthread 1 --hidden 32 32 --value-hidden 32 32 --mean-every 20 --mean-episodes 2"
+"""Options of all trainings that are killed."""
 
 VARIANT = """
 
@@ -128,8 +132,8 @@ class Options(experiment.Options):
     """Number of worlds; by default, the number listed for the task."""
     steps: int | None = None
     """Number of steps per chunk, summed over worlds; by default, the number listed for the task."""
-    kill_every: float = 40.0
-    """Mean training time between two kills, in seconds."""
+    kill_every: float = 8.0
+    """Mean time from the start of a training to its kill, in seconds. The start is about half of it."""
     work: Path = Path("runs/soak")
     """Folder for task variants, for states between chunks, and for training runs."""
 
@@ -210,9 +214,9 @@ def cases(options: Options) -> list[Any]:
             cases += [Random(task, steps, nworld, options.engine, options.device, seed)
                       for task in (tuple(sizes_of) if short else options.tasks or lw.task_names())]  # fmt: skip
         if "kills" in parts and not cuda:
-            trainings = {"point_mass": SHORT_TRAINING} if short else TRAININGS
-            kills = (1, 0.2) if short else (10, options.kill_every)
-            cases += [Kills(task, words, *kills, seed) for task, words in trainings.items()]
+            kills = (1, 4.0) if short else (20, options.kill_every)
+            trainings = SHORT_TRAININGS if short else TRAININGS
+            cases += [Kills("point_mass", words, *kills, seed) for words in trainings]
     if "memory" in parts:
         cases.append(Memory("hopper", 10 if short else 100, 32, options.engine, options.device))
     return cases
@@ -484,29 +488,20 @@ def make_and_delete(case: Memory, options: Options) -> dict[str, Any]:
 
 def kill(case: Kills, options: Options) -> dict[str, Any]:
     """Train once without interruption and once with kills, and compare the results."""
-    straight = options.work / f"{case.task}-{case.seed}-straight"
-    killed = options.work / f"{case.task}-{case.seed}-killed"
+    straight, killed = (options.work / f"{case.words.split()[1]}-{case.seed}-{name}" for name in ("straight", "killed"))
     for folder in (straight, killed):
         shutil.rmtree(folder, ignore_errors=True)
-    program, quiet = [sys.executable, "-m", "lyceum_warp.cli", "train"], ["--no-video", "--no-plot"]
-    start = [*program, case.task, *case.words.split(), *quiet, "--seed", str(case.seed), "--out"]
-    subprocess.run([*start, str(straight)], check=True, stdout=subprocess.DEVNULL)
-    resume = [*program, "--resume", str(killed), "--iterations", str(len(table(straight))), *quiet]
+    command = [sys.executable, "-m", "lyceum_warp.cli", "train", case.task, *f"{case.words} {SMALL}".split(),
+               "--no-plot", "--seed", str(case.seed), "--continue", "--out"]  # fmt: skip
+    subprocess.run([*command, str(straight)], check=True, stdout=subprocess.DEVNULL)
     draws, kills, code = random.Random(case.seed), 0, -1
-    while code < 0:
-        saved = (killed / "checkpoint.pt").exists()
-        if not saved:
-            shutil.rmtree(killed, ignore_errors=True)
-        rows = len(table(killed))
-        process = subprocess.Popen(resume if saved else [*start, str(killed)], stdout=subprocess.DEVNULL)
+    while code < 0 or code == 128 + signal.SIGTERM:
+        process = subprocess.Popen([*command, str(killed)], stdout=subprocess.DEVNULL)
         try:
-            while process.poll() is None and len(table(killed)) <= rows:
-                time.sleep(0.05)
-            process.wait(case.kill_every * draws.uniform(0.5, 1.5) if kills < case.kills else None)
+            process.wait(case.kill_every * draws.uniform(0.0, 2.0) if kills < case.kills else None)
         except subprocess.TimeoutExpired:
             kills += 1
-        finally:
-            process.kill()
+            process.send_signal(draws.choice((signal.SIGTERM, signal.SIGKILL)))
         code = process.wait()
     policies = [lw.load(folder).state_dict() for folder in (straight, killed)]
     return {

@@ -85,6 +85,7 @@ QUICK = {
     "train --algorithm": shlex.split(
         "--iterations 2 --nworld 4 --horizon 32 --no-video --hidden 8 --value-hidden 8 --mean-every 1"
     ),
+    "train --network": ["--iterations", "2", "--no-video", *TINY[:4]],
     "train --resume": ["--iterations", "3", "--no-video"],
     "eval": ["--episodes", "2", "--no-video"],
     "tune": ["--nworld", "8", "--episodes", "4"],
@@ -92,7 +93,7 @@ QUICK = {
 }
 
 
-KINDS = ("--resume", "--teacher", "--demonstrations", "--algorithm")
+KINDS = ("--resume", "--network", "--teacher", "--demonstrations", "--algorithm")
 
 
 class Walkthrough:

@@ -9,6 +9,7 @@ import numpy as np
 
 from lyceum_warp.controllers import Trajectory
 from lyceum_warp.core import Done
+from lyceum_warp.support.extras import check_extra
 
 _DATA, _EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 
@@ -30,12 +31,10 @@ def write_minari(episodes: Sequence[Trajectory], dataset_id: str, **options: Any
         ValueError: There is no episode, or the dataset exists.
         ImportError: Minari is not installed.
     """
-    try:
-        import minari
-        from minari.data_collector import EpisodeBuffer
-    except ImportError as error:
-        raise ImportError("writing a Minari dataset needs minari: pip install 'lyceum-warp[minari]'") from error
+    check_extra("writing a Minari dataset", "minari")
+    import minari
     from gymnasium.spaces import Box
+    from minari.data_collector import EpisodeBuffer
 
     spaces = [Box(-np.inf, np.inf, (rows.shape[1],)) for rows in (_first(episodes).obs, _first(episodes).actions)]
     buffers = []
@@ -70,13 +69,9 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         FileExistsError: The folder exists.
         ImportError: pandas or pyarrow is not installed.
     """
-    try:
-        import pandas
-        import pyarrow  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            "writing a LeRobot dataset needs pandas and pyarrow: pip install 'lyceum-warp[lerobot]'"
-        ) from error
+    check_extra("writing a LeRobot dataset", "lerobot", "pandas", "pyarrow")
+    import pandas
+
     first, folder = _first(episodes), Path(folder)
     lengths = np.array([episode.steps for episode in episodes])
     ends, number = np.cumsum(lengths), np.repeat(np.arange(len(episodes)), lengths)
@@ -116,8 +111,8 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
     })  # fmt: skip
     folder.mkdir(parents=True)
-    for name in (_DATA, _EPISODES):
-        (folder / name).parent.mkdir(parents=True)
+    for file in (_DATA, _EPISODES):
+        (folder / file).parent.mkdir(parents=True)
     pandas.DataFrame({name: list(rows) for name, rows in columns.items()}).to_parquet(folder / _DATA)
     table.to_parquet(folder / _EPISODES)
     pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")

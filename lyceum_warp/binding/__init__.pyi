@@ -12,9 +12,11 @@ from lyceum_warp.binding.opened_files import (
 from lyceum_warp.binding.parameters import defaults as defaults
 from lyceum_warp.binding.registry import (
     class_in_file as class_in_file,
+    class_sources as class_sources,
     errors_of as errors_of,
     file_name as file_name,
     find_task as find_task,
+    made_in_file as made_in_file,
     object_in_file as object_in_file,
     package_task_names as package_task_names,
     register as register,

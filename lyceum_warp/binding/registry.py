@@ -93,7 +93,7 @@ def _package_modules() -> dict[str, str]:
     return found
 
 
-def _file(task: type[Task]) -> str | None:
+def _file(task: type[Any]) -> str | None:
     file = getattr(sys.modules.get(task.__module__), "__file__", None)
     return file and str(Path(file).resolve())
 
@@ -261,8 +261,34 @@ def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
     """
     found = object_in_file(spelled)
     if not isinstance(found, type) or not issubclass(found, base):
-        raise ValueError(f"{spelled} is not a class that extends lw.{base.__name__}")
+        raise ValueError(f"{spelled} is not a subclass of {base.__name__}")
     return found
+
+
+def made_in_file(spelled: str, base: type[Any], *arguments: Any) -> Any:
+    """Make an object of a subclass of ``base`` from ``path/to/file.py:Class``.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file cannot be run, has no such class, or the class takes other arguments.
+    """
+    kind = class_in_file(spelled, base)
+    try:
+        return kind(*arguments)
+    except TypeError as error:
+        raise ValueError(f"{spelled} is made by {kind.__name__}{arguments}: {error}") from error
+
+
+def class_sources(kind: type[Any]) -> dict[str, bytes]:
+    """Read the file of a class that ``class_in_file`` has loaded, and the modules that it imports from its folder.
+
+    The keys are paths in this folder. The class's file is the first. The result is empty for any other class.
+    """
+    if not kind.__module__.startswith(_FILE):
+        return {}
+    file = Path(_file(kind) or "")
+    sources = _read(file, local_modules(file))
+    return {path.relative_to(file.parent).as_posix(): content for path, content in sources.items()}
 
 
 def object_in_file(spelled: str) -> Any:

@@ -1,12 +1,12 @@
 """Check that a task follows the package's rules: lyceum-warp check."""
 
 import dataclasses
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, TaskWord, given, parameters
-from lyceum_warp.cli.display import say
+from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.testing import CHECKS, check_task
 
@@ -46,14 +46,13 @@ class Check:
                 hint = did_you_mean(rule, rules, f"there are {', '.join(rules)}")
                 raise ValueError(f"there is no rule {rule!r}: {hint}")
         checks = [rules[rule] for rule in self.rule] or CHECKS
-        kwargs = given(self.env) | given(self.physics_options) | parameters(self.param)
+        kwargs: dict[str, Any] = {"nworld": self.nworld, "steps": self.steps, "seed": self.seed}
+        kwargs |= given(self.env) | given(self.physics_options) | parameters(self.param)
         try:
-            say(
-                str(
-                    check_task(self.task, nworld=self.nworld, steps=self.steps, seed=self.seed, checks=checks, **kwargs)
-                )
-            )
+            say(str(check_task(self.task, checks=checks, **kwargs)))
         except AssertionError as error:
             say(str(error))
             return 1
+        warp = f"lyceum-warp check {self.task} --engine warp, then " if not given(self.env) else ""
+        say_entries(next=f"{warp}lyceum-warp train {self.task}")
         return 0

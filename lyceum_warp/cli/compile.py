@@ -7,7 +7,7 @@ import tyro
 
 from lyceum_warp import algos, engines, env  # each name loads at its first use
 from lyceum_warp.cli.arguments import EnvFlags, ParamWords, Physics, TaskWord
-from lyceum_warp.cli.display import say
+from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.train import Train
 
 _WORLDS = 64
@@ -62,3 +62,4 @@ class Compile:
             # a run evaluates its policy on the C engine
             env.Env(self.task, options.changed({**engines.options_on_cores(), "nworld": 1}), params)
         say(f"the kernels of {self.task} are in {wp.config.kernel_cache_dir}")
+        say_entries(next=f"lyceum-warp train {self.task}")

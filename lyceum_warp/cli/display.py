@@ -27,6 +27,12 @@ def say(text: str) -> None:
     console.print(text, soft_wrap=True, markup=False)
 
 
+def say_entries(**entries: object) -> None:
+    """Print paths and commands by their names, one a line. ``next`` is what to do after the command."""
+    for name, entry in entries.items():
+        say(f"{name + ':':<12}{entry}")
+
+
 def note(line: str) -> None:
     """Print a message to stderr."""
     print(f"lyceum-warp: {line}", file=sys.stderr)

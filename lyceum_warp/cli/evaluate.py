@@ -22,7 +22,7 @@ from lyceum_warp.algos import (
 from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, given, parameter, parameters
 from lyceum_warp.cli.clips import print_clips
-from lyceum_warp.cli.display import console, say, table, tried
+from lyceum_warp.cli.display import console, say, say_entries, table, tried
 from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import options_for_few_worlds, options_on_cores
@@ -129,9 +129,11 @@ class Eval:
         which = better_policy(run, self.which, task=self.task)
         policy = load(run, which=which, device=env.obs.device)
         check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+        place = f"{self.folder} --pretrained" if self.pretrained else self.folder
         if self.clips is not None:
             picture = Path(f"{file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
             print_clips(env, policy, self.clips, picture if self.video else None, camera)
+            say_entries(next=f"lyceum-warp view {place}")
             return
         curricula, origin_of_memory = self._curricula(run, which, env)
         if len(curricula) > 1 and (self.transfer or self.episodes_to):
@@ -163,8 +165,7 @@ class Eval:
             path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
             seed = evaluation_seed(self.seed)
             say(f"video: {tried(policy_video, env, policy, path, seed, curriculum=curricula[0], camera=camera)}")
-        place = f"{self.folder} --pretrained" if self.pretrained else self.folder
-        say(f"next: lyceum-warp view {place}")
+        say_entries(next=f"lyceum-warp view {place}")
 
     def _curricula(self, run: Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
         """Return the curricula at which to play, one for each value of --memory, and where they come from."""

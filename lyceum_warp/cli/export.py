@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.algos import check_export, export_policy
-from lyceum_warp.cli.display import note, say
+from lyceum_warp.cli.display import note, say, say_entries
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.env import Env, start_episodes
@@ -44,7 +44,7 @@ class Export:
         policy = load(run, which=which)
         export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
         say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
-        say("next:       docs/deployment.md runs the policy on a robot")
+        say_entries(next="docs/deployment.md runs the policy on a robot")
 
     def _env(self, run: Run, which: str) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.algos import gate
-from lyceum_warp.cli.display import console, say, table
+from lyceum_warp.cli.display import console, say, say_entries, table
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.long_work import LongWork
@@ -58,4 +58,7 @@ class Gate:
         start = f", begun at {verdict.memory}" if verdict.memory else ""
         say(f"{verdict.task}: the policy {'passes' if verdict.passed else 'does not pass'} on the C engine under exact "
             f"physics{start}")  # fmt: skip
+        place = f"{self.folder} --pretrained" if self.pretrained else f"{self.folder} --which {self.which}"
+        export = f", or lyceum-warp export {place}" if verdict.passed and not self.pretrained else ""
+        say_entries(next=f"lyceum-warp view {place}{export}")
         return 0 if verdict.passed else 1

@@ -13,7 +13,7 @@ import mujoco
 import tyro
 
 from lyceum_warp.binding import compile_model, find_task, package_task_names, snake_case
-from lyceum_warp.cli.display import say
+from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.task_text import TRAINING, actuated_joints, literal, plain_text, tracking_text, velocity_text
 from lyceum_warp.core import (
     CONES,
@@ -105,12 +105,12 @@ class New:
         else:
             sizes = f"feet {', '.join(foot.site for foot in legs.feet)}; joints {', '.join(legs.joints)}"
         training = {"plain": "", "velocity": f" {TRAINING}", "tracking": " --clips FILES --device cuda"}[self.template]
-        say(f"{path}: {sizes}; check and train it with")
-        say(f"  lyceum-warp check {path}\n  lyceum-warp train {path}{training}")
+        say(f"{path}: {sizes}")
         if self.template != "plain":
             cone = next(name for name, kind in CONES.items() if kind == model.opt.cone)
             physics = f"{task.frame_skip} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
             say(f"a step has {physics}; lyceum-warp tune {path} finds faster physics")
+        say_entries(next=f"lyceum-warp check {path}", then=f"lyceum-warp train {path}{training}")
 
 
 def _class_name(path: Path) -> str:

@@ -16,7 +16,7 @@ import tyro
 from rich.markup import escape
 
 from lyceum_warp.algos import MPPI, MPPIConfig, PlanUpdate, task_config
-from lyceum_warp.binding import class_in_file, file_name, find_task, spelled_task, task_name
+from lyceum_warp.binding import file_name, find_task, made_in_file, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
     CameraWords,
     OptionFlags,
@@ -28,7 +28,7 @@ from lyceum_warp.cli.arguments import (
     given,
     parameters,
 )
-from lyceum_warp.cli.display import console, counted, episode_result, say, tried
+from lyceum_warp.cli.display import console, counted, episode_result, say, say_entries, tried
 from lyceum_warp.controllers import (
     CheckedController,
     ControlReport,
@@ -67,21 +67,13 @@ class Settings(OptionFlags, options=[MPPIConfig]):
         """Override a configuration's settings with the given flags."""
         settings = given(self)
         if ".py:" in settings.get("update", ""):
-            settings["update"] = _own_update(settings["update"])
+            settings["update"] = made_in_file(settings["update"], PlanUpdate)
         if self.fill is not None:
             settings["fill"] = _fill(self.fill)
         for name in ("noise", "min_noise"):
             if name in settings and len(settings[name]) == 1:
                 settings[name] = settings[name][0]
         return config.changed(settings)
-
-
-def _own_update(spelled: str) -> PlanUpdate:
-    kind = class_in_file(spelled, PlanUpdate)
-    try:
-        return kind()
-    except TypeError as error:
-        raise ValueError(f"--update {spelled} makes {kind.__name__}(): {error}: give its arguments defaults") from error
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -327,8 +319,7 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
         camera = parsed_camera(options.camera)
         paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
     paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
-    for name, path in paths.items():
-        say(f"{name + ':':<12}{path}")
+    say_entries(**paths)
 
 
 def _file(run: Run, episode: int) -> Path:

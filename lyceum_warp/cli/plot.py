@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say, table
+from lyceum_warp.cli.display import console, say_entries, table
 
 _COLUMNS = 4
 """Maximum number of groups in the table of differences."""
@@ -41,8 +41,7 @@ class Plot:
             _print_differences(groups)
         alone = len(curves) == 1 and (curves[0].folder / "config.json").is_file()
         path = training.learning_curve(curves[0].folder) if alone else training.comparison_figure(groups, self.out)
-        say(f"figure:     {path}")
-        say(f"next:       lyceum-warp report {curves[0].folder}")
+        say_entries(figure=path, next=f"lyceum-warp report {curves[0].folder}")
 
 
 def print_groups(groups: "list[training.RunGroup]") -> None:
@@ -74,12 +73,15 @@ def _interval(summary: dict[str, Any], name: str) -> str:
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
-    runs = [group.runs[0] for group in groups]
-    names = [(kind, name) for kind in ("settings", "versions")
-             for name in training.differing([getattr(run, kind) for run in runs])]  # fmt: skip
-    if names:
-        columns = {"difference": [name for _, name in names]}
-        for k, run in enumerate(runs):
-            cells = [str(getattr(run, kind).get(name, "")) for kind, name in names]
-            columns[f"{k + 1}: {run.folder.name}"] = cells
+    entries = [_entries(group.runs[0]) for group in groups]
+    if names := training.differing(entries):
+        columns = {"difference": names}
+        for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1):
+            columns[f"{k}: {group.label}"] = [str(each.get(name, "")) for name in names]
         console.print(table(columns))
+
+
+def _entries(run: "training.RunCurve") -> dict[str, Any]:
+    """Return settings and versions. Hyperparameters have no prefix, so that those of two algorithms are in one row."""
+    prefix = f"{run.settings['algorithm']}."
+    return {name.removeprefix(prefix): value for name, value in run.settings.items()} | {**run.versions}

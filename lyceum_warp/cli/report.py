@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import say
+from lyceum_warp.cli.display import say_entries
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -29,5 +29,4 @@ class Report:
 
     def run(self) -> None:
         path = training.write_report(self.folder, self.out, episode=self.episode)
-        say(f"report:     {path}")
-        say("next:       open the file in a browser, or send it: it needs no other file")
+        say_entries(report=path, next="open the file in a browser, or send it: it needs no other file")

@@ -10,8 +10,11 @@ from rich.live import Live
 from rich.table import Table
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say, table, tried
+from lyceum_warp.cli.display import console, known_values, say, say_entries, table, tried
 from lyceum_warp.cli.plot import print_groups
+
+_NUMBERS = {"iteration": ",.0f", "samples": ",.0f", "return_mean": ".5g", "mean_return": ".5g"}
+"""Columns of metrics.csv whose last values the table shows, with their formats."""
 
 
 def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, settings: Mapping[str, Any]) -> int:
@@ -32,27 +35,24 @@ def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, set
     console.print(_progress(runs))
     groups = training.group_runs(training.read_curves([folder]))
     print_groups(groups)
-    failed = [run for run in runs if run.state != "complete"]
     content = {
         "states": {run.seed: run.state for run in runs},
         "groups": [{"task": group.task, "label": group.label, **group.summary()} for group in groups],
     }
     (folder / "summary.json").write_text(json.dumps(content, indent=2))
-    say(f"curves:     {tried(training.comparison_figure, groups, folder / 'curves.png')}")
-    say(f"next:       lyceum-warp plot {folder} OTHER_FOLDER, or lyceum-warp report {runs[0].folder}")
-    return 1 if failed else 0
+    figure = tried(training.comparison_figure, groups, folder / "curves.png")
+    say_entries(curves=figure, next=f"lyceum-warp plot {folder} OTHER, or lyceum-warp report {runs[0].folder}")
+    return int(any(run.state != "complete" for run in runs))
 
 
 def _progress(runs: Sequence[Any]) -> Table:
     rows = []
     for run in runs:
-        metrics = run.folder / "metrics.csv"
-        lines = training.Run.open(run.folder).rows() if metrics.exists() else []
-        last: dict[str, float | None] = lines[-1] if lines else {}
-        returns = [value for line in lines if (value := line.get("mean_return")) is not None]
-        counts = [f"{last[name]:,.0f}" if name in last else "" for name in ("iteration", "samples")]
-        result = "" if last.get("return_mean") is None else f"{last['return_mean']:.5g}"
-        rows.append([str(run.seed), run.state, *counts, result, f"{returns[-1]:.5g}" if returns else "", run.error])
+        last: dict[str, float] = {}
+        for row in training.Run.open(run.folder).rows() if (run.folder / "metrics.csv").exists() else ():
+            last |= known_values(row)
+        cells = [format(last[name], form) if name in last else "" for name, form in _NUMBERS.items()]
+        rows.append([str(run.seed), run.state, *cells, run.error])
     headings = ("seed", "state", "iter", "samples", "return", "mean\npolicy", "error")
     return table(dict(zip(headings, zip(*rows, strict=True), strict=True)))
 

@@ -7,21 +7,18 @@ import math
 import time
 import tomllib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp import binding, training
-from lyceum_warp.cli.display import say
+from lyceum_warp import binding, training, viz
+from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.parsing import parse
+from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.interrupts import Interrupted
-
-_KEYS = {
-    "task": str, "trials": int, "out": str, "storage": str, "objective": str, "direction": str, "sampler": str,
-    "pruner": str, "heartbeat": int, "settings": dict, "ranges": dict,
-}  # fmt: skip
+from lyceum_warp.support.validate import check_kind, whole_number
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,105 +50,131 @@ class Sweep:
     file in out), sampler and pruner (names of Optuna's classes), and heartbeat (60 seconds)."""
 
     def run(self) -> None:
-        try:
-            import optuna
-        except ImportError as error:
-            raise ImportError("sweeps need optuna: pip install 'lyceum-warp[sweep]'") from error
-        sweep = _read(self.file)
-        out = Path(sweep["out"])
+        check_extra("a sweep", "sweep", "optuna")
+        import optuna
+
+        search = read_search(self.file)
+        out, beat = Path(search.out), search.heartbeat
         out.mkdir(parents=True, exist_ok=True)
-        beat = sweep.get("heartbeat", 60)
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # heartbeats are experimental
-        storage = optuna.storages.RDBStorage(
-            sweep.get("storage", f"sqlite:///{out.resolve()}/sweep.db"), heartbeat_interval=beat, grace_period=2 * beat,
-            heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
-        )  # fmt: skip
-        gate = sweep.get("objective") == "gate"
-        study = optuna.create_study(
-            storage=storage, study_name=self.file.stem, load_if_exists=True,
-            direction=sweep.get("direction", "minimize" if gate else "maximize"),
-            sampler=getattr(optuna.samplers, sweep.get("sampler", "TPESampler"))(),
-            pruner=getattr(optuna.pruners, sweep.get("pruner", "MedianPruner"))(),
-        )  # fmt: skip
-        objective = _objective(sweep, out)
-        while True:
-            optuna.storages.fail_stale_trials(study)
-            states = [trial.state.name for trial in study.get_trials(deepcopy=False)]
-            done = states.count("COMPLETE") + states.count("PRUNED")
-            if done >= sweep["trials"]:
-                break
-            if done + states.count("RUNNING") >= sweep["trials"]:
-                time.sleep(min(beat, 5))  # another worker finishes the last trials, or has been killed
-                continue
-            study.optimize(objective, n_trials=1)
-            last = study.get_trials(deepcopy=False)[-1]
-            say(f"trial {last.number}: {last.state.name.lower()} {'' if last.value is None else f'{last.value:.6g}'} "
-                f"{last.params}")  # fmt: skip
-        completed = study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.COMPLETE])
-        if not completed:
-            raise ValueError(f"no trial of {self.file} has been completed: see the logs in {out}")
-        best = study.best_trial
-        say(f"best:       trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}")
-        words = " ".join([sweep["task"], *training.flag_words(best.user_attrs["settings"])])
-        say(f"next:       lyceum-warp train {words} --seeds 5, or lyceum-warp plot {out}")
+        try:
+            study = optuna.create_study(
+                storage=optuna.storages.RDBStorage(
+                    search.storage or f"sqlite:///{out.resolve()}/sweep.db", heartbeat_interval=beat,
+                    grace_period=2 * beat,
+                    heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
+                ),
+                study_name=self.file.stem, load_if_exists=True,
+                direction=search.direction or ("minimize" if search.objective == "gate" else "maximize"),
+                sampler=getattr(optuna.samplers, search.sampler)(), pruner=getattr(optuna.pruners, search.pruner)(),
+            )  # fmt: skip
+            _optimize(study, _objective(search), search)
+            best = study.best_trial
+        except Exception as error:  # Optuna and databases raise many types of errors
+            raise ValueError(f"{self.file}: {viz.one_line(error)} (the logs of trials are in {out})") from error
+        words = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
+        say_entries(
+            best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
+            next=f"lyceum-warp train {words} --seeds 5, or lyceum-warp plot {out}",
+        )
 
 
-def _read(file: Path) -> dict[str, Any]:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Search:
+    """The content of a sweep's file."""
+
+    task: str
+    trials: int
+    out: str
+    ranges: dict
+    settings: dict = dataclasses.field(default_factory=dict)
+    objective: str = "return"
+    direction: str | None = None
+    storage: str | None = None
+    sampler: str = "TPESampler"
+    pruner: str = "MedianPruner"
+    heartbeat: int = 60
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            check_kind(field.name, getattr(self, field.name), field.type, "see lyceum-warp sweep --help")
+        whole_number("heartbeat", self.heartbeat, low=1)
+
+
+def read_search(file: Path) -> Search:
+    """Read a sweep's file."""
     try:
-        sweep = tomllib.loads(file.read_text())
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{file}: {error}") from error
-    for name, value in sweep.items():
-        if not isinstance(value, _KEYS.get(name, ())):
-            raise ValueError(f"{file}: {name} = {value!r} is not one of {', '.join(_KEYS)} with its type")
-    if missing := [name for name in ("task", "trials", "out", "ranges") if name not in sweep]:
-        raise ValueError(f"{file} lacks {missing[0]}: see lyceum-warp sweep --help")
-    return sweep
+        return Search(**tomllib.loads(file.read_text()))
+    except (ValueError, TypeError) as error:  # a name is missing or unknown
+        raise ValueError(f"{file}: {str(error).removeprefix('Search.__init__() ')}") from error
 
 
-def suggestion(trial: Any, name: str, entry: Mapping[str, Any]) -> Any:
-    """Let a trial choose a value in a range, such as ``{"low": 0.1, "high": 1.0}`` or ``{"choices": [...]}``."""
-    try:
-        if "choices" in entry:
-            # Optuna stores only single values
-            words = {json.dumps(x) if isinstance(x, list) else x: x for x in entry["choices"]}
-            return words[trial.suggest_categorical(name, list(words))]
-        whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
-        return (trial.suggest_int if whole else trial.suggest_float)(name, **entry)
-    except (TypeError, KeyError, ValueError) as error:
-        raise ValueError(f"the range {name} = {entry!r} needs low and high, or choices: {error}") from error
+def _optimize(study: Any, objective: Callable[[Any], float], search: Search) -> None:
+    """Run trials until the sweep has enough. Other workers may run trials of the same study."""
+    import optuna
+
+    while True:
+        optuna.storages.fail_stale_trials(study)
+        states = [trial.state.name for trial in study.get_trials(deepcopy=False)]
+        done = states.count("COMPLETE") + states.count("PRUNED")
+        if done >= search.trials:
+            return
+        if done + states.count("RUNNING") >= search.trials:
+            time.sleep(min(search.heartbeat, 5))  # another worker finishes the last trials, or has been killed
+            continue
+        study.optimize(objective, n_trials=1)
+        last = study.get_trials(deepcopy=False)[-1]
+        value = "" if last.value is None else f"{last.value:.6g}"
+        say(f"trial {last.number}: {last.state.name.lower()} {value} {last.params}")
 
 
-def _objective(sweep: Mapping[str, Any], out: Path) -> Callable[[Any], float]:
+def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
+    """Return a trial's settings: those of the file, and values that the trial chooses in the ranges."""
+    settings = dict(search.settings)
+    for name, entry in search.ranges.items():
+        first, _, part = name.partition(".")
+        try:
+            if "choices" in entry:  # Optuna stores only single values
+                words = {json.dumps(x) if isinstance(x, list) else x: x for x in entry["choices"]}
+                value = words[trial.suggest_categorical(name, list(words))]
+            else:
+                whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
+                value = (trial.suggest_int if whole else trial.suggest_float)(name, **entry)
+            settings[first] = {**settings.get(first, {}), part: value} if part else value
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
+            raise ValueError(f"the range {name} = {entry!r} needs low and high, or choices: {error}") from error
+    return settings
+
+
+def _objective(search: Search) -> Callable[[Any], float]:
     import optuna
 
     from lyceum_warp.cli.train import Train
 
-    goal = sweep.get("objective", "return")
-    judge = {"return": _best_return, "gate": _gate_seconds}.get(goal) or binding.object_in_file(goal)
+    judge = {"return": _best_return, "gate": _gate_seconds}.get(search.objective)
+    judge = judge or binding.object_in_file(search.objective)
 
     def objective(trial: Any) -> float:
-        settings = dict(sweep.get("settings", {}))
-        for name, entry in sweep["ranges"].items():
-            value, (first, _, part) = suggestion(trial, name, entry), name.partition(".")
-            settings[first] = {**settings.get(first, {}), part: value} if part else value
-        folder = Path(trial.user_attrs.get("run", out / f"trial-{trial.number:04d}"))  # a killed trial goes on
+        settings = trial_settings(search, trial)
+        # a trial that was killed goes on
+        folder = Path(trial.user_attrs.get("run", Path(search.out, f"trial-{trial.number:04d}")))
         trial.set_user_attr("run", str(folder))
         trial.set_user_attr("settings", settings)
 
         def report(iteration: Any) -> None:
             value = iteration.return_mean if iteration.mean_return is None else iteration.mean_return
-            if value is not None and math.isfinite(value) and goal == "return":
+            if value is not None and math.isfinite(value):
                 trial.report(value, iteration.iteration)
                 if trial.should_prune():
                     raise optuna.TrialPruned
 
-        words = [sweep["task"], *training.flag_words(settings), "--continue", "--out", str(folder)]
-        command = parse(Train, "lyceum-warp train", words)
+        by_return = search.objective == "return"
+        words = [search.task, *training.flag_words(settings), *["--evaluate"] * by_return, "--continue", "--out"]
+        command = parse(Train, "lyceum-warp train", [*words, str(folder)])
         with folder.with_suffix(".log").open("a") as log, contextlib.redirect_stdout(log):
             try:
-                code = command.run([report])
+                code = command.run([report] * by_return)
             except FloatingPointError as error:
                 raise optuna.TrialPruned from error
         if code >= 128:
@@ -162,16 +185,11 @@ def _objective(sweep: Mapping[str, Any], out: Path) -> Callable[[Any], float]:
 
 
 def _best_return(run: Any) -> float:
-    """Return the mean return of the better policy in new episodes, which ``train`` has stored at the end."""
+    """Return the mean return of the better policy in new episodes, which ``train --evaluate`` has stored."""
     return max(float(score["mean"]) for score in json.loads(run.evaluation.read_text())["policies"].values())
 
 
 def _gate_seconds(run: Any) -> float:
     """Return the seconds of sampling and updates until the gate was passed; infinity if it was not."""
     passed = run.config.get("passed")
-    if passed is None:
-        return math.inf
-    rows = run.rows()[: passed["iteration"]]
-    return sum(
-        value or 0.0 for row in rows for name, value in row.items() if name.startswith("time_") and name != "time_mean"
-    )
+    return math.inf if passed is None else sum(map(training.row_seconds, run.rows()[: passed["iteration"]]))

@@ -24,7 +24,7 @@ from lyceum_warp.cli.arguments import (
     parameter,
     parameters,
 )
-from lyceum_warp.cli.display import console, curve_table, note, say, tried
+from lyceum_warp.cli.display import console, curve_table, note, say, say_entries, tried
 from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
@@ -43,9 +43,13 @@ _SETTINGS = {"target_return": None, "keep_every": 0, "save_every": 0, "tensorboa
 
 _RUN_FLAGS = {
     "from_run": "--from", "algorithm": "--algorithm", "teacher": "--teacher", "demonstrations": "--demonstrations",
-    "seed": "--seed", "threads": "--threads", "out": "--out",
+    "network": "--network", "seed": "--seed", "threads": "--threads", "out": "--out",
 }  # fmt: skip
 """Flags that --resume refuses, because a run keeps these settings."""
+
+
+_SIZES = {"hidden", "activation", "recurrent"}
+"""Hyperparameters of the policy's network."""
 
 
 def _default_texts() -> dict[str, str]:
@@ -124,6 +128,9 @@ class Train:
     """
     demonstrations: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE...")] = None
     """The episodes that distill imitates instead, as written by eval --episodes-to or plan: files or folders."""
+    network: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
+    """A network of your own, path/to/file.py:Class: a torch module, made by Class(observations, actions), that computes
+    the mean actions of npg, ppo and distill. The run's folder has a copy of the file."""
     setting: Repeated = ()
     """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
@@ -223,7 +230,7 @@ class Train:
             begun = self.out is not None and self.go_on and team.leads and training.Run.begun(self.out)
             if self.out is not None and team.largest(int(begun))[0]:
                 source = training.Run.open(self.out)
-                return self._continued(source)._run(source, team, callbacks)
+                return dataclasses.replace(self, resume=self.out, out=None, from_run=None)._run(source, team, callbacks)
             return self._run(source, team, callbacks)
 
     def _run_seeds(self) -> int:
@@ -270,20 +277,6 @@ class Train:
         self._say_end(run, learner.iteration, total, hint)
         return self._report(run, learner)
 
-    def _continued(self, source: "training.Run") -> "Train":
-        """Return the command that resumes the run in --out, which must have the settings of the given flags."""
-        kept: dict[str, Any] = dict.fromkeys(("algorithm", "seed", "threads"))
-        for name in kept:
-            value = getattr(self, name)
-            if name == "algorithm" and ".py:" in str(value):
-                kept[name], value = value, training.learner_classes(value)[0].algorithm
-            if value not in (None, source.config[name]):
-                raise ValueError(
-                    f"{source.folder} has {name} {source.config[name]}, not {value}: omit --{name}, or start a new run "
-                    "in another folder"
-                )
-        return dataclasses.replace(self, resume=self.out, out=None, from_run=None, **kept)
-
     def _check_flags(self) -> None:
         if self.resume is not None:
             for name, flag in _RUN_FLAGS.items():
@@ -297,6 +290,8 @@ class Train:
             )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
+        if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
+            raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:
             raise ValueError("--continue needs the run's folder: add --out FOLDER")
         if self.take_over and self.resume is None and not self.go_on:
@@ -319,7 +314,7 @@ class Train:
         say(f"interrupted by {name} after {done} of {total} iterations{f'; {hint}' if done < total else ''}")
         if self.plot and (folder / "metrics.csv").exists():
             with obeyed():
-                say(f"curve:      {tried(training.learning_curve, folder)}")
+                say_entries(curve=tried(training.learning_curve, folder))
 
     def _say_end(self, run: "training.Run", iteration: int, total: int, hint: str) -> None:
         """Say why the run has ended before its last iteration."""
@@ -379,7 +374,7 @@ class Train:
             hyperparameters = self._own_settings(algorithm, source)
         return dataclasses.replace(
             base,
-            **self._given("task", "threads", "iterations"),
+            **self._given("task", "threads", "iterations", "network"),
             options=options,
             params=params,
             algorithm=algorithm,
@@ -509,11 +504,12 @@ class Train:
             policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
         paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
-        for name, place in paths.items():
-            say(f"{name + ':':<12}{place}")
         if choice is None:
-            say(f"{'evaluate:':<12}lyceum-warp eval {run.folder}")
-        elif self.require_return is not None and not choice.score.mean > self.require_return:
+            paths["evaluate"] = f"lyceum-warp eval {run.folder}"
+        say_entries(**paths)
+        if choice is None:
+            return 0
+        if self.require_return is not None and not choice.score.mean > self.require_return:
             demand = f"--require-return demands more than {self.require_return:g}"
             note(f"the {choice.which} policy returns {choice.score.mean:.1f}; {demand}")
             return 1

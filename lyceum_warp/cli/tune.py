@@ -8,7 +8,7 @@ import torch
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Placement, TaskWord, given, parameters
-from lyceum_warp.cli.display import console, note, say, table
+from lyceum_warp.cli.display import console, note, say, say_entries, table
 from lyceum_warp.tuning import Difference, Tuning, tune
 
 
@@ -102,7 +102,8 @@ def _report(tuning: Tuning, options: Tune) -> None:
         say(f"best within {options.tolerance}: {tuning.best['name']}, {tuning.best['speedup']:.2f} times as fast")
         say(f"flags: {tuning.flags}")
         say(f"task:  {tuning.task_line}")
-    say(f"results: {tuning.path}")
+    command = "plan" if options.planning else "train"
+    say_entries(results=tuning.path, next=f"lyceum-warp {command} {options.task} {tuning.flags}".rstrip())
 
 
 def _columns(rows: list[dict[str, Any]], reference: dict[str, Any]) -> dict[str, list[str]]:

@@ -12,6 +12,7 @@ from lyceum_warp.training.comparison import (
     mean_curve as mean_curve,
     read_curve as read_curve,
     read_curves as read_curves,
+    row_seconds as row_seconds,
 )
 from lyceum_warp.training.curve import learning_curve as learning_curve
 from lyceum_warp.training.gating import PassGate as PassGate

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval, student_quantile
 from lyceum_warp.training.runs.folder import Run, runs_in
 from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_png
 
-_SETTINGS = ("algorithm", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
+_SETTINGS = ("algorithm", "network", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
 """Entries of config.json that tell one kind of run from another, besides the algorithm's own."""
 
 _POINTS = 200
@@ -68,14 +69,14 @@ class RunGroup:
         The interval of the mean is Student's t interval. That of the interquartile mean is a percentile bootstrap
         interval, as in Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
         """
-        finals = np.array([run.final for run in self.runs if not math.isnan(run.final)])
-        result: dict[str, Any] = {"runs": len(self.runs), "with_a_return": len(finals)}
-        if len(finals):
+        finals = [run.final for run in self.runs if not math.isnan(run.final)]
+        result: dict[str, Any] = {"runs": len(self.runs), "finals": finals}
+        if finals:
             mean, half = mean_interval(finals)
-            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(finals)), "finals": finals.tolist()}
-            if len(finals) > 1:
-                result["mean_interval"] = [mean - half, mean + half]
-                result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
+            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(np.array(finals)))}
+        if len(finals) > 1:
+            result["mean_interval"] = [mean - half, mean + half]
+            result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
         return result
 
 
@@ -106,8 +107,7 @@ def read_curve(run: Run) -> RunCurve:
     rows = run.rows() if run.metrics.exists() else []
     table = {name: np.array([row.get(name) for row in rows], dtype=float) for name in (rows[0] if rows else ())}
     nothing = np.full(len(rows), math.nan)
-    times = [column for name, column in table.items() if name.startswith("time_") and name != "time_mean"]
-    seconds = np.cumsum(np.nansum([nothing, *times], axis=0))
+    seconds = np.cumsum([row_seconds(row) for row in rows])
     evaluated = table.get("mean_return", nothing)
     returns = evaluated if np.isfinite(evaluated).any() else table.get("return_mean", nothing)
     known = np.isfinite(returns)
@@ -124,6 +124,11 @@ def read_curve(run: Run) -> RunCurve:
     )  # fmt: skip
 
 
+def row_seconds(row: Mapping[str, float | None]) -> float:
+    """Sum the seconds of sampling and updates in a row of metrics.csv, without those of evaluations."""
+    return sum(value or 0.0 for name, value in row.items() if name.startswith("time_") and name != "time_mean")
+
+
 def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Flatten nested settings to names such as "ppo.gamma"."""
     flat: dict[str, Any] = {}
@@ -134,10 +139,9 @@ def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, An
 
 def _read_events(folder: Path) -> RunCurve:
     """Read a run of rsl_rl or Stable-Baselines3 from its files for TensorBoard."""
-    try:
-        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-    except ImportError as error:
-        raise ImportError(f"reading {folder} needs tensorboard: pip install 'lyceum-warp[tensorboard]'") from error
+    check_extra(f"reading {folder}", "tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     events = EventAccumulator(str(folder), size_guidance={"scalars": 0})
     events.Reload()
 
@@ -162,22 +166,21 @@ def _read_events(folder: Path) -> RunCurve:
 def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
     """Group runs by task and settings. A group's label names the settings that differ from other groups'."""
     tasks = list(dict.fromkeys(curve.task for curve in curves if curve.task)) or [""]
+    kinds: dict[str, dict[str, list[RunCurve]]] = {task: {} for task in tasks}
+    for curve in curves:
+        if not curve.task and len(tasks) > 1:
+            raise ValueError(f"{curve.folder} names no task: compare it with runs of one task")
+        key = json.dumps(curve.settings, sort_keys=True, default=str)
+        kinds[curve.task or tasks[0]].setdefault(key, []).append(curve)
     groups: list[RunGroup] = []
-    for task in tasks:
-        # a run of another library names no task, so it goes with the only task
-        members = [curve for curve in curves if curve.task == task or (not curve.task and len(tasks) == 1)]
-        kinds: dict[str, list[RunCurve]] = {}
-        for curve in members:
-            kinds.setdefault(json.dumps(curve.settings, sort_keys=True, default=str), []).append(curve)
-        settings = [kind[0].settings for kind in kinds.values()]
+    for task, members in kinds.items():
+        settings = [runs[0].settings for runs in members.values()]
         varied = [name for name in differing(settings) if all(name in each for each in settings)]
-        for kind in kinds.values():
-            values = {name: kind[0].settings[name] for name in varied}
-            algorithm = kind[0].settings.get("algorithm", "") if "algorithm" in varied or not varied else ""
-            words = [f"{name.rpartition('.')[2]} {value}" for name, value in values.items() if name != "algorithm"]
-            groups.append(RunGroup(task, ", ".join(filter(None, [str(algorithm), *words])), kind))
-    if lost := [curve for curve in curves if not curve.task] if len(tasks) > 1 else []:
-        raise ValueError(f"{lost[0].folder} names no task: compare it with runs of one task")
+        for values, runs in zip(settings, members.values(), strict=True):
+            words = [f"{name.rpartition('.')[2]} {values[name]}" for name in varied if name != "algorithm"]
+            if "algorithm" in varied or not varied:
+                words.insert(0, str(values.get("algorithm", "")))
+            groups.append(RunGroup(task, ", ".join(words), runs))
     return groups
 
 

@@ -10,10 +10,9 @@ from lyceum_warp.algos import METRIC_COLUMN, STEP_METRIC_COLUMN, Iteration
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_png
 
-RETURNS, TERMS, METRICS, ENDS, FAULTS, LEARNING = (
-    "returns", "reward terms", "metrics", "ends of episodes", "faults", "learning",
-)  # fmt: skip
+GROUPS = ("returns", "reward terms", "metrics", "ends of episodes", "faults", "learning")
 """Groups of panels."""
+RETURNS, TERMS, METRICS, ENDS, FAULTS, LEARNING = GROUPS
 
 _SAMPLED, _MEAN = "stochastic policy", "mean policy"
 
@@ -67,9 +66,10 @@ def curve_panels(run: Run) -> list[Panel]:
         panels += panel(RETURNS, title, unit, stochastic_policy=sampled, mean_policy=mean)
     if not any(each.title == "return" for each in panels):  # no episode has ended yet
         panels[:0] = panel(RETURNS, "reward", "of a step", stochastic_policy="reward_mean")
-    names = [column.removeprefix(METRIC_COLUMN) for column in rows[0] if column.startswith(METRIC_COLUMN)]
-    for name in names:
-        column = METRIC_COLUMN + name
+    for column in rows[0]:
+        name = column.removeprefix(METRIC_COLUMN)
+        if name == column:
+            continue
         if name in weights:
             panels += panel(TERMS, name, f"weight {weights[name]:g}, sum of an episode", term=column)
         elif name in ends:
@@ -82,8 +82,7 @@ def curve_panels(run: Run) -> list[Panel]:
     for column in rows[0]:
         if column not in known and "/" not in column and not column.startswith("time_"):
             panels += panel(LEARNING, column.replace("_", " "), "", value=column)
-    order = (RETURNS, TERMS, METRICS, ENDS, FAULTS, LEARNING)
-    return sorted(panels, key=lambda each: order.index(each.group))
+    return sorted(panels, key=lambda each: GROUPS.index(each.group))
 
 
 def learning_curve(run: str | Path | Run) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.algos import EXACT, Learner, task_physics
+from lyceum_warp.binding import class_sources
 from lyceum_warp.engines import engine_name
 from lyceum_warp.support.interrupts import Interrupted, postponed
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
@@ -17,7 +18,7 @@ from lyceum_warp.support.versions import versions
 from lyceum_warp.training.callbacks import Callback
 from lyceum_warp.training.runs.checkpoints import policy_content, write_content
 from lyceum_warp.training.runs.configuration import describe
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training.runs.folder import NETWORK, Run
 from lyceum_warp.training.runs.lock import run_lock
 from lyceum_warp.training.runs.replay_files import read_replay
 from lyceum_warp.training.runs.saving import Saver
@@ -149,6 +150,8 @@ def _create(
     if not learner.team.leads:
         return Run(folder, config)
     manifest, files = task_copy(learner.env)
+    network = class_sources(type(getattr(learner.policy, "network", None)))
+    files |= {f"{NETWORK}/{name}": content for name, content in network.items()}
     run = Run.create(folder, config | {"kept": manifest}, files=files)
     undo.callback(shutil.rmtree, folder, ignore_errors=True)
     run.check = stack.enter_context(run_lock(folder))
@@ -247,7 +250,7 @@ def _check_equal(run: Run, learner: Learner, done: int) -> None:
 
 def _fixed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a configuration that a run keeps, by their names in config.json."""
-    settings = {name: config.get(name) for name in ("task", "algorithm", "nworld")}
+    settings = {name: config.get(name) for name in ("task", "algorithm", "nworld", "seed", "network")}
     settings["engine"] = engine_name(config.get("engine", ""), config.get("device"))
     for name in ("horizon", "fields", "dynamics"):
         settings[name] = config.get("options", {}).get(name)

@@ -23,12 +23,13 @@ from lyceum_warp.training.runs.task_copy import run_env
 from lyceum_warp.viz import one_line, write_page
 
 _SETTINGS = (
-    "task", "algorithm", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from", "target_return",
-    "options", "params", "physics", "planner", "planner_params", "episodes", "steps", "replan_every", "real_time",
+    "task", "algorithm", "network", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from",
+    "target_return", "options", "params", "physics", "planner", "planner_params", "episodes", "steps", "replan_every",
+    "real_time",
 )  # fmt: skip
 """Entries of config.json on the page. All others, such as those of callbacks, are left out."""
 
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 320, 150, 46, 18
+_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 320, 150, 50, 18
 _MOST_POINTS = 300
 
 
@@ -122,7 +123,8 @@ def _section(title: str, content: str) -> list[str]:
 
 def _table(entries: Mapping[str, Any]) -> str:
     cells = ((name, _short(value)) for name, value in entries.items() if value not in (None, "", {}))
-    rows = (f"<tr><th>{html.escape(name)}</th><td>{html.escape(text)}</td></tr>" for name, text in cells)
+    names = ((re.sub(r"([._])", r"\1<wbr>", html.escape(name)), text) for name, text in cells)  # where a name may break
+    rows = (f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in names)
     return f"<table>{''.join(rows)}</table>"
 
 
@@ -140,8 +142,9 @@ def _figure(panel: Panel) -> str:
     points = [point for curve in panel.curves.values() for point in curve]
     (x_low, x_high), (y_low, y_high) = ((min(each), max(each)) for each in zip(*points, strict=True))
     ticks = _ticks(y_low, y_high)
-    y_low, y_high = min(y_low, ticks[0]), max(y_high, ticks[-1])
-    x_scale, y_scale = (_WIDTH - _LEFT - 6) / (x_high - x_low or 1.0), (_HEIGHT - _BOTTOM - 8) / (y_high - y_low or 1.0)
+    if y_low == y_high:  # put the line into the middle
+        y_low, y_high = y_low - 1.0, y_high + 1.0
+    x_scale, y_scale = (_WIDTH - _LEFT - 6) / (x_high - x_low or 1.0), (_HEIGHT - _BOTTOM - 8) / (y_high - y_low)
 
     def place(x: float, y: float) -> str:
         return f"{_LEFT + (x - x_low) * x_scale:.1f} {_HEIGHT - _BOTTOM - (y - y_low) * y_scale:.1f}"
@@ -168,18 +171,17 @@ def _figure(panel: Panel) -> str:
 
 
 def _ticks(low: float, high: float) -> Sequence[float]:
-    """Choose two to five round numbers in a range, or around a single value."""
-    if high - low <= 1e-9 * max(abs(low), abs(high)):
+    """Choose three to six round numbers in a range, or its only value."""
+    if low == high:
         return [low]
-    rough = (high - low) / 3
-    power = 10.0 ** math.floor(math.log10(rough))
-    step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= rough * 0.999)
-    first = math.floor(low / step) if low / step - math.floor(low / step) < 0.3 else math.ceil(low / step)
-    return [step * k for k in range(first, math.floor(high / step + 1e-9) + 1)] or [low]
+    power = 10.0 ** math.floor(math.log10(high - low))
+    steps = (power * factor for factor in (5, 2, 1, 0.5, 0.2))
+    grids = ([step * k for k in range(math.ceil(low / step), math.floor(high / step) + 1)] for step in steps)
+    return next(grid for grid in grids if len(grid) >= 3)
 
 
 def _number(value: float) -> str:
-    for limit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= limit:
-            return f"{value / (1e3 if letter == 'k' else limit):.3g}{letter}"
-    return f"{value:.3g}" if abs(value) > 1e-12 else "0"
+    for unit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= unit:
+            return f"{value / unit:.4g}{letter}"
+    return f"{value:.4g}"

@@ -13,7 +13,6 @@ from typing import Any
 
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.interrupts import postponed
-from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number
 
 _POLL = 0.2  # seconds
@@ -112,7 +111,7 @@ def flag_words(settings: Mapping[str, Any]) -> list[str]:
                 text = ",".join(map(str, part)) if isinstance(part, Sequence) and not isinstance(part, str) else part
                 words += [flag, f"{key}={text}"]
         elif isinstance(value, tuple | list) and any(isinstance(part, str) for part in value):
-            words += [word for part in value for word in (flag, part)]
+            words += [word for part in value for word in (flag, str(part))]
         else:
             words += [flag, *map(str, value if isinstance(value, tuple | list) else [value])]
     return words
@@ -128,8 +127,8 @@ def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int] | None, st
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         gpus = visible.split(",") if visible else list(map(str, range(torch.cuda.device_count())))
     for slot in range(jobs):
-        share = set(cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs]) if jobs <= cpu_cores() else None
-        yield share or None, gpus[slot % len(gpus)] if gpus else None
+        share = set(cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs])
+        yield share if jobs <= len(cores) else None, gpus[slot % len(gpus)] if gpus else None
 
 
 def _start(run: SeedRun, words: Sequence[str], cores: set[int] | None, gpu: str | None) -> subprocess.Popen[bytes]:

@@ -1,6 +1,5 @@
 """Write a run's curves for TensorBoard, with the extra ``tensorboard``."""
 
-import importlib.util
 import math
 import os
 import time
@@ -10,8 +9,9 @@ from typing import Any
 
 from lyceum_warp.algos import Iteration, Learner
 from lyceum_warp.env import Env
+from lyceum_warp.support.extras import check_extra
 from lyceum_warp.training.callbacks import Callback
-from lyceum_warp.training.comparison import flat_settings
+from lyceum_warp.training.comparison import flat_settings, row_seconds
 from lyceum_warp.training.runs.folder import Run
 
 _GROUPS = {
@@ -73,10 +73,7 @@ class TensorBoard(Callback):
     settings: Mapping[str, Any] = {"tensorboard": True}
 
     def __init__(self, folder: str | Path = ".", env: Env | None = None) -> None:
-        if importlib.util.find_spec("tensorboard") is None:
-            raise ImportError(
-                "curves for TensorBoard need the package tensorboard: pip install 'lyceum-warp[tensorboard]'"
-            )
+        check_extra("TensorBoard", "tensorboard")
         self._folder = Path(folder)
         self._terms: dict[str, tuple[str, float]] = {} if env is None else _terms(env)
         self._file: Any = None
@@ -165,8 +162,7 @@ def _terms(env: Env) -> dict[str, tuple[str, float]]:
 
 def _total_fps(iteration: Iteration) -> dict[str, float]:
     """Compute the samples per second, excluding the time of evaluations."""
-    times = {name: time for name, time in iteration.row().items() if name.startswith("time_") and name != "time_mean"}
-    seconds = sum(filter(None, times.values()))
+    seconds = row_seconds(iteration.row())
     return {"total_fps": iteration.samples / iteration.iteration / seconds} if seconds else {}
 
 

@@ -1,11 +1,11 @@
 """Log a run to Weights & Biases, with the extra ``wandb``."""
 
-import importlib.util
 import math
 import uuid
 from typing import Any
 
 from lyceum_warp.algos import Iteration, Learner
+from lyceum_warp.support.extras import check_extra
 from lyceum_warp.training.callbacks import Callback
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.training.tensorboard import tag
@@ -25,8 +25,7 @@ class WandB(Callback):
     """
 
     def __init__(self, project: str = "lyceum_warp", **options: Any) -> None:
-        if importlib.util.find_spec("wandb") is None:
-            raise ImportError("Weights & Biases needs the package wandb: pip install 'lyceum-warp[wandb]'")
+        check_extra("Weights & Biases", "wandb")
         self._options = {"project": project, **options}
         self._run: Any = None
         self.settings: dict[str, Any] = {"wandb": project}

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.viz.extra import EXTRA
+from lyceum_warp.support.extras import check_extra
 
 LINE, ACCENT, GRID = "#7a8ba3", "#c8502d", "#e4e7eb"
 
@@ -18,11 +18,10 @@ STYLES = (
 
 def new_figure(purpose: str, width: float, height: float) -> Any:
     """Make a figure without pyplot. The figure needs no display, and shares no state with the user's figures."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ImportError(f"plotting {purpose} needs matplotlib: {EXTRA}") from error
+    check_extra(f"plotting {purpose}", "viz", "matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -9,15 +9,16 @@ from lyceum_warp.testing import CHECKS
 
 def test_check_command_lists_all_rules_with_their_durations(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "point_mass", "--nworld", "2", "--steps", "5", "--param", "success_distance=0.1"]) == 0
-    head, *lines = capsys.readouterr().out.splitlines()
+    head, *lines, what_next = capsys.readouterr().out.splitlines()
     assert head == "point_mass on the mujoco engine (cpu, 2 worlds) keeps the rules:"
+    assert what_next == "next:       lyceum-warp check point_mass --engine warp, then lyceum-warp train point_mass"
     assert [line.split()[0] for line in lines] == [check.__name__.removeprefix("check_") for check in CHECKS]
     assert all(float(line.split()[1]) >= 0 and line.endswith(" s") for line in lines)
 
 
 def test_check_command_runs_only_the_named_rules(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "point_mass", "--rule", "graphs", "--rule", "reset"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == ["graphs", "reset"]
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:-1]] == ["graphs", "reset"]
     assert cli.main(["check", "point_mass", "--rule", "graph"]) == 2
     refused(capsys, "no rule 'graph'", "did you mean graphs")
 

@@ -110,7 +110,9 @@ def test_model_of_a_package_or_of_menagerie_is_loaded_from_its_source(
     monkeypatch.setenv("MENAGERIE_ROOT", "checkout")
     assert cli.main(["new", "leg_walk", "--model", "menagerie:leg/scene.xml"]) == 0
     assert cli.main(["new", "hop", "--model", "gymnasium:hopper.xml"]) == 0
-    assert "leg_walk.py: 4 observations, 1 actions, 20 ms in a step" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "leg_walk.py: 4 observations, 1 actions, 20 ms in a step" in shown
+    assert shown.splitlines()[-1].startswith("then:       lyceum-warp train ")
     assert find_task("leg_walk.py").model == lw.menagerie_model("leg/scene.xml")
     assert find_task("hop.py").model == lw.gymnasium_model("hopper.xml")
 

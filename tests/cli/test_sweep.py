@@ -33,6 +33,8 @@ def test_sweep_continues_and_names_its_best_run(
     shown = capsys.readouterr().out
     assert len(set(gammas)) == 3 and f"best:       trial {gammas.index(max(gammas))}, " in shown
     assert "--seeds 5" in shown
+    Path("other.toml").write_text(SWEEP.format(trials=1, objective="return").replace('"sweep"', '"other"'))
+    assert cli.main(["sweep", "other.toml"]) == 0
 
 
 def test_sweep_with_a_wrong_key_or_range_prints_an_error(
@@ -42,7 +44,10 @@ def test_sweep_with_a_wrong_key_or_range_prints_an_error(
     monkeypatch.chdir(tmp_path)
     text = SWEEP.format(trials=1, objective="return")
     for wrong, words in [
-        (text.replace("trials", "trails"), "trails = 1 is not one of task, trials"),
+        (text.replace("trials", "trails"), "sweep.toml: got an unexpected keyword argument 'trails'"),
+        (text.replace("trials = 1", "trials = 'a'"), "trials must be of type int"),
+        (text + "[x]", "sweep.toml: "),
+        (text.replace('objective = "return"', 'sampler = "Guess"'), "sweep.toml: module 'optuna.samplers' has no"),
         (text.replace("low", "lo"), "the range gamma = "),
     ]:
         Path("sweep.toml").write_text(wrong)

@@ -329,7 +329,7 @@ def test_continue_starts_a_run_then_continues_it_then_reports_it(
     assert metrics(out) == metrics(tmp_path / "whole")
     assert f"the run in {out} is complete" in capsys.readouterr().out
     assert train(out, "--iterations", "9", "--continue", "--seed", "5") == 2
-    refused(capsys, "has seed 0, not 5", "omit --seed")
+    refused(capsys, "has seed 0, not 5", "omit seed")
 
 
 def test_continue_replaces_what_a_kill_before_the_first_save_left(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ def test_tune_prints_a_table_and_flags_for_other_commands(
     out, err = capsys.readouterr()
     assert "half_cheetah: 8 worlds, mujoco engine on" in out and "the task as it is" in out
     assert "1 x 50 ms" in out and "1 x 50 ms: " in err
+    assert "\nnext:       lyceum-warp train half_cheetah" in out
     flags = next(line for line in out.splitlines() if line.startswith("flags: ")).removeprefix("flags: ").split()
     assert cli.main(["check", "half_cheetah", "--rule", "reset", *flags]) == 0
 

@@ -6,6 +6,7 @@ A case is "KIND SEED" or the name of a case in ``minimal_cases.py``.
 import contextlib
 import dataclasses
 import functools
+import importlib.util
 import io
 import json
 import re
@@ -28,8 +29,11 @@ from motion_files import go1, go1_clip, write_csv, write_npz, write_pickle
 import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
+from lyceum_warp.cli.parsing import parse
+from lyceum_warp.cli.sweep import read_search, trial_settings
+from lyceum_warp.cli.train import Train
 from lyceum_warp.controllers import episode_env, load_episodes
-from lyceum_warp.training import Run
+from lyceum_warp.training import Run, flag_words
 from lyceum_warp.viz.video import NoVideoError
 
 REFUSALS = (ValueError, OSError, ImportError, NoVideoError, FloatingPointError)
@@ -48,6 +52,19 @@ SLIDE = text(
     '<sensor><framepos objtype="site" objname="tip"/></sensor><keyframe><key name="home" qpos=".1 .2"/></keyframe>',
 )
 SIZES = "--samples 16 --nworld 2 --hidden 4 --value-hidden 4 --mean-every 2 --mean-episodes 2 --no-video --no-plot"
+
+
+SWEEP = """
+task = "point_mass"
+trials = 3
+out = "case/sweep"
+settings = { iterations = 2, hidden = [4] }
+[ranges]
+gamma = { low = 0.9, high = 0.99 }
+samples = { low = 16, high = 64, log = true }
+value_hidden = { choices = [[4], [8, 8]] }
+"param.success_distance" = { low = 0.1, high = 0.2 }
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +105,8 @@ KINDS = {
     "clip.csv": Kind("clips/clip.csv", mutations.mutated_csv, ("clips",)),
     "clip.pkl": Kind("clips/clip.pkl", functools.partial(mutations.mutated_pickle, canary=CANARY), ("clips",)),
 }  # fmt: skip
+if importlib.util.find_spec("optuna") is not None:
+    KINDS["sweep.toml"] = Kind("sweep.toml", mutations.mutated_toml, ("sweep",), ("the range", "lyceum-warp train"))
 
 
 def _both(run: Path, which: str = "last") -> None:
@@ -104,6 +123,14 @@ def _episodes(path: Path) -> None:
     env = episode_env(episodes)
     for episode in episodes.values():
         env.set_state(episode.states[:1])
+
+
+def _sweep(file: Path) -> None:
+    """Read a sweep's file and the options of its first trial, without training."""
+    import optuna
+
+    search, trial = read_search(file), optuna.create_study().ask()
+    parse(Train, "lyceum-warp train", [search.task, *flag_words(trial_settings(search, trial))])
 
 
 READERS: dict[str, Callable[[], object]] = {
@@ -128,6 +155,7 @@ READERS: dict[str, Callable[[], object]] = {
     "make file": lambda: lw.make(CASE / "slide.py").step(),
     "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "reset"),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
+    "sweep": lambda: _sweep(CASE / "sweep.toml"),
     "clips": lambda: lw.load_clips(CASE / "clips", go1()),
 }  # fmt: skip
 WITHOUT = {"resume alone": "run/previous.pt", "resume previous": "run/checkpoint.pt"}
@@ -227,6 +255,7 @@ def _make(folder: Path) -> None:
     (folder / "slide.py").write_text(TASK)
     (folder / "slide.xml").write_text(SLIDE)
     (folder / "model.xml").write_text(SLIDE)
+    (folder / "sweep.toml").write_text(SWEEP)
     (folder / "clips").mkdir()
     qpos = go1_clip()[:20]
     write_npz(folder / "clips/clip.npz", go1(), qpos, 50.0)

@@ -5,6 +5,7 @@ import io
 import json
 import math
 import pickle
+import tomllib
 import warnings
 import xml.etree.ElementTree as ET
 import zipfile
@@ -74,6 +75,24 @@ def mutated_json(data: bytes, random: Random) -> bytes:
     if random.random() < 0.05:
         return random.choice((b"[" * 100_000, b'{"a":' * 50_000, b"[]", b"null", b"9" * 5000, b"\xef\xbb\xbf" + data))
     return json.dumps(mutated_value(json.loads(data), random), indent=2).encode("utf-8", "surrogatepass")
+
+
+def mutated_toml(data: bytes, random: Random) -> bytes:
+    if random.random() < 0.3:
+        return mutated_bytes(data, random)
+    tree = mutated_value(tomllib.loads(data.decode()), random)
+    lines = (
+        [f"{json.dumps(name)} = {_toml(entry)}" for name, entry in tree.items()]
+        if isinstance(tree, dict)
+        else [_toml(tree)]
+    )
+    return "\n".join(lines).encode("utf-8", "surrogatepass")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(name)} = {_toml(entry)}' for name, entry in value.items())}}}"
+    return f"[{', '.join(map(_toml, value))}]" if isinstance(value, list) else json.dumps(value)
 
 
 def mutated_csv(data: bytes, random: Random) -> bytes:

@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from training_runs import TINY, train
+from training_runs import TINY, metrics, refused, train
 
+import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.training import Run, curve, group_runs, mean_curve, read_curves
 from lyceum_warp.training.report import write_report
@@ -30,7 +31,7 @@ def test_runs_are_grouped_by_the_settings_that_differ(runs: Path, capsys: pytest
     assert half[-1] == pytest.approx(12.706 * np.std(finals, ddof=1) / math.sqrt(2), rel=1e-3)  # Student's t
     assert cli.main(["plot", str(runs), "--out", str(runs / "all.png")]) == 0
     shown = capsys.readouterr().out
-    assert re.search(r"npg\.gamma +0\.995 +0\.9", shown) and (runs / "all.png").stat().st_size > 1000
+    assert re.search(r"gamma +0\.995 +0\.9", shown) and (runs / "all.png").stat().st_size > 1000
 
 
 def test_a_run_of_rsl_rl_is_read_from_its_tensorboard_files(tmp_path: Path) -> None:
@@ -61,7 +62,7 @@ def test_curve_has_a_panel_for_each_term_and_none_without_data(runs: Path) -> No
 
 def test_report_is_one_page_without_paths(runs: Path) -> None:
     text = write_report(runs / "a").read_text()
-    assert "srcdoc=" in text and "point_mass, npg, seed 0" in text and "npg.gamma" in text
+    assert "srcdoc=" in text and "point_mass, npg, seed 0" in text and "npg.<wbr>gamma" in text
     assert str(runs) not in text and not re.findall(r'(?:src|href)="', text)
 
 
@@ -116,9 +117,42 @@ def test_commands_take_classes_from_a_file(tmp_path: Path, capsys: pytest.Captur
     assert run.config["idle"] == {"noise": 0.5} and [row["mean_return"] for row in run.rows()] == [0.5] * 3
     assert cli.main([*words, *TINY[:2], "--out", str(tmp_path / "x")]) == 2
     assert cli.main([*words[:3], f"{file}:Mean", "--out", str(tmp_path / "x")]) == 2
-    assert "mine.py:Mean is not a class that extends lw.Learner" in capsys.readouterr().err
+    assert "mine.py:Mean is not a subclass of Learner" in capsys.readouterr().err
     plan = ["plan", "point_mass", "--steps", "2", "--samples", "4", "--no-video", "--out", str(tmp_path / "plan")]
     assert cli.main([*plan, "--update", f"{file}:Mean"]) == 0
+
+
+NETWORK = """
+from sizes import UNITS
+from torch import nn
+
+class Mine(nn.Sequential):
+    def __init__(self, nobs, nact):
+        super().__init__(nn.Linear(nobs, UNITS), nn.ELU(), nn.Linear(UNITS, nact))
+"""
+
+
+def test_a_network_from_a_file_is_copied_into_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file, out, words = tmp_path / "mine.py", tmp_path / "run", [*TINY[:4], *TINY[6:]]
+    file.write_text(NETWORK)
+    (tmp_path / "sizes.py").write_text("UNITS = 4")
+    command = ["train", "point_mass", "--network", f"{file}:Mine", *words, "--no-plot"]
+    assert cli.main([*command, "--out", str(tmp_path / "whole"), "--iterations", "3"]) == 0
+    assert cli.main([*command, "--out", str(out), "--iterations", "1"]) == 0
+    assert cli.main([*command, "--out", str(out), "--continue", "--iterations", "2"]) == 0
+    for path in (file, tmp_path / "sizes.py"):
+        path.unlink()
+    assert cli.main(["train", "--resume", str(out), "--iterations", "3"]) == 0
+    assert metrics(out) == metrics(tmp_path / "whole") and Run.open(out).config["network"] == "mine.py:Mine"
+    assert cli.main(["eval", str(out), "--episodes", "2"]) == 0
+    assert cli.main(["train", "--from", str(out), *words, "--no-plot", "--iterations", "1", "--out", f"{out}-2"]) == 0
+    assert lw.load(f"{out}-2").network[0].out_features == 4
+    (out / "task" / "network" / "mine.py").write_text("this code must not run")
+    with pytest.raises(ValueError, match="custom class .*Mine"):
+        lw.load(out)
+    capsys.readouterr()
+    assert cli.main([*command, "--hidden", "8", "--out", str(tmp_path / "x")]) == 2
+    refused(capsys, "--network replaces --from, --hidden")
 
 
 def test_wandb_gets_settings_and_curves_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

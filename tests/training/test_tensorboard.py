@@ -1,4 +1,5 @@
 import dataclasses
+import importlib.util
 import math
 import resource
 import signal
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import lyceum_warp as lw
-from lyceum_warp.training import TensorBoard, tensorboard as module
+from lyceum_warp.training import TensorBoard
 from lyceum_warp.training.tensorboard import tag
 
 
@@ -99,7 +100,7 @@ def test_full_disk_raises_an_error(first: lw.Iteration, tmp_path: Path) -> None:
 
 
 def test_error_of_a_missing_package_names_the_install_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"need the package tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"TensorBoard needs tensorboard: pip install 'lyceum-warp\[tensorboard\]'$"):
         TensorBoard(tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -201,6 +201,6 @@ with Renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), sys.argv[1], camera={
 
 
 def test_error_names_the_extra_if_matplotlib_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"needs matplotlib: pip install 'lyceum-warp\[viz\]'"):
         new_figure("curves", 1.0, 1.0)

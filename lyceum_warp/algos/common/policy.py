@@ -98,19 +98,20 @@ class GaussianPolicy(Normalized):
         self.shape["mirror"] = self.mirror.reflections
 
     @staticmethod
-    def like(shape: Mapping[str, Any]) -> "GaussianPolicy":
-        """Make a new policy with the given ``shape``.
+    def like(shape: Mapping[str, Any], network: nn.Module | None = None) -> "GaussianPolicy":
+        """Make a new policy with the given ``shape``, and with a network of a custom class.
 
         Raises:
             ValueError: The policy or its network has a custom class.
         """
-        if "own" in shape:
+        if "own" in shape and network is None:
             normalize = ", normalize=True" if shape["normalize"] else ""
             raise ValueError(
                 f"the policy has the custom class {shape['own']}: pass a policy of this class, as in lw.load(run, "
                 f"policy=lw.GaussianPolicy({shape['nobs']}, {shape['nact']}, network=...{normalize}))"
             )
-        policy = GaussianPolicy(**{name: value for name, value in shape.items() if name != "mirror"})
+        sizes = {name: value for name, value in shape.items() if name not in ("mirror", "own")}
+        policy = GaussianPolicy(**sizes, network=network)
         if "mirror" in shape:
             policy.use_mirror(shape["mirror"])
         return policy

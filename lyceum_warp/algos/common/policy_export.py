@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import importlib.util
 import json
 import logging
 import warnings
@@ -16,11 +15,10 @@ import torch
 from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
 from lyceum_warp.env.env import Env
+from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.tensors import repeatable
 from lyceum_warp.support.validate import described, first_sentence
-
-EXTRA = "pip install 'lyceum-warp[export]'"
 
 _SUFFIXES = (".onnx", ".pt2")
 
@@ -147,9 +145,8 @@ def check_export(path: Path) -> None:
     """Check a file's suffix, and whether the packages for its format are installed."""
     if path.suffix not in _SUFFIXES:
         raise ValueError(f"{path} must end with {' or '.join(_SUFFIXES)}")
-    missing = [name for name in ("onnx", "onnxscript") if importlib.util.find_spec(name) is None]
-    if path.suffix == ".onnx" and missing:
-        raise ImportError(f"export to ONNX needs {' and '.join(missing)}: {EXTRA}")
+    if path.suffix == ".onnx":
+        check_extra("export to ONNX", "export", "onnx", "onnxscript")
 
 
 @contextlib.contextmanager

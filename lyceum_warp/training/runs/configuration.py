@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from lyceum_warp import algos
-from lyceum_warp.algos import LIMIT, Distill, Learner, Team
-from lyceum_warp.binding import class_in_file, spelled_task
+from lyceum_warp.algos import LIMIT, Distill, GaussianPolicy, Learner, Team
+from lyceum_warp.binding import class_in_file, class_sources, made_in_file, spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
@@ -19,7 +20,7 @@ from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
-from lyceum_warp.training.runs.folder import Run
+from lyceum_warp.training.runs.folder import Run, policy_of
 from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copies
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
@@ -60,6 +61,8 @@ def describe(learner: Learner) -> dict[str, Any]:
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     task = env.task.definition
     weights = {name: float(env.given_params.get(name, weight)) for name, weight in task.rewards.items()}
+    own = type(getattr(learner.policy, "network", None))
+    network = {} if not (files := [*class_sources(own)]) else {"network": f"{files[0]}:{own.__name__}"}
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.definition),
@@ -73,6 +76,7 @@ def describe(learner: Learner) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "seed": options.seed,
         **seed,
+        **network,
         learner.algorithm: learner.settings(),
     }
 
@@ -87,6 +91,8 @@ class Configuration:
     params: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     options: EnvOptions
     """Options of the environment. ``nworld`` counts the worlds of all processes."""
+    network: str | None = None
+    """The class of a new policy's network, as path/to/file.py:Class."""
     algorithm: str
     hyperparameters: Any
     """The algorithm's hyperparameters. None for an algorithm that is not in ``ALGORITHMS``."""
@@ -150,6 +156,8 @@ class Configuration:
                 # only rank 0 checks trust, because other machines may have no record of the run
                 env = run_env(run, options, self.params, task=task, trust=not team.leads)
             seed = self.options.seed if self.seed is None else self.seed
+            if self.network is not None:
+                networks = self._new_policy(self.network, env, seed), None
             if teacher is not None:
                 return Distill(env, networks[0], self.hyperparameters, teacher=teacher, seed=seed, team=team)
             kind, _ = learner_classes(self.algorithm)
@@ -168,6 +176,15 @@ class Configuration:
                 run.note_settings(error)
             raise
 
+    def _new_policy(self, network: str, env: Env, seed: int) -> GaussianPolicy:
+        """Make a policy with a network of the user's class."""
+        sizes = env.obs_space.size, env.action_space.size
+        config = self.hyperparameters
+        options = {name: getattr(config, name) for name in ("log_std", "normalize") if hasattr(config, name)}
+        with torch.random.fork_rng(devices=()):
+            torch.manual_seed(seed)
+            return GaussianPolicy(*sizes, network=made_in_file(network, nn.Module, *sizes), **options)
+
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
     """Load a learner's initial policy and value function from a run.
@@ -176,12 +193,12 @@ def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, 
 
     If ``which`` is None, the run is resumed. The learner then usually makes its networks from the hyperparameters, and
     this function returns None for the policy and for the value function. It returns the networks if the policy has
-    another ``limit`` than ``LIMIT``, or if the run started from another run.
+    another ``limit`` than ``LIMIT`` or a network of the user's, or if the run started from another run.
     """
     path = run.policy_file("last" if which is None else which)
     content = read_checkpoint(path, parts=("iteration", "policy"))
     limit = (content["policy"].get("shape") or {}).get("limit", LIMIT)
-    if which is None and "from" not in run.config and limit == LIMIT:
+    if which is None and not {"from", "network"} & run.config.keys() and limit == LIMIT:
         return None, None, content["iteration"]
     value = network_of(content, path, "value") if "value" in content else None
-    return network_of(content, path, "policy"), value, content["iteration"]
+    return policy_of(content, path), value, content["iteration"]

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
-from lyceum_warp.binding import file_name
+from lyceum_warp.algos import GaussianPolicy
+from lyceum_warp.binding import file_name, made_in_file
 from lyceum_warp.env import Curriculum
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
@@ -19,9 +21,12 @@ from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.support.versions import versions
 from lyceum_warp.training.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
-from lyceum_warp.training.runs.trust import remember
+from lyceum_warp.training.runs.trust import is_trusted, remember
 
-_CONFIG, _TASK = "config.json", "task"
+_CONFIG, _TASK, _POLICIES = "config.json", "task", "policies"
+
+NETWORK = "network"
+"""The folder for the file of the user's network, in the folder ``task``."""
 
 PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
 """The folder of the package's pretrained runs."""
@@ -38,7 +43,7 @@ _ENTRIES: dict[str, Any] = {
     "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
     "reached": {"iteration": _COUNT, "return": float | int}, "exact_from": int | None, "gate_every": _COUNT,
     "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list, "wandb": str | None,
-    "terms": {"rewards": dict, "ends": list},
+    "terms": {"rewards": dict, "ends": list}, "network": str,
     "kept": {
         "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
         "modules": dict, "program": bool,
@@ -170,7 +175,7 @@ class Run:
         except BaseException:  # for example, the disk is full, or a signal ends the program
             shutil.rmtree(folder, ignore_errors=True)
             raise
-        if "file" in run.manifest:
+        if "file" in run.manifest or "network" in config:
             remember(folder, run.config)
         return run
 
@@ -270,7 +275,7 @@ class Run:
 
     def numbered(self, iteration: int) -> Path:
         """Get the path of an iteration's policy."""
-        return self.folder / "policies" / f"{iteration:06d}.pt"
+        return self.folder / _POLICIES / f"{iteration:06d}.pt"
 
     def policy_file(self, which: str | int = "last") -> Path:
         """Get the path of a saved policy.
@@ -396,7 +401,7 @@ def load(
         run: A run's folder, a policy file in this folder, or a checkpoint of rsl_rl 5.
         which: "last", "best" (see ``train``), or the number of a saved iteration.
         policy: A policy into which the weights are loaded. Custom classes of policies or networks, and checkpoints of
-            rsl_rl, need it.
+            rsl_rl, need it. Networks of ``train --network`` do not, on the machine that has trained them.
         device: Device for the parameters.
 
     Raises:
@@ -405,7 +410,22 @@ def load(
             also raised if ``policy`` is missing or does not fit the file.
     """
     content, path = _content(run, which, device)
-    return network_of(content, path, "policy", policy).to(device).eval().requires_grad_(False)
+    return policy_of(content, path, policy).to(device).eval().requires_grad_(False)
+
+
+def policy_of(content: Mapping[str, Any], path: Path, policy: Any = None) -> Any:
+    """Make a policy from a file's content, or load the file's weights into ``policy``.
+
+    The class of a network from ``train --network`` is loaded from the run's copy, if this user has run it before.
+    """
+    folder = path.parents[path.parent.name == _POLICIES]
+    shape = content["policy"]["shape"] or {}
+    if policy is None and "own" in shape and (folder / _CONFIG).is_file():
+        run = Run.open(folder)
+        if "network" in run.config and is_trusted(folder, run.config):
+            spelled = str(run.task_folder / NETWORK / run.config["network"])
+            policy = GaussianPolicy.like(shape, made_in_file(spelled, nn.Module, shape["nobs"], shape["nact"]))
+    return network_of(content, path, "policy", policy)
 
 
 def load_value(run: str | Path | Run, *, which: str | int = "last", device: str | torch.device = "cpu") -> Any:

@@ -30,12 +30,14 @@ def is_trusted(folder: Path, config: Mapping[str, Any]) -> bool:
 def _record(folder: Path, config: Mapping[str, Any]) -> Path:
     """Get the file that records a run. Its name is a hash of the code that the run can execute.
 
-    This code is the task's file in config.json, and all files of the run's copy, which may import each other.
+    This code is the task's file in config.json, the network's class, and all files of the run's copy, which may import
+    each other.
     """
     task, files = folder / "task", []
     for path in sorted(task.rglob("*")):
         content = path.read_bytes() if path.is_file() else b""
         files.append([str(path.relative_to(task)), path.is_symlink(), hashlib.sha256(content).hexdigest()])
     code = [config.get("task"), config.get("kept", {}).get("file"), files]
+    code += [config["network"]] if "network" in config else []
     state = os.environ.get("XDG_STATE_HOME") or os.path.expanduser("~/.local/state")
     return Path(state, "lyceum_warp", "trusted", hashlib.sha256(json.dumps(code).encode()).hexdigest())

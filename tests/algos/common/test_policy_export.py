@@ -1,3 +1,4 @@
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 
@@ -7,7 +8,6 @@ import torch
 from torch import nn
 
 import lyceum_warp as lw
-from lyceum_warp.algos.common import policy_export
 
 Run = Callable[[Path, np.ndarray], np.ndarray]
 
@@ -103,7 +103,7 @@ def test_invalid_export_arguments_and_a_missing_package_raise_one_line_errors(
         lw.export_policy(policy, tmp_path / "policy.jit")
     with pytest.raises(ValueError, match="policy must be a module with act and nobs, as lw.load"):
         lw.export_policy("runs/mine", tmp_path / "policy.onnx")  # type: ignore[arg-type]
-    monkeypatch.setattr(policy_export.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=r"needs onnx and onnxscript: pip install 'lyceum-warp\[export\]'$"):
         lw.export_policy(policy, tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
