@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import inspect
 import io
 import itertools
 import re
@@ -9,10 +10,12 @@ import shutil
 import textwrap
 import typing
 from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Annotated, Any
 
 import tyro
 
+from lyceum_warp.support.docstrings import attribute_docs
 from lyceum_warp.support.suggestions import closest
 
 _ERRORS = (
@@ -34,7 +37,7 @@ def parse(command: type, prog: str, argv: Sequence[str]) -> Any:
     if {"-h", "--help"} & set(argv):
         _print_help(command, prog)
     if "--help-all" in argv:
-        argv = ["--help"]
+        _help(command, prog)
     options: Any
     with contextlib.redirect_stderr(io.StringIO()) as printed:
         try:
@@ -90,7 +93,7 @@ def _options(command: Any, group: str = "") -> Iterator[_Option]:
 
 def _print_help(command: Any, prog: str) -> None:
     if not hasattr(command, "USUAL"):
-        tyro.cli(command, prog=prog, args=["--help"], config=_CONFIG)
+        _help(command, prog)
     usual: Sequence[str] = command.USUAL
     hints = typing.get_type_hints(command, include_extras=True)
     hidden = [name for name, hint in hints.items() if name not in usual and tyro.conf.Positional not in _markers(hint)]
@@ -99,14 +102,36 @@ def _print_help(command: Any, prog: str) -> None:
     body = {"__doc__": command.__doc__, "__annotations__": annotations, **dict.fromkeys(from_groups)}
     short: Any = dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
     try:
-        tyro.cli(short, prog=prog, args=["--help"], config=_CONFIG)
+        _help(short, prog)
     finally:
         print(f"{prog} --help-all also describes")
-        width = min(shutil.get_terminal_size().columns, 80)
         unusual = [option for option in _options(command) if option.field not in usual]
         for group, options in itertools.groupby(unusual, lambda option: option.group):
             text = f"  {group}: {' '.join(option.flag for option in options)}"
-            print(textwrap.fill(text, width, break_on_hyphens=False, subsequent_indent="    "))
+            print(textwrap.fill(text, _width(), break_on_hyphens=False, subsequent_indent="    "))
+
+
+def _help(command: Any, prog: str) -> None:
+    """Print the help of a command, wrapped, and without the defaults None."""
+    hints, docs = typing.get_type_hints(command, include_extras=True), attribute_docs(*reversed(command.__mro__[:-1]))
+    body: dict[str, Any] = {"__doc__": command.__doc__, "__annotations__": {}}
+    for field in dataclasses.fields(command):
+        if field.name in docs:
+            hint = "" if field.default is None else None
+            text = tyro.conf.arg(help=" ".join(docs[field.name].split()), help_behavior_hint=hint)
+            body["__annotations__"][field.name] = Annotated[hints[field.name], text]
+            if field.default is not dataclasses.MISSING:
+                body[field.name] = field.default
+    shown: Any = dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
+    paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
+    fill = partial(textwrap.fill, width=_width(), break_on_hyphens=False, break_long_words=False)
+    texts = [text if text.startswith(("$", " ")) else fill(text) for text in paragraphs]
+    print("\n\n".join(texts), end="\n\n")  # tyro would join the lines
+    tyro.cli(shown, prog=prog, description=" ", args=["--help"], config=_CONFIG)
+
+
+def _width() -> int:
+    return min(shutil.get_terminal_size().columns, 80)
 
 
 def _markers(hint: Any) -> tuple[Any, ...]:

@@ -3,8 +3,9 @@
 import math
 import sys
 import textwrap
+from collections.abc import Iterable
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -13,8 +14,15 @@ from lyceum_warp.cli.display import COUNTED, counted, known_values, say
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Callback, Run
 
-_BAR_WIDTH = 36
-"""Number of characters that the bar, the iteration number and the times take up together."""
+
+class _Bar(Progress):
+    """A bar as wide as the terminal, over a line of text."""
+
+    text = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Return the bar and the text."""
+        return *super().get_renderables(), self.text
 
 
 class Display(Callback):
@@ -25,10 +33,10 @@ class Display(Callback):
         self.total = 0
         self.mean = math.nan
         self.long_work: LongWork | None = None
-        self.progress = Progress(
-            BarColumn(bar_width=8), MofNCompleteColumn(), TextColumn("{task.fields[text]}"),
-            TimeElapsedColumn(), TimeRemainingColumn(compact=True), TextColumn("left"),
-            console=console, disable=not console.is_terminal,
+        self.progress = _Bar(
+            BarColumn(bar_width=None), MofNCompleteColumn(), TextColumn("iterations"), TimeElapsedColumn(),
+            TimeRemainingColumn(compact=True), TextColumn("left"),
+            console=console, disable=not console.is_terminal, expand=True,
         )  # fmt: skip
 
     def begin(self, run: Run, learner: Learner, iterations: int) -> None:
@@ -41,7 +49,7 @@ class Display(Callback):
             soft_wrap=True,
         )  # fmt: skip
         self.total, self.learner, self.simulation = iterations, learner, simulation(env)
-        self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration, text="")
+        self.bar = self.progress.add_task("", total=iterations, completed=learner.iteration)
         self.progress.start()
 
     def end(self, run: Run, learner: Learner) -> None:
@@ -73,8 +81,8 @@ class Display(Callback):
         loss = f"loss {row['loss']:.3g}" if "loss" in row else ""
         text = " ".join(filter(None, [result, loss, *bad, mean, success, rate]))
         if self.console.is_terminal:
-            text = textwrap.shorten(text, self.console.width - _BAR_WIDTH, placeholder="…")
-            self.progress.update(self.bar, completed=it.iteration, text=text)
+            self.progress.text = escape(textwrap.shorten(text, self.console.width, placeholder="…"))
+            self.progress.update(self.bar, completed=it.iteration)
         else:
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
@@ -82,7 +90,7 @@ class Display(Callback):
     def work(self, text: str, unit: str, done: int, total: int) -> None:
         """Show the progress of work between two iterations, such as rendering a video."""
         if self.console.is_terminal:
-            self.progress.update(self.bar, text=f"{text}: {done}/{total} {unit}")
+            self.progress.text = f"{text}: {done}/{total} {unit}"
             return
         if self.long_work is None or (self.long_work.text, self.long_work.unit) != (text, unit):
             self.long_work = LongWork(text, unit, self.console)

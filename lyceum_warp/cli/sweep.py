@@ -33,15 +33,15 @@ class Sweep:
 
     A file has task, trials, out, and the tables settings and ranges, whose keys are options of lyceum-warp train:
 
-    task = "hopper"
-    trials = 30
-    out = "runs/hopper-sweep"
-    settings = { iterations = 40, nworld = 16 }
-    [ranges]
-    gamma = { low = 0.98, high = 0.999 }
-    delta = { low = 0.01, high = 0.3, log = true }
-    hidden = { choices = [[32, 32], [64, 64]] }
-    "param.ctrl_cost_weight" = { low = 1e-4, high = 1e-2, log = true }
+        task = "hopper"
+        trials = 30
+        out = "runs/hopper-sweep"
+        settings = { iterations = 40, nworld = 16 }
+        [ranges]
+        gamma = { low = 0.98, high = 0.999 }
+        delta = { low = 0.01, high = 0.3, log = true }
+        hidden = { choices = [[32, 32], [64, 64]] }
+        "param.ctrl_cost_weight" = { low = 1e-4, high = 1e-2, log = true }
     """
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
@@ -55,6 +55,7 @@ class Sweep:
 
         search = read_search(self.file)
         out, beat = Path(search.out), search.heartbeat
+        direction: Any = search.direction or ("minimize" if search.objective == "gate" else "maximize")
         out.mkdir(parents=True, exist_ok=True)
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # heartbeats are experimental
@@ -66,7 +67,7 @@ class Sweep:
                     heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
                 ),
                 study_name=self.file.stem, load_if_exists=True,
-                direction=search.direction or ("minimize" if search.objective == "gate" else "maximize"),
+                direction=direction,
                 sampler=getattr(optuna.samplers, search.sampler)(), pruner=getattr(optuna.pruners, search.pruner)(),
             )  # fmt: skip
             _optimize(study, _objective(search), search)

@@ -38,11 +38,14 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     return capsys.readouterr().out.replace("│", " ")  # some terminals draw boxes without sides
 
 
-def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     out = help_of([], capsys)
     assert all(f"• {name} " in out for name in COMMANDS)
     for name in COMMANDS:
-        assert f"$ lyceum-warp {name}" in help_of([name, "--help"], capsys)
+        shown = help_of([name, "--help"], capsys)
+        assert f"$ lyceum-warp {name}" in shown and "None)" not in shown
+        assert all(len(line) <= 80 or line.startswith(("$", "    ")) for line in shown.splitlines())
 
 
 def test_help_all_describes_more_options_than_help(
