@@ -23,12 +23,12 @@ LEVELS = {
     "algos": 6, "controllers": 6,
     "viz": 7,
     "training": 8,
-    "adapters": 9, "testing": 9, "tuning": 9, "viewer": 9,
+    "adapters": 9, "fitting": 9, "testing": 9, "tuning": 9, "viewer": 9,
     "cli": 10, "gym": 10,
 }  # fmt: skip
 """The level of each room. A module imports only from lower levels and from its own room."""
 
-APPS = {"adapters", "cli", "gym", "testing", "training", "tuning", "viewer", "viz"}
+APPS = {"adapters", "cli", "fitting", "gym", "testing", "training", "tuning", "viewer", "viz"}
 """Rooms that use the others through the names in their ``__init__.pyi`` only. All rooms may use modules of ``OPEN``."""
 
 OPEN = {"kernels", "support"}

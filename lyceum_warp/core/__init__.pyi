@@ -4,6 +4,8 @@ from lyceum_warp.core.done import (
 )
 from lyceum_warp.core.fields import (
     INPUTS as INPUTS,
+    element_names as element_names,
+    elements as elements,
     quat as quat,
     vec10 as vec10,
 )
@@ -13,11 +15,18 @@ from lyceum_warp.core.gate import (
     Verdict as Verdict,
 )
 from lyceum_warp.core.mirror import Mirror as Mirror
+from lyceum_warp.core.model_fields import (
+    MOVED_INERTIA as MOVED_INERTIA,
+    NOT_NEGATIVE as NOT_NEGATIVE,
+    VARYING_FIELDS as VARYING_FIELDS,
+)
 from lyceum_warp.core.model_files import (
     ModelFile as ModelFile,
+    ModelSource as ModelSource,
     find_model as find_model,
     gymnasium_model as gymnasium_model,
     gymnasium_robotics_model as gymnasium_robotics_model,
+    load_spec as load_spec,
     menagerie_model as menagerie_model,
     package_model as package_model,
     playground_model as playground_model,

@@ -273,6 +273,18 @@ def rows(model: mujoco.MjModel, name: str) -> int:
     return len(getattr(owner, name))
 
 
+def element_names(model: mujoco.MjModel, name: str) -> list[str]:
+    """List the named elements of a field of MjData or MjModel, such as the joints of ``qvel``."""
+    prefix = name.partition("_")[0]
+    place = _RANGES.get(name) or _RANGES.get(prefix)
+    kind = place[0] if place is not None else _KINDS.get(name) or _KINDS.get(prefix)
+    known = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)] if kind is not None else []
+    elements_of = [element for element in known if element]
+    if place is _ACTIVATIONS:
+        return [element for element in elements_of if model.actuator(element).actadr[0] >= 0]
+    return elements_of
+
+
 def _called(kind: mujoco.mjtObj) -> str:
     return kind.name.removeprefix("mjOBJ_").lower()
 

@@ -6,6 +6,7 @@ command line. To add an option, add a field to one of these classes.
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping, Set
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -178,6 +179,12 @@ class EnvOptions:
     """Further fields that ``env.field`` returns."""
     dynamics: Collection[str] = ()
     """Model fields that ``env.set_dynamics`` may set, besides the fields that the task randomizes."""
+    fitted: str | None = None
+    """Folder of a fit (``lw.fit``), whose values replace those of the model. Parameters that a task computes from its
+    model keep the values of the model before the fit, so that an action means the same to the robot."""
+    fitted_draws: bool = False
+    """Whether each world draws its own values from what the fit left uncertain. A world keeps them for all episodes,
+    and the task's own draws start from them."""
     physics: PhysicsOptions = PhysicsOptions()
     """Physics options, or the name of options in the task's ``physics``. "exact" means the options of the task's
     model."""
@@ -193,6 +200,12 @@ class EnvOptions:
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
         check_flag("autoreset", self.autoreset)
+        check_flag("fitted_draws", self.fitted_draws)
+        check_kind("fitted", self.fitted, str | Path | None, "the folder of a fit")
+        if self.fitted is not None:
+            object.__setattr__(self, "fitted", str(Path(self.fitted).expanduser().absolute()))
+        elif self.fitted_draws:
+            raise ValueError("fitted_draws=True needs a fit: pass its folder as fitted=...")
         check_flag("graphs", self.graphs)
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
