@@ -1,6 +1,7 @@
 """Bind a task to its model and its parameters, and make its kernels."""
 
 import contextlib
+import copy
 import functools
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
@@ -16,6 +17,7 @@ from lyceum_warp.binding.layouts import layouts_of
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
+from lyceum_warp.core.fitted import Fitted
 from lyceum_warp.core.model_fields import describe_model_field
 from lyceum_warp.core.model_files import ModelSource, read_task_spec
 from lyceum_warp.core.options import PhysicsOptions
@@ -34,6 +36,8 @@ class BoundTask:
         fields: More fields for the engine to provide. It always provides the fields of ``World``.
         dynamics: Model fields that may differ between worlds, besides those that the task writes.
         params: Values for the fields of ``Params``: one value, or one value per world.
+        fitted: Folder of a fit.
+        fitted_draws: Whether the fitted fields may differ between worlds.
     """
 
     def __init__(
@@ -46,6 +50,8 @@ class BoundTask:
         dynamics: Collection[str] = (),
         physics: PhysicsOptions | None = None,
         params: Mapping[str, Any] | None = None,
+        fitted: str | None = None,
+        fitted_draws: bool = False,
     ) -> None:
         physics = physics or PhysicsOptions()
         self.definition = task
@@ -64,8 +70,20 @@ class BoundTask:
         self.spec = read_task_spec(task, model)
         """The model before ``edit_model``."""
         edited = models.edited(task, self.spec)
+        self.fit = None if fitted is None else Fitted(fitted)
+        """The fit whose values the model has."""
+        fields_of_fit = tuple(self.fit.values) if self.fit else ()
+        dynamics = (*dynamics, *fields_of_fit) if fitted_draws else dynamics
+        if self.fit:
+            self.fit.delay(edited, physics.timestep or edited.option.timestep)
+        varied = {*model_fields, *dynamics, *fields_of_fit}
         with _file_in_errors(task.model if model is None else model):
-            self.model = models.compile_model(edited, data_fields, physics, varied={*model_fields, *dynamics})
+            self.nominal = models.compile_model(edited, data_fields, physics, varied=varied)
+            """The compiled model without the values of a fit."""
+        self.model = self.nominal
+        if self.fit:
+            self.model = copy.copy(self.nominal)
+            self.fit.put(self.model)
         if physics.timestep is not None or physics.integrator is not None:
             models.warn_of_unstable_servos(self.model)
         self.frame_skip = task.frame_skip if physics.frame_skip is None else physics.frame_skip
@@ -83,7 +101,7 @@ class BoundTask:
             for name in dict.fromkeys([*data_fields, "time", "ctrl"])
         ]
         self._describe_model_fields(model_fields, dynamics)
-        self.parameters = Parameters(source, self.model, params or {}, nworld=nworld, timestep=self.timestep)
+        self.parameters = Parameters(source, self.nominal, params or {}, nworld=nworld, timestep=self.timestep)
         self.layouts = layouts_of(source, self.params)
         self.kernels = kernels_of(source, self.layouts)
 

@@ -55,6 +55,8 @@ class WorldArrays:
             self._allocate_masks()
             self.state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64)
         self.state_view = torch_view(self.state)
+        self.drawn: dict[str, wp.array] = {}
+        """Each world's own values of fitted model fields, (nworld, size), which take the place of the nominal ones."""
 
     def _allocate_fields(self) -> None:
         n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels

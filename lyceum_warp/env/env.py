@@ -56,6 +56,8 @@ def make(  # noqa: D417
     model: ModelSource | None = None,
     fields: Collection[str] = (),
     dynamics: Collection[str] = (),
+    fitted: str | Path | None = None,
+    fitted_draws: bool | None = None,
     physics: str | PhysicsOptions | None = None,
     frame_skip: int | None = None,
     timestep: float | None = None,

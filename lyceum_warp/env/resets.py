@@ -76,5 +76,6 @@ class Resets(WorldArrays):
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
         for name in names:
-            nominal = repeated(flat(self.engine.nominal[name])[0], self.nworld)
-            launch_rows(state.copy_rows, mask, nominal, flat(self.engine.arrays[name]))
+            if (rows := self.drawn.get(name)) is None:
+                rows = repeated(flat(self.engine.nominal[name])[0], self.nworld)
+            launch_rows(state.copy_rows, mask, rows, flat(self.engine.arrays[name]))

@@ -44,7 +44,7 @@ def open_worlds(task: type[Task], options: EnvOptions, params: Mapping[str, Any]
     """Bind a task to its model and parameters, open its engine, and allocate the arrays of its worlds."""
     bound = BoundTask(
         task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
-        physics=options.physics, params=params,
+        physics=options.physics, params=params, fitted=options.fitted, fitted_draws=options.fitted_draws,
     )  # fmt: skip
     engine = open_engine(
         options.engine, bound.model, options.nworld, find_device(options.device), bound.fields,
@@ -61,6 +61,9 @@ class Worlds(Resets):
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
         super().__init__(task, engine)
+        if task.fit is not None and options.fitted_draws:
+            draws = task.fit.draws(task.model, self.nworld, options.seed, options.first_world)
+            self.drawn = {name: wp.array(rows, dtype=float, device=self.device) for name, rows in draws.items()}
         # Warp's kernels in debug mode are not thread-safe
         parallel = self.device.is_cpu and not engine.capturable and wp.config.mode != "debug"
         self._workers = Workers(engine.launch_threads) if parallel and engine.launch_threads > 1 else None

@@ -101,12 +101,13 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
                       scale of each column; the file applies them: (obs - offset) * scale
     ``actions``       the parts of an action in order: name and size
     ``actuators``     names of the model's actuators, in order
+    ``fit``           values and intervals of the fit (``lw.fit``) that ``env`` used, if any
     ================  ===================================================================================
 
     A task may add entries (``lw.Task.deployment``); ``walkers.deployment`` lists the entries of velocity tasks.
     """
     exact = env if task_physics(env)[1] == EXACT else env.replicate_few(1, physics=EXACT)
-    task, model = env.task, exact.task.model
+    task, model = env.task, exact.task.nominal  # a robot gets the commands of the model before the fit
     memory = {name: values.numpy(force=True) for name, values in {**env.shared, **env.lasting}.items()}
     parts = [{"name": name, "size": part.stop - part.start} for name, part in env.obs_space.parts.items()]
     normalizer: Any = getattr(policy, "normalizer", None)
@@ -121,6 +122,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         "observations": parts,
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
         "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
+        **({} if task.fit is None else {"fit": task.fit.metadata}),
         **task.definition.deployment(model, SimpleNamespace(**task.params), memory),
     }
 

@@ -100,6 +100,8 @@ class Transfer:
     """The curriculum at which all episodes began, as in "level 4.2 (0 to 9)"; empty if the task has none."""
     comparisons: tuple[Comparison, ...]
     """One comparison for each engine and each set of physics options."""
+    fitted: str = ""
+    """The folder of the fit whose values the worlds had; empty if they had none."""
 
     @property
     def line(self) -> str:
@@ -108,7 +110,11 @@ class Transfer:
         for comparison in self.comparisons:
             differences = ", ".join(difference.text for difference in comparison.differences)
             texts.append(f"{comparison.second} against {comparison.first}: {comparison.verdict} ({differences})")
-        return "; ".join(texts) + (f"; begun at {self.memory}" if self.memory else "")
+        return (
+            "; ".join(texts)
+            + (f"; begun at {self.memory}" if self.memory else "")
+            + (f"; fitted by {self.fitted}" if self.fitted else "")
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Convert the result to values that JSON supports."""
@@ -191,7 +197,10 @@ def transfer(
     for name in simulations:
         if name not in (exact, warp_name):
             comparisons.append(compare(exact, name, results[exact], results[name]))
-    return Transfer(task=env.task.name, episodes=episodes, seed=seed, memory=memory, comparisons=tuple(comparisons))
+    return Transfer(
+        task=env.task.name, episodes=episodes, seed=seed, memory=memory, comparisons=tuple(comparisons),
+        fitted=env.options.fitted or "",
+    )  # fmt: skip
 
 
 def _report(progress: Callable[[int, int], object] | None, number: int, count: int, step: int, steps: int) -> None:

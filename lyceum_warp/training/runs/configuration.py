@@ -21,7 +21,7 @@ from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
 from lyceum_warp.training.runs.folder import Run, policy_of
-from lyceum_warp.training.runs.task_copy import json_value, run_env, table_copies
+from lyceum_warp.training.runs.task_copy import fit_copy, json_value, run_env, table_copies
 
 ALGORITHMS: dict[str, tuple[Any, Any]] = {
     "npg": (algos.NPG, algos.NPGConfig), "ppo": (algos.PPO, algos.PPOConfig), "sac": (algos.SAC, algos.SACConfig),
@@ -52,7 +52,7 @@ def learner_classes(algorithm: str) -> tuple[Any, Any]:
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
-    names = ["horizon", "graphs", "fields", "dynamics"]
+    names = ["horizon", "graphs", "fields", "dynamics", "fitted", "fitted_draws"]
     if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
         names.append("nthread")
     entries = {name: value for name, value in options.given().items() if name in names}
@@ -72,6 +72,7 @@ def describe(learner: Learner) -> dict[str, Any]:
         "engine": options.engine if isinstance(options.engine, str) else env.engine.name,
         "device": options.device or "cpu",
         "options": entries,
+        **({} if env.task.fit is None else {"fit": env.task.fit.metadata}),
         "nworld": env.nworld * learner.team.size,
         "threads": torch.get_num_threads(),
         "seed": options.seed,
@@ -113,7 +114,7 @@ class Configuration:
             return cls(
                 task=config["task"],
                 params=config["params"] | {table: str(copy) for table, copy in table_copies(run).items()},
-                options=options.changed(config["physics"] | config["options"]),
+                options=options.changed(config["physics"] | config["options"] | fit_copy(run)),
                 algorithm=name,
                 hyperparameters=ALGORITHMS[name][1](**config[name]) if name in ALGORITHMS else None,
                 seed=config.get(f"{name}_seed"),

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 Files = dict[Path, Path | bytes]
 """Maps the path of each new file to its content, or to an existing file to copy."""
 
-TABLES = "tables"
+TABLES, FIT = "tables", "fit"
 _APART = 2
 """If the task's file lies more than this number of levels below the folder that contains both the task and the model,
 the two are copied into separate folders."""
@@ -61,6 +61,8 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
             manifest |= {"file": names[file], "modules": modules, "program": task.__module__ == "__main__"}
     if model_file is not None:
         manifest["model"] = names[model_file]
+    if env.task.fit is not None:
+        files |= {f"{FIT}/{name}": env.task.fit.folder / name for name in ("fit.json", "draws.npz")}
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
@@ -131,6 +133,12 @@ def table_copies(run: Run) -> dict[str, Path]:
         for name, copy in copies.items()
         if copy.is_file() and not (Path(tables[name]).is_file() and filecmp.cmp(tables[name], copy, shallow=False))
     }
+
+
+def fit_copy(run: Run) -> dict[str, str]:
+    """Return the option ``fitted`` with the run's copy of its fit, if the run used one."""
+    folder = run.task_folder / FIT
+    return {"fitted": str(folder.absolute())} if (folder / "fit.json").is_file() else {}
 
 
 def _npy(array: np.ndarray) -> bytes:
