@@ -83,6 +83,10 @@ from lyceum_warp.core.task import (
 from lyceum_warp.env.curriculum import Curriculum as Curriculum
 from lyceum_warp.env.env import Env as Env, make as make
 from lyceum_warp.env.openloop import OpenLoop as OpenLoop
+from lyceum_warp.fitting.excitation import excitation as excitation
+from lyceum_warp.fitting.fit import fit as fit
+from lyceum_warp.fitting.parameters import Parameter as Parameter
+from lyceum_warp.fitting.result import Fit as Fit
 from lyceum_warp.kernels.ground import (
     follow_walk as follow_walk,
     ground_distance as ground_distance,

@@ -17,7 +17,7 @@ from lyceum_warp.training.comparison import (
 from lyceum_warp.training.curve import learning_curve as learning_curve
 from lyceum_warp.training.gating import PassGate as PassGate
 from lyceum_warp.training.loop import train as train
-from lyceum_warp.training.report import write_report as write_report
+from lyceum_warp.training.report import html_page as html_page, write_report as write_report
 from lyceum_warp.training.runs.checkpoints import (
     network_of as network_of,
     read_checkpoint as read_checkpoint,

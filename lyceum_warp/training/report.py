@@ -7,7 +7,7 @@ import json
 import math
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +61,15 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, episode: 
     settings = {name: config[name] for name in (*_SETTINGS, config["algorithm"]) if name in config}
     parts += _section("Settings", _table(flat_settings(settings)))
     parts += _section("Machine and versions", _table(config.get("versions", {})))
+    return html_page(Path(out or folder / "report.html"), title, parts)
+
+
+def html_page(out: Path, title: str, parts: Iterable[str]) -> Path:
+    """Write parts of HTML as a page in the style of reports."""
     page = Path(__file__).with_suffix(".html").read_text()
-    with replaced(Path(out or folder / "report.html")) as temporary:
+    with replaced(out) as temporary:
         temporary.write_text(page.replace("TITLE", html.escape(title)).replace("BODY", "\n".join(parts), 1))
-    return Path(out or folder / "report.html")
+    return out
 
 
 def _run_parts(run: Run) -> Iterator[str]:

@@ -1,0 +1,296 @@
+"""Fit model fields, delays and sensors to a log: ``lw.fit``."""
+
+import dataclasses
+import functools
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from lyceum_warp.binding import compile_model, find_task, task_spec
+from lyceum_warp.core import MOVED_INERTIA, EnvOptions, ModelFile, Task, load_spec
+from lyceum_warp.env import Env
+from lyceum_warp.fitting.least_squares import Estimate, LeastSquares, Linear, search
+from lyceum_warp.fitting.log import Column, Controls, Log, LogSource, read_log
+from lyceum_warp.fitting.parameters import Parameter, Parameters
+from lyceum_warp.fitting.report import write_report
+from lyceum_warp.fitting.result import Fit
+from lyceum_warp.fitting.windows import Predictor, cut_windows
+from lyceum_warp.support.files import replaced
+from lyceum_warp.support.suggestions import did_you_mean
+from lyceum_warp.support.validate import finite_number, positive_number, whole_number
+
+FORMAT = 1
+DRAWS = 1024
+"""Draws from the posterior that the folder holds."""
+DEFAULT = ("kp.*", "kd.*", "dof_armature.*", "dof_damping.*", "dof_frictionloss.*", "delay.ctrl.*")
+"""Parameters of a fit, if none are given; those that the model lacks are left out."""
+_USUAL = {
+    "qpos": 0.002, "qvel": 0.05, "base position": 0.005, "base rotation": 0.005, "base velocity": 0.05,
+    "base angular velocity": 0.02, "gyro": 0.02, "accelerometer": 0.2, "framequat": 0.005, "jointpos": 0.002,
+    "jointvel": 0.05,
+}  # fmt: skip
+"""Standard deviations of the noise of usual sensors, by kind of measurement."""
+_SHARE_OF_SIGNAL = 0.02
+_CONVERGED = 0.1
+"""A fit ends if a step moves no parameter by this multiple of its standard deviation."""
+_KNOWN = 0.3
+"""A parameter is determined if its posterior is narrower than this multiple of its prior."""
+_LARGE = 2.0
+Progress = Callable[[str, int, float], object]
+
+
+def fit(
+    model: str | Path | type[Task] | mujoco.MjSpec | ModelFile,
+    log: LogSource,
+    parameters: Iterable[Parameter | str] | None = None,
+    *,
+    out: str | Path | None = None,
+    window: float | None = None,
+    held_out: float = 0.2,
+    noise: Mapping[str, float] | None = None,
+    samples: int = 128,
+    iterations: int = 30,
+    seed: int = 0,
+    nthread: int = 0,
+    hangs: bool = False,
+    resume: bool = False,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Fit:
+    """Fit a model to a log of the robot, and say what the log determines.
+
+    The log is cut into windows. Each window starts from its own initial state, which is estimated with the parameters
+    (multiple shooting). The cross-entropy method searches all parameters over ``samples`` hypotheses, each in its own
+    worlds. Gauss-Newton steps with finite differences follow, on the C engine in float64. Residuals count in multiples
+    of the noise, and linearly beyond 3 of them; windows that the model explains badly count less. Intervals come from
+    the Fisher information, and are widened by the scatter of the windows if the model can't explain the log.
+
+    Args:
+        model: A task, or a model file (MJCF or URDF) or MjSpec without a task.
+        log: The log; ``docs/fitting.md`` describes its columns.
+        parameters: What to fit: ``lw.Parameter`` or names such as "dof_damping.*_knee". The default is ``DEFAULT``.
+        out: Folder for the results, as for ``lw.make(..., fitted=out)``.
+        window: Seconds of a window; by default 0.25, or 0.1 if the robot's base moves, because contacts are chaotic.
+        held_out: Share of the windows, at the end of the log, that is held back to measure errors of prediction.
+        noise: Standard deviations of measurements by kind, such as {"qpos": 0.002}. Others are estimated.
+        samples: Hypotheses per round of the search; 0 starts at the nominal values.
+        iterations: Most Gauss-Newton steps.
+        seed: Seed of the search and of the draws from the posterior.
+        nthread: Threads; 0 means all cores.
+        hangs: Whether the robot hung at a fixed base: the free joint is taken away.
+        resume: Whether to continue a fit of the same problem in ``out``.
+        progress: Called with "search", the round and the least cost, and then with "fit", the iteration and the step's
+            largest change of a parameter in standard deviations.
+        options: Options and parameters of ``lw.make``, such as ``physics`` or ``timestep``.
+
+    Raises:
+        FileNotFoundError: The model or the log is missing.
+        ValueError: The log does not fit the model, or an argument is invalid.
+    """
+    began = time.perf_counter()
+    seed = whole_number("seed", seed, low=0)
+    samples, iterations = whole_number("samples", samples, low=0), whole_number("iterations", iterations, low=1)
+    held_out = finite_number("held_out", held_out, low=0.0, high=0.9)
+    if resume and out is None:
+        raise ValueError("resume=True needs the folder of the fit: pass it as out=...")
+    name, compiled, controls = _compiled(model, options, hangs=hangs)
+    moves = bool((compiled.jnt_type == mujoco.mjtJoint.mjJNT_FREE.value).any())
+    window = positive_number("window", (0.1 if moves else 0.25) if window is None else window, "seconds")
+    data = read_log(log, compiled, controls)
+    if not any(column.field == "sensordata" for column in data.columns):
+        compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
+    columns = [column.name for column in data.columns]
+    wanted = [name for name in DEFAULT if _fits(name, compiled, columns)] if parameters is None else parameters
+    bound = Parameters(wanted, compiled, columns)
+    groups, usual = _noise(data, compiled, noise or {})
+    windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
+    kept = len(windows) - round(held_out * len(windows))
+    free = {label: group for label, group in groups.items() if label not in (noise or {})}
+    problem = LeastSquares(windows.chosen(slice(kept)), predictor, free)
+    report = progress or (lambda stage, iteration, cost: None)
+    checkpoint = None if out is None else Path(out) / "estimate.npz"
+    if resume and checkpoint is not None and checkpoint.is_file():
+        at = _load(checkpoint, problem)
+    else:
+        start = np.zeros(bound.size)
+        if samples:
+            some = np.unique(np.linspace(0, kept - 1, 12).astype(int))
+            coarse = LeastSquares(problem.windows.chosen(some), predictor, {})
+            start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
+        at = problem.begin(start, usual)
+    while at.iteration < iterations and at.move >= _CONVERGED:
+        at = problem.iterate(at)
+        if checkpoint is not None:
+            _save(checkpoint, problem, at)
+        report("fit", at.iteration, at.move)
+    linear = problem.linearize(at)
+    held = LeastSquares(windows.chosen(slice(kept, None)), predictor, {}) if kept < len(windows) else problem
+    errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
+    notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
+    result = _result(bound, problem.covariance(linear), at, linear, groups, errors, notes)
+    result = dataclasses.replace(result, seconds=time.perf_counter() - began, substeps=predictor.substeps)
+    if out is None:
+        return result
+    result = dataclasses.replace(result, folder=Path(out))
+    _write(result, name, bound, problem.covariance(linear), at, seed)
+    times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
+    residuals = np.where(problem.seen, linear.residuals * at.noise, np.nan)
+    with replaced(Path(out) / "residuals.npz") as path, path.open("wb") as file:
+        np.savez_compressed(file, time=times, residuals=residuals, columns=np.array(columns))
+    write_report(result, name, times, residuals, groups)
+    return result
+
+
+def _fits(name: str, model: mujoco.MjModel, columns: Sequence[str]) -> bool:
+    try:
+        Parameters([name], model, columns)
+    except ValueError:
+        return False
+    return not name.startswith(("kp", "kd")) or bool((model.actuator_biasprm[:, 1] < 0.0).any())
+
+
+def _compiled(model: Any, options: Mapping[str, Any], *, hangs: bool) -> tuple[str, mujoco.MjModel, Controls | None]:
+    """Compile the model of a task or a file. The last result converts a task's actions to controls."""
+    given, params = EnvOptions.split(options)
+    controls: Controls | None = None
+    if isinstance(model, mujoco.MjSpec | ModelFile) or str(model).lower().endswith((".xml", ".urdf", ".mjcf")):
+        if params:
+            raise ValueError(f"the option {min(params)!r} needs a task, and the model is a file: leave it out")
+        spec, physics = load_spec(model), given.physics
+        name = spec.modelname
+    else:
+        task = find_task(model)
+        spec, physics = task_spec(task, given.model), given.physics.resolved(task.physics)
+        name, controls = task.__name__, functools.partial(_controls, task, given, params)
+    if hangs:
+        for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
+            spec.delete(joint)
+        for key in list(spec.keys):  # keyframes have the coordinates of the free joint
+            spec.delete(key)
+    physics = dataclasses.replace(physics, discardvisual=True)
+    compiled = compile_model(spec, ["sensordata"], physics, varied=MOVED_INERTIA)
+    if hangs:
+        compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    if compiled.nu == 0:
+        raise ValueError(f"the model {name!r} has no actuators, so that controls can't move it: add actuators to it")
+    if np.any(compiled.actuator_delay > 0.0):
+        raise ValueError(f"the actuators of {name!r} have delays of their own: take them away, and fit 'delay.ctrl.*'")
+    return name, compiled, controls
+
+
+def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], actions: np.ndarray) -> np.ndarray:
+    """Convert actions to controls by the task, as in worlds that were just reset."""
+    env = Env(task, options.changed({"nworld": len(actions), "engine": "mujoco", "device": "cpu"}), params)
+    if actions.shape[1] != env.action.shape[1]:
+        raise ValueError(f"'action' has {actions.shape[1]} numbers per time, and the task's has {env.action.shape[1]}")
+    env.reset()
+    env.action.copy_(torch.as_tensor(actions))
+    env.worlds.act()
+    result: np.ndarray = env.field("ctrl").double().numpy().copy()
+    return result
+
+
+def _noise(log: Log, model: mujoco.MjModel, given: Mapping[str, float]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Group the columns by kind, and get each column's first noise."""
+    kinds = [_kind(column, model) for column in log.columns]
+    groups = {kind: np.array([i for i, k in enumerate(kinds) if k == kind]) for kind in dict.fromkeys(kinds)}
+    for name, number in given.items():
+        if name not in groups:
+            raise ValueError(f"noise has {name!r}, which the log does not measure: {did_you_mean(name, groups)}")
+        positive_number(f"noise of {name!r}", number, "the column's units")
+    spread = np.nanstd(np.concatenate([take.measured for take in log.takes]), axis=0)
+    usual = _USUAL | dict(given)
+    return groups, np.array([usual.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
+
+
+def _kind(column: Column, model: mujoco.MjModel) -> str:
+    """Name the kind of a column's measurement."""
+    if column.field == "sensordata":
+        sensor = int(np.searchsorted(model.sensor_adr, column.index, side="right")) - 1
+        return mujoco.mjtSensor(model.sensor_type[sensor]).name.removeprefix("mjSENS_").lower()
+    if column.field in ("qpos", "qvel"):
+        address = model.jnt_qposadr if column.field == "qpos" else model.jnt_dofadr
+        joint = int(np.searchsorted(address, column.index, side="right")) - 1
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            words = {"qpos": ("position", "rotation"), "qvel": ("velocity", "angular velocity")}[column.field]
+            return f"base {words[int(column.index - address[joint] >= 3)]}"
+    return column.field
+
+
+def _notes(groups: Mapping[str, np.ndarray], usual: np.ndarray, at: Estimate, *, held: bool) -> list[str]:
+    notes = [] if held else ["no window was held back: errors of prediction are those of the fitted windows"]
+    for label, group in groups.items():
+        if (ratio := at.noise[group[0]] / usual[group[0]]) > _LARGE:
+            notes.append(
+                f"the errors of {label} are {ratio:.1f} times a sensor's usual noise: the model lacks something, or "
+                "the log has other units or another order"
+            )
+    return notes
+
+
+def _result(
+    bound: Parameters, covariance: np.ndarray, at: Estimate, linear: Linear, groups: Mapping[str, np.ndarray],
+    errors: Sequence[np.ndarray], notes: Sequence[str],
+) -> Fit:  # fmt: skip
+    deviation = np.sqrt(np.diag(covariance))
+    ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
+    value, low, high = (np.array([c.value(x) for c, x in zip(bound.coordinates, end, strict=True)]) for end in ends)
+    # in multiples of the priors, a direction of information 1 is known as well from the prior as from the log
+    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.reduced()[1] * bound.std)
+    weak = vectors.T[1.0 / np.sqrt(np.maximum(strength, 0.0) + 1.0) > _KNOWN]
+    directions = [{bound.names[i]: float(v[i]) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2} for v in weak]
+    rms: dict[str, Any] = {
+        label: tuple(float(np.sqrt(np.nanmean(e[..., group] ** 2))) for e in errors) for label, group in groups.items()
+    }
+    nominal, fitted = (float(np.sqrt(np.nanmean((e / at.noise) ** 2))) for e in errors)
+    delay = bound.signals(at.x)["delay"]
+    return Fit(
+        bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
+        covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
+        rms, (nominal, fitted), bound.fields(bound.model(at.x)),
+        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, 0.0, 0,
+    )  # fmt: skip
+
+
+def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at: Estimate, seed: int) -> None:
+    """Write fit.json and draws.npz, which ``lw.make(..., fitted=...)`` reads."""
+    folder = result.folder
+    assert folder is not None
+    xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
+    rows = [bound.fields(bound.model(x)) for x in np.clip(xs, bound.low, bound.high)]
+    draws: dict[str, Any] = {field: np.array([list(row[field].values()) for row in rows]) for field in result.fields}
+    content = {"format": FORMAT, "model": name} | {
+        field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value
+        for field in dataclasses.fields(result) if field.name not in ("folder", "correlation")
+    }  # fmt: skip
+    folder.mkdir(parents=True, exist_ok=True)
+    with replaced(folder / "draws.npz") as path, path.open("wb") as file:
+        np.savez_compressed(file, **draws)
+    with replaced(folder / "fit.json") as path:
+        path.write_text(json.dumps(content, indent=1))
+
+
+def _save(path: Path, problem: LeastSquares, at: Estimate) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, names=problem.parameters.names, begin=problem.windows.begin, **dataclasses.asdict(at))
+
+
+def _load(path: Path, problem: LeastSquares) -> Estimate:
+    """Read the estimate of an unfinished fit."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        names, begin = arrays.pop("names").tolist(), arrays.pop("begin")
+        at = Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})
+    except Exception as error:  # numpy and zipfile raise many types of errors
+        raise ValueError(f"{path} is damaged ({error}): delete it to start again") from error
+    if names != problem.parameters.names or not np.array_equal(begin, problem.windows.begin):
+        raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
+    return at

@@ -1,0 +1,251 @@
+"""Minimise the squared residuals of all windows over parameters and initial states."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from lyceum_warp.fitting.windows import WORLDS, Predictor, Windows
+
+_HUBER, _CUT = 3.0, 1e4
+"""Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
+_BAD, _POWER = 1.3, 3
+"""A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
+_STEPS, _PARAMETER_STEP = (1e-5, 2e-4, 1e-4), 1e-3
+"""Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
+_MEMORIES = (0.015, 0.1, 0.5)
+"""Seconds of memory of the simulations that guess the initial states."""
+_JUMP = 1.0
+"""A prediction that a finite difference changes by this multiple of the noise has jumped."""
+_START = (0.1, 1.0, 1.0)
+"""Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
+_SETTLE = 4
+"""Steps of the initial states alone, to predict windows with given parameters."""
+_STEADY = 0.03
+"""The noise is known if its logarithm changes less."""
+_DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 1.0, 100.0)
+
+
+@dataclasses.dataclass
+class Estimate:
+    """Parameters, initial states and noise at some iteration."""
+
+    x: np.ndarray
+    """Coordinates, (parameters,)."""
+    states: np.ndarray
+    """Initial states of the windows, (windows, nq + nv + na)."""
+    noise: np.ndarray
+    """Standard deviation of each column's noise, (columns,)."""
+    move: float = np.inf
+    """The last step's largest change of a parameter in standard deviations; infinite while the noise is not known."""
+    iteration: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Linear:
+    """The normal equations of each window, around an estimate."""
+
+    residuals: np.ndarray
+    """In multiples of the noise, (windows, samples, columns)."""
+    leverage: np.ndarray
+    """The share of each column's residuals that the initial states absorb, (windows, columns)."""
+    cost: np.ndarray
+    """Costs of the windows, (windows,)."""
+    weight: np.ndarray
+    """Weights of the windows, (windows,)."""
+    a: np.ndarray
+    """(windows, parameters, parameters)."""
+    b: np.ndarray
+    """(windows, parameters, nx)."""
+    c: np.ndarray
+    """(windows, nx, nx)."""
+    by_x: np.ndarray
+    """Gradients, (windows, parameters)."""
+    by_state: np.ndarray
+    """Gradients, (windows, nx)."""
+
+    def reduced(self) -> tuple[np.ndarray, np.ndarray]:
+        """Eliminate the initial states: each window's weighted gradient, and the Fisher information of the log."""
+        solved = np.linalg.solve(self.c, np.concatenate([self.b.swapaxes(1, 2), self.by_state[..., None]], axis=2))
+        gradients = self.by_x - np.einsum("wpk,wk->wp", self.b, solved[..., -1])
+        information = np.einsum("w,wpq->pq", self.weight, self.a - self.b @ solved[..., :-1])
+        return self.weight[:, None] * gradients, information
+
+
+class LeastSquares:
+    """A problem of robust least squares with one initial state per window (multiple shooting).
+
+    The initial states are eliminated from the normal equations window by window, so that a step costs
+    1 + parameters + nx rollouts of the log.
+
+    Args:
+        windows: The windows.
+        predictor: Predicts them.
+        groups: Groups of columns whose noise is estimated.
+    """
+
+    def __init__(self, windows: Windows, predictor: Predictor, groups: Mapping[str, np.ndarray]) -> None:
+        self.windows, self.predictor, self.groups = windows, predictor, groups
+        self.parameters, model = predictor.parameters, predictor.model
+        sizes = (model.nv, model.nv, model.na)
+        self.steps, self.ridge = np.repeat(_STEPS, sizes), np.repeat(_START, sizes) ** -2.0
+        self.seen = ~np.isnan(windows.measured)
+        self.seen[..., [quat[-1] for quat in predictor.quats]] = False  # a rotation has three numbers
+
+    def begin(self, x: np.ndarray, noise: np.ndarray) -> Estimate:
+        """Start at parameters, and guess the initial states."""
+        return self._guessed(Estimate(x, self.predictor.track(self.windows, x, _MEMORIES[0]), noise))[0]
+
+    def linearize(self, at: Estimate) -> Linear:
+        """Make the normal equations from finite differences, with one world for each number and window."""
+        p, nx = self.parameters.size, self.predictor.nx
+        eps = np.where(at.x >= self.parameters.high, -_PARAMETER_STEP, _PARAMETER_STEP) * self.parameters.std
+        xs = np.tile(at.x, (1 + p + nx, 1))
+        xs[1 : 1 + p] += np.diag(eps)
+        changes = np.zeros((1, 1 + p + nx, nx))
+        changes[0, 1 + p :] = np.diag(self.steps)
+        parts = [self._equations(rows, at, np.concatenate([eps, self.steps])) for rows in self._rows(at, xs, changes)]
+        residuals, leverage, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
+        cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
+        share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
+        return Linear(residuals, leverage, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+
+    def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
+        p, base = self.parameters.size, np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
+        with np.errstate(invalid="ignore"):
+            change = (rows[:, 1:] - rows[:, :1]) / at.noise
+        # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
+        jumps = ~(np.abs(change) < _JUMP).all(axis=1, keepdims=True)
+        slopes = np.where(jumps, 0.0, change) / steps[:, None, None]
+        flat = base.reshape(len(rows), -1)
+        jacobian = slopes.reshape(*slopes.shape[:2], -1).swapaxes(1, 2)
+        weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[..., None]
+        square, gradient = jacobian.swapaxes(1, 2) @ weighted, np.einsum("wnp,wn->wp", weighted, flat)
+        c = square[:, p:, p:] + np.diag(self.ridge)
+        share = np.einsum("wnp,wpn->wn", jacobian[..., p:], np.linalg.solve(c, weighted[..., p:].swapaxes(1, 2)))
+        leverage = share.reshape(base.shape).sum(axis=1)
+        return base, leverage, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
+
+    def iterate(self, at: Estimate) -> Estimate:
+        """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
+        linear = self.linearize(at)
+        cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
+        steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
+        deviation = np.sqrt(np.diag(np.linalg.inv(linear.reduced()[1] + np.diag(self.parameters.std**-2.0))))
+        result, move = at, 0.0
+        for damping in _DAMPINGS:
+            x = self._step(at, linear, damping)
+            trial, costs = self._guessed(dataclasses.replace(at, x=x, states=self._settled(at, linear, x)))
+            if linear.weight @ costs + self.prior(x[None])[0] < cost:
+                result, move = trial, float(np.max(np.abs(x - at.x) / deviation))
+                break
+        return dataclasses.replace(result, noise=noise, move=move if steady else np.inf, iteration=at.iteration + 1)
+
+    def _guessed(self, at: Estimate) -> tuple[Estimate, np.ndarray]:
+        """Choose each window's best initial state, the present one or a guess; return the windows' costs, too."""
+        guesses = np.stack([at.states, *(self.predictor.track(self.windows, at.x, m) for m in _MEMORIES)])
+        none, trials = np.zeros((1, 1, self.predictor.nx)), [dataclasses.replace(at, states=s) for s in guesses]
+        costs = np.concatenate([self.costs(trial, at.x[None], none) for trial in trials], axis=1).T
+        best = guesses[costs.argmin(axis=0), np.arange(len(at.states))]
+        return dataclasses.replace(at, states=best), costs.min(axis=0)
+
+    def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> np.ndarray:
+        """Move the initial states with the parameters, each by its own best damping.
+
+        One bad contact must not stop the other windows.
+        """
+        gradient = (linear.by_state + np.einsum("wpk,p->wk", linear.b, x - at.x))[..., None]
+        diagonal = np.eye(linear.c.shape[1]) * linear.c
+        steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient)[..., 0] for mu in _STATE_DAMPINGS]
+        changes = np.stack([*steps, np.zeros_like(steps[0])], axis=1)
+        choice = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
+        return self.predictor.moved(at.states, changes[np.arange(len(changes)), choice])
+
+    def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Compute residuals with given parameters, after an estimate of the initial states alone."""
+        at = self.begin(x, noise)
+        for _ in range(_SETTLE):
+            at = dataclasses.replace(at, states=self._settled(at, self.linearize(at), x))
+        none = np.zeros((1, 1, self.predictor.nx))
+        rows = np.concatenate([rows[:, 0] for rows in self._rows(at, x[None], none)])
+        return np.where(self.seen, np.clip(rows / noise, -_CUT, _CUT) * noise, np.nan)
+
+    def costs(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Compute half the robust sum of squares of each window under hypotheses, (windows, hypotheses)."""
+        return np.concatenate([self._costs(rows, at.noise) for rows in self._rows(at, xs, changes)])
+
+    def _costs(self, rows: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        scaled = np.minimum(np.abs(rows) / noise, _CUT)
+        total: np.ndarray = np.where(scaled < _HUBER, 0.5 * scaled**2, _HUBER * (scaled - 0.5 * _HUBER)).sum((2, 3))
+        return total
+
+    def _rows(self, at: Estimate, xs: np.ndarray, changes: np.ndarray) -> Any:
+        """Yield the residuals of some windows at a time."""
+        group = max(1, WORLDS // len(xs))
+        for begin in range(0, len(self.windows), group):
+            part = slice(begin, begin + group)
+            shift = changes if len(changes) == 1 else changes[part]
+            yield self.predictor.predict(self.windows.chosen(part), at.states[part], xs, shift)
+
+    def prior(self, xs: np.ndarray) -> np.ndarray:
+        """Compute minus the logarithm of the prior of hypotheses, (hypotheses,)."""
+        total: np.ndarray = 0.5 * ((xs / self.parameters.std) ** 2).sum(axis=1)
+        return total
+
+    def covariance(self, linear: Linear) -> np.ndarray:
+        """Compute the covariance of the posterior.
+
+        If the residuals of a window have a common cause, such as wrong contacts, the curvature promises too much. The
+        scatter of the windows' gradients then widens the intervals (the sandwich estimate, clustered by window).
+        """
+        gradients, information = linear.reduced()
+        prior, (count, p) = np.diag(self.parameters.std**-2.0), gradients.shape
+        inverse = np.linalg.inv(information + prior)
+        meat = gradients.T @ gradients * count / max(1, count - p) + prior
+        scale = np.sqrt(np.maximum(1.0, np.diag(inverse @ meat @ inverse) / np.diag(inverse)))
+        covariance: np.ndarray = scale[:, None] * inverse * scale if count >= 2 * p else inverse
+        return covariance
+
+    def _step(self, at: Estimate, linear: Linear, damping: float) -> np.ndarray:
+        """Solve the damped normal equations of the parameters within their bounds."""
+        prior, low, high = self.parameters.std**-2.0, self.parameters.low, self.parameters.high
+        gradients, whole = linear.reduced()
+        gradient, whole = gradients.sum(axis=0) + prior * at.x, whole + np.diag(prior)
+        whole[np.diag_indices(len(whole))] *= 1.0 + damping
+        held = ((at.x <= low) & (gradient > 0.0)) | ((at.x >= high) & (gradient < 0.0))
+        whole[held], whole[:, held], gradient[held] = 0.0, 0.0, 0.0
+        whole[held, held] = 1.0
+        x: np.ndarray = np.clip(at.x - np.linalg.solve(whole, gradient), low, high)
+        return x
+
+    def _noise(self, at: Estimate, linear: Linear) -> np.ndarray:
+        """Estimate the noise of each group of columns from the median of the residuals."""
+        noise = at.noise.copy()
+        for group in self.groups.values():
+            sizes = np.abs(linear.residuals[..., group][self.seen[..., group]])
+            free = max(0.1, 1.0 - linear.leverage[:, group].sum() / len(sizes))
+            noise[group] *= max(1e-6, float(np.median(sizes)) / 0.6745 / np.sqrt(free))
+        return noise
+
+
+def search(
+    problem: LeastSquares, noise: np.ndarray, samples: int, seed: int, report: Callable[[int, float], Any]
+) -> np.ndarray:
+    """Search all parameters by the cross-entropy method.
+
+    Each of five rounds draws hypotheses from a normal distribution, at first the prior, and fits the distribution to
+    the best tenth.
+    """
+    rng, parameters = np.random.default_rng(seed), problem.parameters
+    at = problem.begin(np.zeros(parameters.size), noise)
+    mean, std, none = at.x, parameters.std.copy(), np.zeros((1, samples, problem.predictor.nx))
+    best = at.x
+    for number in range(5):
+        xs = np.clip(mean + std * rng.standard_normal((samples, len(mean))), parameters.low, parameters.high)
+        xs[0] = best
+        costs = problem.costs(at, xs, none).sum(axis=0) + problem.prior(xs)
+        elites = xs[np.argsort(costs)[: max(4, samples // 10)]]
+        best, mean, std = elites[0], elites.mean(axis=0), np.maximum(elites.std(axis=0), 0.02 * parameters.std)
+        report(number, float(costs.min()))
+    return best

@@ -1,0 +1,260 @@
+"""Describe what a fit may change: model fields, delays, and the gains and biases of sensors."""
+
+import copy
+import dataclasses
+import fnmatch
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.core import NOT_NEGATIVE, VARYING_FIELDS, element_names, elements
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import did_you_mean
+from lyceum_warp.support.validate import finite_number
+
+_NAME = re.compile(r"(?P<field>[a-z0-9_]+)\.(?P<pattern>.+?)(?:\[(?P<column>\d+)\])?")
+_SERVO = {"kp": (("actuator_gainprm", 0), ("actuator_biasprm", 1)), "kd": (("actuator_biasprm", 2),)}
+_SIGNALS = {"delay": (0.0, 0.02, 0.0, 0.05), "gain": (1.0, 0.1, 0.1, 10.0), "bias": (0.0, 0.02, -np.inf, np.inf)}
+"""The nominal value, the prior's deviation and the bounds of parameters of signals."""
+_SIGNED = {"body_ipos": 0.02, "body_pos": 0.01, "geom_pos": 0.01, "site_pos": 0.01, "jnt_pos": 0.01, "qpos_spring": 0.1}
+"""Fields whose columns are shifted apart, with the prior's deviation of the shift."""
+_FROM_ZERO = {"dof_armature": 0.02, "dof_damping": 0.5, "dof_frictionloss": 0.5, "jnt_stiffness": 1.0}
+"""The prior's deviation of fields whose nominal value is 0."""
+_FACTOR, _RANGE, _INERTIA = 0.5, 10.0, 0.2
+_INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """Something that ``lw.fit`` changes to explain a log.
+
+    ``name`` is FIELD.ELEMENTS or FIELD.ELEMENTS[COLUMN], as "dof_damping.*_knee" or "geom_friction.foot[0]". ELEMENTS
+    are names of elements, separated by commas, and may have the wildcards of a shell.
+
+    =======================  ==========================================================================================
+    a model field            one factor for all elements; a field that is 0 grows from 0; positions shift, in m
+    ``body_mass``            one factor for masses and inertias
+    ``kp``, ``kd``           one factor for the gains of position servos
+    ``inertia``              mass, centre of mass and inertia of each body, ten numbers that stay physical
+    ``delay``                seconds from a control to its effect (``delay.ctrl.*``) or from a motion to its measurement
+                             (``delay.qvel.*``)
+    ``gain``, ``bias``       a logged number is gain * value + bias, for controls and measurements
+    =======================  ==========================================================================================
+
+    Factors have a normal prior of the logarithm around 0, and all others a normal prior around the nominal value.
+    """
+
+    name: str
+    each: bool = False
+    """Whether each element gets a parameter of its own."""
+    prior: float | None = None
+    """Standard deviation of the prior: of a factor's logarithm, or in the field's units. The default depends on the
+    field; for factors, it is 0.5."""
+    low: float | None = None
+    """Least factor or value."""
+    high: float | None = None
+    """Greatest factor or value."""
+
+    def __post_init__(self) -> None:
+        if _NAME.fullmatch(str(self.name)) is None:
+            raise ValueError(f"the parameter {self.name!r} must be FIELD.ELEMENTS, as in 'dof_damping.*'")
+        for name in ("prior", "low", "high"):
+            if getattr(self, name) is not None:
+                finite_number(f"{name} of {self.name}", getattr(self, name), low=1e-12 if name == "prior" else -np.inf)
+
+
+@dataclasses.dataclass(frozen=True)
+class Coordinate:
+    """One number that the fit changes. It is 0 at the nominal value."""
+
+    name: str
+    kind: str
+    """"factor" (a logarithm), "shift", "inertia", or a key of ``_SIGNALS``."""
+    std: float
+    low: float
+    high: float
+    writes: tuple[tuple[str, np.ndarray, np.ndarray], ...] = ()
+    """Fields, the flat indices in them, and the directions of shifts."""
+    signals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    """Indices of controls, and of columns of the log after them."""
+    body: int = 0
+
+    def value(self, x: Any) -> Any:
+        """Convert coordinates to factors or values."""
+        return np.exp(x) if self.kind == "factor" else x + (self.kind == "gain")
+
+
+class Parameters:
+    """The coordinates of a fit, bound to a model and to the columns of a log."""
+
+    def __init__(
+        self, parameters: Iterable[Parameter | str], model: mujoco.MjModel, columns: Sequence[str] = ()
+    ) -> None:
+        self.nominal, self._data = model, mujoco.MjData(model)
+        self._count = model.nu + len(columns)
+        known = {f"ctrl.{name}": elements(model, "ctrl", name) for name in element_names(model, "ctrl")}
+        self.actuators = {name.removeprefix("ctrl."): part.start for name, part in known.items()}
+        """Index of the first control of each actuator."""
+        self._signals = {name: range(part.start, part.stop) for name, part in known.items()} | {
+            name: range(model.nu + i, model.nu + i + 1) for i, name in enumerate(columns)
+        }
+        self.coordinates: list[Coordinate] = []
+        self.touched: dict[str, set[str]] = {}
+        """The names of the elements that the fit changes, by field."""
+        for given in parameters:
+            self._add(Parameter(name=given) if isinstance(given, str) else given)
+        if not self.coordinates:
+            raise ValueError("there is nothing to fit: pass parameters, as in ['dof_damping.*', 'delay.ctrl.*']")
+        names = [coordinate.name for coordinate in self.coordinates]
+        if len(set(names)) < len(names):
+            raise ValueError(f"the parameter {max(names, key=names.count)!r} is given twice")
+        self.names, self.size = names, len(names)
+        self.std, self.low, self.high = (
+            np.array([getattr(c, name) for c in self.coordinates]) for name in ("std", "low", "high")
+        )
+
+    def _add(self, given: Parameter) -> None:
+        match = _NAME.fullmatch(given.name)
+        assert match is not None
+        field, known = match["field"], (*VARYING_FIELDS, *_SERVO, *_SIGNALS, "inertia")
+        if field not in known:
+            raise ValueError(f"the parameter {given.name!r} can't be fitted: {did_you_mean(field, known)}")
+        own = {"inertia": "body_mass", **dict.fromkeys(_SERVO, "actuator_gainprm")}.get(field, field)
+        names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, own)
+        wanted = match["pattern"].split(",")
+        for pattern in wanted:
+            if not fnmatch.filter(names, pattern):
+                hint = did_you_mean(pattern, names, f"it has {', '.join(names) or 'none with names'}")
+                raise ValueError(f"the parameter {given.name!r} fits no element of the model or the log: {hint}")
+        names = [name for name in names if any(fnmatch.fnmatchcase(name, pattern) for pattern in wanted)]
+        apart = given.each or field == "inertia"
+        for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
+            if field in _SIGNALS:
+                places = np.concatenate([self._signals[name] for name in members])
+                nominal, std, low, high = _SIGNALS[field]
+                self._append(given, f"{field}.{label}", field, std, low - nominal, high - nominal, signals=places)
+            elif field == "inertia":
+                self._touch(_INERTIAL, members)
+                body = elements(self.nominal, own, label).start
+                self._factor(body)
+                for k in range(10):
+                    self._append(given, f"inertia.{label}[{k}]", field, _INERTIA, -np.inf, np.inf, body=body)
+            else:
+                self._add_field(given, field, label, members, None if match["column"] is None else int(match["column"]))
+
+    def _add_field(self, given: Parameter, field: str, label: str, names: list[str], column: int | None) -> None:
+        pairs = _SERVO.get(field, ((field, column), *((("body_inertia", None),) if field == "body_mass" else ())))
+        self._touch([name for name, _ in pairs], names)
+        rows = np.asarray(getattr(self.nominal, pairs[0][0]))
+        width = rows.size // max(1, len(rows))
+        if column is not None and column >= width:
+            raise ValueError(f"the parameter {given.name!r} is out of range: {field} has {width} columns")
+        places = [(name, self._indices(name, names, k)) for name, k in pairs]
+        if field in _SIGNED:
+            for k in range(width) if column is None else [column]:
+                place = self._indices(field, names, k)
+                whole = f"{field}.{label}" + (f"[{k}]" if width > 1 else "")
+                shift = ((field, place, np.ones(len(place))),)
+                self._append(given, whole, "shift", _SIGNED[field], -np.inf, np.inf, writes=shift)
+            return
+        whole = f"{field}.{label}" + ("" if column is None else f"[{column}]")
+        writes: Any = [(name, place, np.full(len(place), -1.0 if name == "actuator_biasprm" else 1.0))
+                       for name, place in places]  # fmt: skip
+        if any(np.ravel(getattr(self.nominal, name))[place].any() for name, place in places):
+            self._append(given, whole, "factor", _FACTOR, -np.log(_RANGE), np.log(_RANGE), writes=writes)
+        else:
+            least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
+            self._append(given, whole, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
+
+    def _append(self, given: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any) -> None:
+        into: Callable[[float], float] = np.log if kind == "factor" else lambda value: value - (kind == "gain")
+        if kind == "factor" and min(given.low or 1.0, given.high or 1.0) <= 0.0:
+            raise ValueError(f"the bounds of {given.name!r} are factors of the nominal value, and must be positive")
+        low = low if given.low is None else float(into(given.low))
+        high = high if given.high is None else float(into(given.high))
+        if not low <= 0.0 <= high or low == high:
+            raise ValueError(f"the bounds of {given.name!r} must lie around the nominal value")
+        self.coordinates.append(Coordinate(name, kind, given.prior or std, low, high, **more))
+
+    def _touch(self, fields: Iterable[str], names: Iterable[str]) -> None:
+        for field in fields:
+            self.touched.setdefault(field, set()).update(names)
+
+    def _indices(self, field: str, names: list[str], column: int | None) -> np.ndarray:
+        values = np.asarray(getattr(self.nominal, field))
+        grid = np.arange(values.size).reshape(len(values), -1)
+        rows = np.concatenate([grid[elements(self.nominal, field, name)] for name in names])
+        return rows.ravel() if column is None else rows[:, column]
+
+    def _factor(self, body: int) -> np.ndarray:
+        """Get the Cholesky factor of a body's pseudo-inertia."""
+        try:
+            return np.linalg.cholesky(_pseudo_inertia(self.nominal, body))
+        except np.linalg.LinAlgError:
+            name = self.nominal.body(body).name
+            raise ValueError(f"the body {name!r} has no physical inertia: fit its body_mass, or correct it") from None
+
+    def model(self, x: np.ndarray) -> mujoco.MjModel:
+        """Make the model of a hypothesis."""
+        if not any((c.writes or c.kind == "inertia") and x[i] != 0.0 for i, c in enumerate(self.coordinates)):
+            return self.nominal
+        model = copy.copy(self.nominal)
+        bodies: dict[int, list[float]] = {}
+        for value, coordinate in zip(x, self.coordinates, strict=True):
+            if coordinate.kind == "inertia":
+                bodies.setdefault(coordinate.body, []).append(value)
+            for field, places, direction in coordinate.writes:
+                flat = np.reshape(getattr(model, field), -1)
+                new = flat[places] * np.exp(value) if coordinate.kind == "factor" else flat[places] + direction * value
+                flat[places] = new
+        for body, numbers in bodies.items():
+            turn = np.diag(np.exp(numbers[:4]))
+            turn[np.tril_indices(4, -1)] = numbers[4:]
+            root = self._factor(body) @ turn
+            _set_inertia(model, body, root @ root.T)
+        mujoco.mj_setConst(model, self._data)
+        return model
+
+    def signals(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Get delay, gain and bias of each control and then of each column of the log."""
+        values = {kind: np.full(self._count, nominal) for kind, (nominal, *_) in _SIGNALS.items()}
+        for value, coordinate in zip(x, self.coordinates, strict=True):
+            if coordinate.kind in values:
+                values[coordinate.kind][coordinate.signals] += value
+        return values
+
+    @property
+    def longest_delays(self) -> np.ndarray:
+        """The greatest delay of each control and column that the bounds allow."""
+        return self.signals(np.where(np.isfinite(self.high), self.high, 0.0))["delay"]
+
+    def fields(self, model: mujoco.MjModel) -> dict[str, dict[str, list[Any]]]:
+        """Get the rows of a model that the fit changes, by field and element."""
+        return {
+            field: {name: getattr(model, field)[elements(model, field, name)].tolist() for name in sorted(names)}
+            for field, names in self.touched.items()
+        }
+
+
+def _pseudo_inertia(model: mujoco.MjModel, body: int) -> np.ndarray:
+    """Compute the pseudo-inertia (Wensing et al., 2018), (4, 4): second and first moments of mass, and the mass."""
+    flat = np.zeros(9)
+    mujoco.mju_quat2Mat(flat, model.body_iquat[body])
+    turn = flat.reshape(3, 3)
+    inertia, mass, centre = model.body_inertia[body], model.body_mass[body], model.body_ipos[body]
+    moments = turn @ np.diag(0.5 * inertia.sum() - inertia) @ turn.T + mass * np.outer(centre, centre)
+    return np.block([[moments, mass * centre[:, None]], [mass * centre[None], np.full((1, 1), mass)]])
+
+
+def _set_inertia(model: mujoco.MjModel, body: int, pseudo: np.ndarray) -> None:
+    mass = pseudo[3, 3]
+    centre = pseudo[:3, 3] / mass
+    moments, axes = np.linalg.eigh(pseudo[:3, :3] - mass * np.outer(centre, centre))
+    axes[:, 0] *= np.sign(np.linalg.det(axes))
+    model.body_mass[body], model.body_ipos[body] = mass, centre
+    model.body_inertia[body] = moments.sum() - moments
+    mujoco.mju_mat2Quat(model.body_iquat[body], np.ascontiguousarray(axes).ravel())

@@ -1,0 +1,249 @@
+"""Cut a log into windows, guess their initial states, and predict what each window measured."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+
+from lyceum_warp.fitting.log import Column, Log
+from lyceum_warp.fitting.parameters import Parameters
+
+Signals: TypeAlias = dict[str, np.ndarray]
+"""Delay, gain and bias of each control, and then of each column of the log."""
+WORLDS = 1024
+"""Worlds of a batch. More would only take more memory."""
+_STATE = mujoco.mjtState.mjSTATE_QPOS.value | mujoco.mjtState.mjSTATE_QVEL.value | mujoco.mjtState.mjSTATE_ACT.value
+_QUATERNION = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
+"""Numbers of position before the quaternion, by the type of joint."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Windows:
+    """Short parts of a log. Each is predicted from its own initial state, so that chaos can't build up."""
+
+    take: np.ndarray
+    """Indices of the takes, (windows,)."""
+    begin: np.ndarray
+    """Time at which each window begins, (windows,)."""
+    steps: int
+    """Substeps of a window."""
+    time: np.ndarray
+    """Times of the samples since the window's beginning in substeps, (windows, samples)."""
+    measured: np.ndarray
+    """(windows, samples, columns); NaN for a missing number."""
+
+    def __len__(self) -> int:
+        return len(self.take)
+
+    def chosen(self, which: Any) -> "Windows":
+        """Select windows."""
+        arrays = ("take", "begin", "time", "measured")
+        return dataclasses.replace(self, **{name: getattr(self, name)[which] for name in arrays})
+
+
+def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
+    """Cut a log into windows that begin at samples.
+
+    Raises:
+        ValueError: No take is as long as a window.
+    """
+    model = parameters.nominal
+    step, steps = model.opt.timestep, max(2, round(seconds / model.opt.timestep))
+    lead = parameters.longest_delays[model.nu :] / step
+    rows: list[tuple[Any, ...]] = []
+    for number, take in enumerate(log.takes):
+        begin = take.time[0]
+        while begin + steps * step <= take.time[-1] + 1e-6:
+            # a record holds the state before each substep
+            inside = np.flatnonzero((take.time > begin - 1e-6) & (take.time < begin + (steps - 1) * step + 1e-6))
+            time = (take.time[inside] - begin) / step
+            rows.append((number, begin, time, np.where(time[:, None] < lead - 1e-6, np.nan, take.measured[inside])))
+            begin = take.time[np.searchsorted(take.time, begin + steps * step - 1e-6)]
+    if not rows:
+        raise ValueError(
+            f"no take of the log has the {seconds:g} s of a window: record longer takes, or shorten the window"
+        )
+    most = max(len(row[2]) for row in rows)
+    time, measured = np.zeros((len(rows), most)), np.full((len(rows), most, len(log.columns)), np.nan)
+    for i, row in enumerate(rows):
+        time[i, : len(row[2])], measured[i, : len(row[2])] = row[2:]
+    return Windows(np.array([row[0] for row in rows]), np.array([row[1] for row in rows]), steps, time, measured)
+
+
+class Predictor:
+    """Predicts the measurements of windows under hypotheses, in worlds of the C engine in float64."""
+
+    def __init__(self, log: Log, parameters: Parameters, *, nthread: int = 0) -> None:
+        self.log, self.parameters, self.model, self.nthread = log, parameters, parameters.nominal, nthread
+        self.nx = 2 * self.model.nv + self.model.na
+        """Numbers by which an initial state may differ from another: positions, velocities and activations."""
+        self.sources = {name: [(i, c.index) for i, c in enumerate(log.columns) if c.field == name]
+                        for name in dict.fromkeys(column.field for column in log.columns)}  # fmt: skip
+        self.quats = _quaternions(log.columns, self.model)
+        self._record = [_STATE, *(name for name in self.sources if name in ("sensordata", "actuator_force"))]
+        self._batches: dict[int, Batch] = {}
+        self._data = mujoco.MjData(self.model)
+        self.substeps = 0
+        """Substeps of all worlds so far."""
+
+    def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
+        """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
+
+        The result has less noise than the measurements, obeys the contacts, and fills what was not measured.
+
+        Args:
+            windows: The windows.
+            x: Coordinates of the parameters.
+            memory: Seconds in which the simulation forgets its own state. A long memory suits a good model.
+
+        Returns:
+            qpos, qvel and act, (windows, nq + nv + na).
+        """
+        model, signals, data = self.parameters.model(x), self.parameters.signals(x), self._data
+        step, states = model.opt.timestep, np.empty((len(windows), model.nq + model.nv + model.na))
+        gain, bias = (signals[name][model.nu :] for name in ("gain", "bias"))
+        columns = {name: np.array(self.sources.get(name, []), dtype=int).reshape(-1, 2).T for name in ("qpos", "qvel")}
+        # velocities that are not measured follow from positions
+        change, derived = np.zeros(model.nv), ~np.isin(np.arange(model.nv), columns["qvel"][1])
+        for number in np.unique(windows.take):
+            take, members = self.log.takes[number], np.flatnonzero(windows.take == number)
+            steps = round((windows.begin[members[-1]] - take.time[0]) / step) + 1
+            whole = dataclasses.replace(windows.chosen(members[:1]), begin=take.time[:1], steps=steps)
+            controls, measured = self.controls(whole, signals)[0], (take.measured - bias) / gain
+            mujoco.mj_resetData(model, data)
+            if model.nkey:
+                data.qpos[:] = model.key_qpos[0]
+            begins = {round((windows.begin[i] - take.time[0]) / step): i for i in members}
+            sample, last = 0, -np.inf
+            for k in range(steps):
+                now = take.time[0] + k * step
+                while sample < len(take.time) and take.time[sample] < now + 0.5 * step:
+                    pull = 1.0 - np.exp(-(take.time[sample] - last) / memory)
+                    for name, part in (("qpos", data.qpos.copy()), ("qvel", data.qvel.copy())):
+                        source, places = columns[name]
+                        part[places] = np.where(np.isnan(seen := measured[sample, source]), part[places], seen)
+                        if name == "qvel":
+                            data.qvel += pull * (part - data.qvel)
+                            continue
+                        mujoco.mj_normalizeQuat(model, part)
+                        mujoco.mj_differentiatePos(model, change, pull, data.qpos, part)
+                        data.qvel += 0.5 * derived * change / memory
+                        mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
+                    last, sample = take.time[sample], sample + 1
+                if k in begins:
+                    states[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
+                data.ctrl[:] = controls[k]
+                mujoco.mj_step(model, data)
+            self.substeps += steps
+        return states
+
+    def predict(self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Compute predictions minus measurements.
+
+        Args:
+            windows: The windows.
+            states: Initial states, (windows, nq + nv + na).
+            xs: Hypotheses: coordinates of the parameters, (hypotheses, parameters).
+            changes: Changes of the initial states, (1 or windows, hypotheses, nx).
+
+        Returns:
+            (windows, hypotheses, samples, columns). Missing numbers are 0, and those of diverged worlds are infinite.
+        """
+        count, signals = len(xs), [self.parameters.signals(x) for x in xs]
+        batch = self._batch(len(windows) * count)
+        batch.set_models([self.parameters.model(x) for x in xs] * len(windows))
+        batch.warning[:] = 0
+        batch.state[:] = 0.0
+        shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
+        initial = self.moved(np.repeat(states, count, axis=0), shifts)
+        edges = [self.model.nq, self.model.nq + self.model.nv]
+        for name, part in zip(("qpos", "qvel", "act"), np.split(initial, edges, axis=1), strict=True):
+            batch.bind(name)[...] = part
+        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
+        controls = controls.reshape(-1, windows.steps, self.model.nu)
+        self.substeps += len(initial) * windows.steps
+        bad = np.zeros(len(initial), bool)
+        try:
+            records = batch.rollout(windows.steps, controls, record=self._record)
+        except SimulationError as error:  # a hypothesis may be absurd; the other worlds went on
+            records = batch.rollout(windows.steps, controls, record=self._record)
+            bad[error.ids] = True
+        bad |= batch.warning[:, :, 1].any(axis=1)
+        rolled = np.concatenate([initial[:, None], records[_STATE][:, :-1]], axis=1)
+        predicted = np.empty((*rolled.shape[:2], len(self.log.columns)))
+        for name, pairs in self.sources.items():
+            offset = {"qpos": 0, "qvel": edges[0], "act": edges[1]}.get(name)
+            source = rolled if offset is not None else records[name].reshape(*rolled.shape[:2], -1)
+            columns, indices = np.array(pairs).T
+            predicted[..., columns] = source[..., indices + (offset or 0)]
+        predicted[bad] = np.inf
+        return self._compared(windows, predicted.reshape(len(windows), count, windows.steps, -1), signals)
+
+    def moved(self, states: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Add changes (n, nx) to states (n, nq + nv + na)."""
+        nq, nv, result = self.model.nq, self.model.nv, states.copy()
+        result[:, nq:] += changes[:, nv:]
+        for row, change in zip(result, changes, strict=True):
+            position = row[:nq].copy()
+            mujoco.mj_integratePos(self.model, position, np.ascontiguousarray(change[:nv]), 1.0)
+            row[:nq] = position
+        return result
+
+    def controls(self, windows: Windows, signals: Signals) -> np.ndarray:
+        """Compute the mean of the delayed controls over every substep, (windows, steps, nu)."""
+        nu, step = self.model.nu, self.model.opt.timestep
+        delay, gain, bias = (signals[name][:nu] for name in ("delay", "gain", "bias"))
+        means = np.empty((len(windows), windows.steps, nu))
+        for number in np.unique(windows.take):
+            take, members = self.log.takes[number], windows.take == number
+            # the first and the last control hold before and after the take
+            time = np.concatenate([take.time[:1] - 10.0, take.time, take.time[-1:] + 10.0])
+            pieces = np.diff(time)[:, None] * np.concatenate([take.control[:1], take.control])
+            integral = np.concatenate([np.zeros((1, nu)), np.cumsum(pieces, axis=0)])
+            edges = windows.begin[members, None] + step * np.arange(windows.steps + 1)
+            for i in range(nu):
+                means[members, :, i] = np.diff(np.interp(edges - delay[i], time, integral[:, i]), axis=1) / step
+        return (means - bias) / gain
+
+    def _compared(self, windows: Windows, predicted: np.ndarray, signals: Sequence[Signals]) -> np.ndarray:
+        """Interpolate predictions at the times of the samples, and subtract the measurements."""
+        delay, gain, bias = (np.stack([signal[name][self.model.nu :] for signal in signals])[:, None]
+                             for name in ("delay", "gain", "bias"))  # fmt: skip
+        place = windows.time[:, None, :, None] - delay / self.model.opt.timestep
+        place = np.clip(place, 0.0, windows.steps - 1.0)
+        low = np.minimum(place.astype(int), windows.steps - 2)
+        early, late = (np.take_along_axis(predicted, low + k, axis=2) for k in (0, 1))
+        with np.errstate(invalid="ignore"):
+            values = gain * (early + (place - low) * (late - early)) + bias
+            measured = windows.measured[:, None]
+            difference = values - measured
+            for quat in self.quats:
+                difference[..., quat] = _turn(values[..., quat], measured[..., quat])
+            return np.where(np.isnan(measured), 0.0, np.where(np.isfinite(difference), difference, np.inf))
+
+    def _batch(self, worlds: int) -> Batch:
+        if worlds not in self._batches:
+            self._batches = {key: batch for key, batch in self._batches.items() if len(self._batches) < 4}
+            self._batches[worlds] = Batch(self.model, worlds, self.nthread)
+        return self._batches[worlds]
+
+
+def _quaternions(columns: Sequence[Column], model: mujoco.MjModel) -> list[list[int]]:
+    """Find the columns that are whole quaternions."""
+    found = {(column.field, column.index): i for i, column in enumerate(columns)}
+    joints = zip(map(mujoco.mjtJoint, model.jnt_type), model.jnt_qposadr.tolist(), strict=True)
+    starts = [("qpos", address + _QUATERNION[kind]) for kind, address in joints if kind in _QUATERNION]
+    sensors = np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_FRAMEQUAT)
+    groups = [[(name, start + k) for k in range(4)]
+              for name, start in [*starts, *(("sensordata", int(model.sensor_adr[i])) for i in sensors)]]  # fmt: skip
+    return [[found[key] for key in group] for group in groups if all(key in found for key in group)]
+
+
+def _turn(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Compute the rotation from measured to predicted quaternions as a vector in rad, and a zero, (..., 4)."""
+    w, v, a, u = predicted[..., :1], predicted[..., 1:], measured[..., :1], measured[..., 1:]
+    real, turn = w * a + (v * u).sum(-1, keepdims=True), a * v - w * u - np.cross(u, v)
+    return np.concatenate([2.0 * turn / np.where(real == 0.0, 1.0, real), np.zeros_like(real)], axis=-1)

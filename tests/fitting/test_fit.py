@@ -1,0 +1,144 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+from hidden_robots import ARM, HOPPING, log_of
+
+import lyceum_warp as lw
+from lyceum_warp.fitting import Fit
+
+TRUTH = {
+    "kp.shoulder": 0.2, "kp.elbow": -0.2, "kd.*": 0.15, "dof_armature.*": 0.25, "body_mass.lower": -0.25,
+    "body_ipos.lower[2]": 0.02, "delay.ctrl.*": 0.012,
+}  # fmt: skip
+PARAMETERS = list(TRUTH)
+
+
+def controls(seconds: float, seed: int = 0) -> np.ndarray:
+    kinds = [lw.excitation([-0.8] * 2, [0.8] * 2, kind, seconds=seconds / 2, rate=100, seed=seed, frequencies=(0.3, 4))
+             for kind in ("chirp", "steps")]  # fmt: skip
+    return np.concatenate(kinds)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Fit, dict[str, Any], Path]:
+    log = log_of(ARM, PARAMETERS, TRUTH, controls(5.0))
+    folder = tmp_path_factory.mktemp("fit")
+    fit = lw.fit(mujoco.MjSpec.from_string(ARM), log, PARAMETERS, out=folder, samples=8, nthread=1)
+    return fit, log, folder
+
+
+def coordinates(fit: Fit, values: np.ndarray) -> dict[str, float]:
+    return {
+        name: float(np.log(value) if kind == "factor" else value)
+        for name, kind, value in zip(fit.names, fit.kinds, values, strict=True)
+    }
+
+
+def test_fit_recovers_a_hidden_arm(arm: tuple[Fit, dict[str, Any], Path]) -> None:
+    fit, _, _ = arm
+    for name, x in coordinates(fit, fit.value).items():
+        assert abs(x - TRUTH[name]) < (0.001 if name.startswith("delay") else 0.02), name
+    low, high = coordinates(fit, fit.low), coordinates(fit, fit.high)
+    covered = [low[name] <= TRUTH[name] <= high[name] for name in fit.names]
+    assert sum(covered) >= len(covered) - 1  # 95 % intervals
+    assert fit.determined.all() and not fit.directions
+    assert fit.noise["qpos"] == pytest.approx(0.002, rel=0.1) and fit.noise["qvel"] == pytest.approx(0.05, rel=0.1)
+    assert fit.held_out[1] < 1.1 < 3.0 < fit.held_out[0]
+
+
+def test_fit_writes_a_folder_with_a_page(arm: tuple[Fit, dict[str, Any], Path]) -> None:
+    fit, _, folder = arm
+    content = json.loads((folder / "fit.json").read_text())
+    assert content["names"] == PARAMETERS and content["delays"].keys() == {"shoulder", "elbow"}
+    with np.load(folder / "residuals.npz") as file:
+        assert file["residuals"].shape[2] == 4 and len(file["columns"]) == 4
+    page = (folder / "report.html").read_text()
+    assert "kp.shoulder" in page and page.count("data:image/png") == 2
+    assert fit.table.count("\n") == len(PARAMETERS) - 1
+
+
+def test_finished_fit_resumes_without_further_steps(arm: tuple[Fit, dict[str, Any], Path]) -> None:
+    fit, log, folder = arm
+    stages: list[str] = []
+    again = lw.fit(
+        mujoco.MjSpec.from_string(ARM), log, PARAMETERS, out=folder, resume=True, iterations=1, nthread=1,
+        progress=lambda stage, k, cost: stages.append(stage),
+    )  # fmt: skip
+    assert not stages and np.array_equal(again.value, fit.value)
+    with pytest.raises(ValueError, match="belongs to another log, model or parameters"):
+        lw.fit(mujoco.MjSpec.from_string(ARM), log, PARAMETERS[1:], out=folder, resume=True, samples=0, nthread=1)
+
+
+def test_parameters_that_a_log_cannot_tell_apart_are_named() -> None:
+    # below the servo's limit, its kd and the joint's damping both multiply the velocity
+    log = log_of(ARM, ["kd.shoulder"], {}, lw.excitation([-0.2] * 2, [0.2] * 2, seconds=4.0, rate=100))
+    names = ["kd.shoulder", "dof_damping.shoulder"]
+    fit = lw.fit(mujoco.MjSpec.from_string(ARM), log, names, samples=0, nthread=1, iterations=6)
+    assert [set(direction) for direction in fit.directions] == [set(names)]
+
+
+def test_held_out_error_tells_a_delayed_servo_from_an_ideal_one() -> None:
+    spec, delayed = (
+        mujoco.MjSpec.from_string(ARM),
+        log_of(ARM, ["delay.ctrl.*"], {"delay.ctrl.*": 0.013}, controls(3.0)),
+    )
+    noise = {"qpos": 0.002, "qvel": 0.05}
+    without, with_delay = (
+        lw.fit(spec, delayed, names, samples=0, nthread=1, iterations=6, noise=noise)
+        for names in (["kp.*", "kd.*"], ["kp.*", "kd.*", "delay.ctrl.*"])
+    )
+    assert with_delay.held_out[1] < 1.1 < 1.3 < without.held_out[1]
+    assert with_delay.delays["elbow"] == pytest.approx(0.013, abs=5e-4)
+    ideal = lw.fit(
+        spec, log_of(ARM, ["kp.*"], {}, controls(3.0)), ["kp.*", "delay.ctrl.*"], samples=0, nthread=1, noise=noise
+    )
+    assert ideal.low[1] == 0.0 and ideal.high[1] < 1e-3
+
+
+def test_windows_with_contacts_determine_mass_and_gain() -> None:
+    names = ["kp.leg", "body_mass.body"]
+    truth = {"kp.leg": 0.2, "body_mass.body": -0.2}
+    control = lw.excitation([-0.05], [0.08], "walk", seconds=4.0, rate=100, frequencies=(0.1, 8.0))
+    log = log_of(HOPPING, names, truth, control, noise=0.3)
+    fit = lw.fit(mujoco.MjSpec.from_string(HOPPING), log, names, samples=0, nthread=1, window=0.1, iterations=10)
+    for name, x in coordinates(fit, fit.value).items():
+        assert abs(x - truth[name]) < 0.03, name
+
+
+def test_outliers_hardly_move_a_fit() -> None:
+    log = log_of(ARM, ["kp.*"], {"kp.*": 0.2}, controls(3.0))
+    rng = np.random.default_rng(0)
+    spikes = rng.random(log["qpos"].shape) < 0.01
+    log["qpos"] = log["qpos"] + spikes * rng.choice([-0.5, 0.5], spikes.shape)
+    fit = lw.fit(mujoco.MjSpec.from_string(ARM), log, ["kp.*"], samples=0, nthread=1)
+    assert np.log(fit.value[0]) == pytest.approx(0.2, abs=0.01)
+
+
+def test_bias_and_lateness_of_sensors_with_missing_samples_are_fitted() -> None:
+    log = log_of(ARM, ["kp.*"], {"kp.*": 0.1}, controls(4.0))
+    (shoulder, elbow), time = log.pop("qpos").T, log["time"]
+    elbow[np.random.default_rng(1).random(len(elbow)) < 0.2] = np.nan
+    late = np.stack([np.interp(time - 0.008, time, column) for column in log["qvel"].T], axis=1)
+    late[::2] = np.nan  # a sensor of half the rate
+    log |= {"qpos.shoulder": shoulder + 0.03, "qpos.elbow": elbow, "qvel": late}
+    names = ["kp.*", "bias.qpos.shoulder", lw.Parameter(name="delay.qvel*", high=0.02)]
+    fit = lw.fit(mujoco.MjSpec.from_string(ARM), log, names, samples=0, nthread=1)
+    assert np.log(fit.value[0]) == pytest.approx(0.1, abs=0.01)
+    assert fit.value[1] == pytest.approx(0.03, abs=0.002)
+    assert fit.value[2] == pytest.approx(0.008, abs=0.001)
+
+
+def test_robot_that_hangs_is_fitted_without_its_base() -> None:
+    spec = mujoco.MjSpec.from_string(HOPPING)
+    spec.delete(spec.joint("base"))
+    spec.delete(spec.geom("floor"))
+    control = lw.excitation([-0.08], [0.08], "walk", seconds=3.0, rate=100, frequencies=(0.1, 8.0))
+    log = log_of(spec.to_xml(), ["kp.leg"], {"kp.leg": 0.3}, control, noise=0.3)
+    hopping = mujoco.MjSpec.from_string(HOPPING)
+    fit = lw.fit(hopping, log, ["kp.leg", "dof_damping.leg"], hangs=True, samples=0, nthread=1)
+    assert np.log(fit.value[0]) == pytest.approx(0.3, abs=0.02)
+    assert fit.value[1] == pytest.approx(1.0, abs=0.1)
