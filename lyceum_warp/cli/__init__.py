@@ -28,6 +28,7 @@ _COMMANDS = {
     "report": ("report", "Write a page on a run: settings, curves, verdicts and an episode."),
     "gate": ("gate", "Test whether a run's policy passes the gate of its task, such as whether a robot walks."),
     "export": ("export", "Write a run's policy to an ONNX or .pt2 file."),
+    "fit": ("fit", "Fit a model to a robot's log, and say what the log determines."),
     "plan": ("plan", "Control a task with a planner, and report rewards, success and planning times."),
     "tune": ("tune", "Find the fastest physics options that do not change a task's returns."),
     "view": ("view", "Show a task, a policy, a planner or saved episodes in a browser."),

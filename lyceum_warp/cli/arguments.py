@@ -111,7 +111,9 @@ class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     engine is auto, because the CPU is faster for a few worlds."""
 
 
-class EnvFlags(Placement, options=[EnvOptions], omit=(*NO_FLAGS, "engine", "device", "nthread")):
+class EnvFlags(
+    Placement, options=[EnvOptions], omit=(*NO_FLAGS, "engine", "device", "nthread", "fitted", "fitted_draws")
+):
     """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 
 

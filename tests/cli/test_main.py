@@ -24,6 +24,7 @@ COMMANDS = (
     "sweep",
     "eval",
     "export",
+    "fit",
     "plan",
     "tune",
     "view",

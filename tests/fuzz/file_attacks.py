@@ -100,6 +100,8 @@ KINDS = {
     "kept table": Kind("kept/task/tables/motion.npy", _table, ("eval kept",)),
     "model.xml": Kind("model.xml", mutations.mutated_xml, ("make", "new"), ("the task 'tiny'",)),
     "task.py": Kind("slide.py", mutations.mutated_task, ("make file", "check"), ("the task 'tiny'",)),
+    "fit.json": Kind("fit/fit.json", mutations.mutated_json, ("fitted",), ("the task 'tiny'",)),
+    "log.csv": Kind("log.csv", mutations.mutated_csv, ("log",), ("the column", "times", "the log", "window")),
     "table.npy": Kind("table.npy", _table, ("table",)),
     "clip.npz": Kind("clips/clip.npz", functools.partial(_episode, main="joint_pos"), ("clips",)),
     "clip.csv": Kind("clips/clip.csv", mutations.mutated_csv, ("clips",)),
@@ -154,6 +156,8 @@ READERS: dict[str, Callable[[], object]] = {
     "new": lambda: command("new", "case/my_new_task", "--model", CASE / "model.xml"),
     "make file": lambda: lw.make(CASE / "slide.py").step(),
     "check": lambda: command("check", CASE / "slide.py", "--nworld", 2, "--steps", 2, "--rule", "reset"),
+    "fitted": lambda: lw.make(SLIDE_PY, fitted=CASE / "fit", fitted_draws=True).step(),
+    "log": lambda: lw.fit(CASE / "model.xml", CASE / "log.csv", ["delay.ctrl.*"], samples=0, iterations=1, nthread=1),
     "table": lambda: lw.make(SLIDE_PY, motion=CASE / "table.npy").step(),
     "sweep": lambda: _sweep(CASE / "sweep.toml"),
     "clips": lambda: lw.load_clips(CASE / "clips", go1()),
@@ -262,6 +266,17 @@ def _make(folder: Path) -> None:
     write_csv(folder / "clips/clip.csv", qpos)
     write_pickle(folder / "clips/clip.pkl", qpos, 50.0)
     np.save(folder / "table.npy", np.linspace(0.0, 1.0, 80, dtype=np.float32).reshape(40, 2))
+    times = 0.01 * np.arange(60)
+    control = np.sin(9.0 * times)
+    rows = np.stack([times, control, 0.1 * np.sin(8.0 * times), 0.1 * np.cos(7.0 * times)], axis=1).round(4)
+    names = ["ctrl.push", "qpos.hinge", "qvel.hinge"]
+    (folder / "log.csv").write_text("\n".join(",".join(map(str, row)) for row in [["time", *names], *rows.tolist()]))
+    (folder / "fit").mkdir()
+    fields = {"dof_damping": {"hinge": [0.1]}}
+    content = {"format": 1, "fields": fields, "delays": {}, "names": ["a"], "value": [1.0], "low": [0.5], "high": [2.0]}
+    (folder / "fit/fit.json").write_text(json.dumps(content | {"determined": [True]}))
+    np.savez(folder / "fit/draws.npz", dof_damping=np.full((4, 1, 1), 0.1))
+    options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
     options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1", "--evaluate"]
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
     motion = f"motion={folder / 'table.npy'}"
