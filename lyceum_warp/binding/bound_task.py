@@ -15,6 +15,7 @@ from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.layouts import layouts_of
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
+from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
 from lyceum_warp.core.model_fields import describe_model_field
 from lyceum_warp.core.model_files import ModelSource, read_task_spec
@@ -34,6 +35,7 @@ class BoundTask:
         fields: More fields for the engine to provide. It always provides the fields of ``World``.
         dynamics: Model fields that may differ between worlds, besides those that the task writes.
         params: Values for the fields of ``Params``: one value, or one value per world.
+        cameras: Cameras whose pictures are observations; None for those of the task.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class BoundTask:
         dynamics: Collection[str] = (),
         physics: PhysicsOptions | None = None,
         params: Mapping[str, Any] | None = None,
+        cameras: Collection[Camera] | None = None,
     ) -> None:
         physics = physics or PhysicsOptions()
         self.definition = task
@@ -57,6 +60,10 @@ class BoundTask:
         self.metrics, self.curriculum = source.terms.metrics, source.curriculum
         self.writes = source.writes
         """What each function writes: fields of World and rows of memory."""
+        self.cameras = cameras_of(task.cameras if cameras is None else cameras)
+        """The cameras whose pictures are observations."""
+        if self.cameras:
+            fields = [*fields, "qpos", "mocap_pos", "mocap_quat"]
         names = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         data_fields = [name for name in names if is_data_field(name)]
         model_fields = [name for name in names if not is_data_field(name)]
@@ -64,6 +71,8 @@ class BoundTask:
         self.spec = read_task_spec(task, model)
         """The model before ``edit_model``."""
         edited = models.edited(task, self.spec)
+        for camera in self.cameras:
+            camera.add_to(edited)
         with _file_in_errors(task.model if model is None else model):
             self.model = models.compile_model(edited, data_fields, physics, varied={*model_fields, *dynamics})
         if physics.timestep is not None or physics.integrator is not None:

@@ -25,6 +25,8 @@ class Space:
     """Lower bounds, of shape ``shape``."""
     high: np.ndarray | None = None
     """Upper bounds, of shape ``shape``."""
+    picture: tuple[int, int, int] | None = None
+    """Height, width and channels of a camera's picture."""
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
@@ -42,8 +44,8 @@ class Space:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the vector, (size,), or () for a scalar."""
-        return (self.size,) if self.parts else ()
+        """Shape of the vector, (size,), or () for a scalar; of a picture, (height, width, channels)."""
+        return self.picture or ((self.size,) if self.parts else ())
 
     @property
     def columns(self) -> list[str]:

@@ -24,7 +24,12 @@ def own_bytes_per_world(task: BoundTask) -> int:
     state_size = state_space(task.model, snapshots, task.dynamics, own).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
-    return 4 * copies + 8 * state_size + 8 * observations + 300
+    total = 4 * copies + 8 * state_size + 8 * observations + 300
+    if task.cameras:
+        from lyceum_warp.engines.pictures import picture_bytes  # loads MuJoCo Warp
+
+        total += picture_bytes(task.model, task.cameras)
+    return total
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
@@ -45,7 +50,7 @@ def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
 class WorldArrays:
     """All arrays of an environment's worlds."""
 
-    def __init__(self, task: BoundTask, engine: Engine) -> None:
+    def __init__(self, task: BoundTask, engine: Engine, *, final_pictures: bool = False) -> None:
         self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
         with wp.ScopedDevice(self.device):
             self._allocate_fields()
@@ -55,6 +60,21 @@ class WorldArrays:
             self._allocate_masks()
             self.state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64)
         self.state_view = torch_view(self.state)
+        self._allocate_pictures(final_pictures)
+
+    def _allocate_pictures(self, final: bool) -> None:
+        self.pictures, self._final_pictures = None, list[tuple[wp.array, wp.array]]()
+        self.picture_groups, self.final_picture_groups = {}, {}
+        if not self.task.cameras:
+            return
+        from lyceum_warp.engines.pictures import Pictures  # loads MuJoCo Warp
+
+        self.pictures = Pictures(self.engine, self.task.cameras)
+        self.picture_groups = self.pictures.groups
+        if final:
+            self.final_picture_groups = {group: torch.zeros_like(now) for group, now in self.picture_groups.items()}
+            for pair in zip(self.picture_groups.values(), self.final_picture_groups.values(), strict=True):
+                self._final_pictures.append(tuple(wp.from_torch(words(picture)) for picture in pair))
 
     def _allocate_fields(self) -> None:
         n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels

@@ -15,6 +15,7 @@ from lyceum_warp.binding.attributes import check_fields
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.registry import errors_of, find_task, task_name
+from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
@@ -56,6 +57,8 @@ def make(  # noqa: D417
     model: ModelSource | None = None,
     fields: Collection[str] = (),
     dynamics: Collection[str] = (),
+    cameras: Collection[Camera] | None = None,
+    final_pictures: bool = False,
     physics: str | PhysicsOptions | None = None,
     frame_skip: int | None = None,
     timestep: float | None = None,
@@ -118,9 +121,10 @@ class Env:
     final_obs: torch.Tensor
     """Observations after the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations by group, each (nworld, group size). The group ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, group size). The group ``policy`` is ``obs``. A camera's group has its
+    pictures, (nworld, height, width, channels); see ``lw.Camera``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` of each group."""
+    """``final_obs`` of each group. Cameras have final pictures only if the option ``final_pictures`` is set."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -199,8 +203,10 @@ class Env:
                 call_once_gone(self, worlds.drop_programs)
                 for name, buffer in worlds.buffers.items():
                     setattr(self, name, buffer)
-                self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
-                self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
+                self.obs_groups = worlds.obs_groups | worlds.picture_groups
+                self.final_obs_groups = worlds.final_obs_groups | worlds.final_picture_groups
+                self.obs_space = worlds.obs_spaces["policy"]
+                self.obs_spaces = worlds.obs_spaces | {camera.group: camera.space for camera in self.task.cameras}
                 self.action_space, self.state_space = worlds.action_space, worlds.state_space
                 self.metrics, self.episode_metrics = (
                     Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
