@@ -21,6 +21,7 @@ from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fi
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
+from lyceum_warp.algos.common.pictures import PICTURE_BOUNDS, PictureConfig, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
 from lyceum_warp.algos.common.symmetry import apply_symmetry
@@ -47,14 +48,14 @@ _BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0,
+    "recurrent": 0, **PICTURE_BOUNDS,
 }  # fmt: skip
 
 
 @suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PPOConfig:
+class PPOConfig(PictureConfig):
     """Hyperparameters of PPO. Except for ``desired_kl``, the defaults are mjlab's settings for legged robots.
 
     Raises:
@@ -114,7 +115,8 @@ class PPOConfig:
     value_activation: Activation = "elu"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy". It
+    cannot be a camera, so a policy that sees pictures learns with a value function that knows the state."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
     image. "loss" adds a term to the loss: symmetry_coef times the squared difference between the policy and its mirror
@@ -209,7 +211,7 @@ class PPO(OnPolicyLearner):
 
     algorithm = "ppo"
     """The name of the algorithm in a run's config.json."""
-    config_type, twice = PPOConfig, False
+    config_type, twice, sees = PPOConfig, False, True
     config: PPOConfig
     """Hyperparameters."""
     rate: torch.Tensor
@@ -234,7 +236,7 @@ class PPO(OnPolicyLearner):
         self._recurrent = self.policy.state_size + self.value.state_size > 0
         if self._recurrent and config.symmetry != "none":
             raise ValueError(
-                f"symmetry={config.symmetry!r} needs a policy without memory: use symmetry='none' (--symmetry none)"
+                f"symmetry={config.symmetry!r} needs a policy without memory and cameras: use symmetry='none' (--symmetry none)"
             )
         self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
         count, items = steps * nworld // self._length, "worlds" if self._recurrent else "samples"
@@ -388,8 +390,9 @@ class PPO(OnPolicyLearner):
             variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
             advantage = advantage / (variance.sqrt() + 1e-8)
         self._old_log_std.copy_(self.policy.log_std)
+        seen = {f"obs/{group}": rollout.obs_groups[group] for group in self.policy.groups}
         samples = {
-            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
+            **(seen if self.policy.pictures else {"obs": rollout.obs}), "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
             "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip
@@ -398,6 +401,8 @@ class PPO(OnPolicyLearner):
     def update(self, samples: Samples) -> None:
         """Run the epochs of mini-batches."""
         config, team, length = self.config, self.team, self._length
+        for group in self.policy.pictures if config.random_shift else ():
+            shift_pictures(samples[f"obs/{group}"], config.random_shift, self.generator)
         if self._recurrent:  # for the mini-batches, a sequence is one sample
             samples = {name: part.transpose(0, 1)[None] for name, part in samples.items()}
         parts = self.minibatches.shuffle(samples, self.generator)
@@ -465,7 +470,9 @@ class PPO(OnPolicyLearner):
         """Compute the mean actions of a mini-batch."""
         if not self._recurrent:
             return self.policy(samples["obs"])
-        mean, _ = self.policy.unrolled(samples["obs"], samples["state"][0], samples["step"] == 0.0)
+        seen = {group: samples[f"obs/{group}"] for group in self.policy.groups} if self.policy.pictures else None
+        obs = samples["obs"] if seen is None else self.policy.inputs(seen)
+        mean, _ = self.policy.unrolled(obs, samples["state"][0], samples["step"] == 0.0)
         return mean
 
     def _value_of(self, samples: Samples) -> torch.Tensor:
@@ -506,7 +513,7 @@ class PPO(OnPolicyLearner):
     def divergence(self) -> torch.Tensor:
         """Compute the KL divergence from the old to the current policy, averaged over the samples."""
         rollout, policy = self.rollout, self.policy
-        mean, _ = policy.unrolled(rollout.obs, self._first, rollout.step == 0.0)
+        mean, _ = policy.unrolled(policy.inputs(rollout.obs_groups), self._first, rollout.step == 0.0)
         kl = divergence(self._means, self._old_log_std, mean, policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 

@@ -612,9 +612,12 @@ class Env:
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """Replicate the environment with only a few worlds, with the C engine if ``engine`` is "auto".
 
-        On a GPU, a step of a few worlds takes nearly as long as a step of thousands.
+        On a GPU, a step of a few worlds takes nearly as long as a step of thousands. An environment with cameras keeps
+        its engine.
         """
-        return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
+        # pictures of few worlds are rendered much faster on a GPU, and the C engine would render them on the CPU
+        few = {} if self.task.cameras else options_for_few_worlds(self.options.engine, self.device)
+        return self.replicate(nworld=nworld, **(few | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
