@@ -236,7 +236,8 @@ class PPO(OnPolicyLearner):
         self._recurrent = self.policy.state_size + self.value.state_size > 0
         if self._recurrent and config.symmetry != "none":
             raise ValueError(
-                f"symmetry={config.symmetry!r} needs a policy without memory and cameras: use symmetry='none' (--symmetry none)"
+                f"symmetry={config.symmetry!r} needs a policy without memory and cameras: use symmetry='none' "
+                "(--symmetry none)"
             )
         self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
         count, items = steps * nworld // self._length, "worlds" if self._recurrent else "samples"
@@ -392,7 +393,8 @@ class PPO(OnPolicyLearner):
         self._old_log_std.copy_(self.policy.log_std)
         seen = {f"obs/{group}": rollout.obs_groups[group] for group in self.policy.groups}
         samples = {
-            **(seen if self.policy.pictures else {"obs": rollout.obs}), "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
+            **(seen if self.policy.pictures else {"obs": rollout.obs}), "value_obs": obs, "step": rollout.step,
+            "action": rollout.action, "mean": self._means,
             "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip

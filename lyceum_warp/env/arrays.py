@@ -14,7 +14,7 @@ from lyceum_warp.core.spaces import OWN_PARTS, Space, action_space, control_rang
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
-from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, zeros_of
+from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, words, zeros_of
 from lyceum_warp.support.tensors import check_tensor
 
 
@@ -63,7 +63,7 @@ class WorldArrays:
         self._allocate_pictures(final_pictures)
 
     def _allocate_pictures(self, final: bool) -> None:
-        self.pictures, self._final_pictures = None, list[tuple[wp.array, wp.array]]()
+        self.pictures, self._final_pictures = None, list[tuple[Any, Any]]()
         self.picture_groups, self.final_picture_groups = {}, {}
         if not self.task.cameras:
             return
@@ -74,7 +74,8 @@ class WorldArrays:
         if final:
             self.final_picture_groups = {group: torch.zeros_like(now) for group, now in self.picture_groups.items()}
             for pair in zip(self.picture_groups.values(), self.final_picture_groups.values(), strict=True):
-                self._final_pictures.append(tuple(wp.from_torch(words(picture)) for picture in pair))
+                live, kept = (wp.from_torch(words(picture)) for picture in pair)
+                self._final_pictures.append((live, kept))
 
     def _allocate_fields(self) -> None:
         n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels

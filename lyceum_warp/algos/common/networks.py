@@ -101,9 +101,7 @@ class GRU(nn.Module):
         state = self.cell(x, state)
         return self.network(state), state
 
-    def unrolled(
-        self, x: torch.Tensor, state: torch.Tensor, began: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unrolled(self, x: torch.Tensor, state: torch.Tensor, began: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Run the network over sequences; see ``unrolled``. After the cell, all steps are one batch."""
         states, _ = unrolled(lambda x, state: 2 * (self.cell(x, state),), x, state, began)
         return self.network(states), states

@@ -77,9 +77,10 @@ class OnPolicyLearner(Learner):
             nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std,
             recurrent=getattr(config, "recurrent", 0), **sees, **options,
         )  # fmt: skip
+        recurrent = self.policy.state_size if group == "policy" and not self.policy.pictures else 0
         self.value = value or ValueFunction(
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
-            time_orders=time_orders, group=group, recurrent=0 if self.policy.pictures or group != "policy" else self.policy.state_size, **options,
+            time_orders=time_orders, group=group, recurrent=recurrent, **options,
         )  # fmt: skip
         if as_torch and policy is None:
             initialize_as_torch(self.policy, init)

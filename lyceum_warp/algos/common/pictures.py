@@ -95,7 +95,7 @@ class Encoder(nn.Module):
             nn.init.kaiming_uniform_(layers[-2].weight, nonlinearity="relu", generator=generator)  # type: ignore[arg-type]
             nn.init.zeros_(layers[-2].bias)  # type: ignore[arg-type]
             height, width = (height + 1) // 2, (width + 1) // 2
-        self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.layers = nn.Sequential(*layers)
         if spatial_softmax:
             self.size = 2 * channels[-1]
             x, y = torch.linspace(-1.0, 1.0, width), torch.linspace(-1.0, 1.0, height)
@@ -111,7 +111,8 @@ class Encoder(nn.Module):
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Compute the features."""
-        x = picture.flatten(0, -4).permute(0, 3, 1, 2)  # the memory format channels_last, without a copy
+        x = picture.flatten(0, -4).permute(0, 3, 1, 2)  # the memory format channels_last, which is slow on the CPU
+        x = x if x.is_cuda else x.contiguous()
         # distances become closeness from 0 (nothing visible) to 1
         x = x.float() / 255.0 - 0.5 if picture.dtype == torch.uint8 else (x > 0) / (1.0 + x)
         # the range of bfloat16 is that of float32, so that gradients cannot overflow
@@ -119,11 +120,8 @@ class Encoder(nn.Module):
         with torch.autocast(x.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
             x = self.layers(x)
         x = x.float().flatten(2)
-        if self.spatial_softmax:
-            features = (x.softmax(-1) @ self.places).flatten(1)
-        else:
-            features = self.head(x.flatten(1))
-        return features.unflatten(0, picture.shape[:-3])
+        features = x.softmax(-1) @ self.places if self.spatial_softmax else self.head(x.flatten(1))
+        return features.reshape(*picture.shape[:-3], self.size)
 
 
 class Stack(nn.Module):

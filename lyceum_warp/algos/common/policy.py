@@ -36,7 +36,7 @@ class GaussianPolicy(Normalized):
             and maps observations (n, nobs) and states (n, state_size) to mean actions and the next states.
         recurrent: Units of a GRU before the hidden layers, which gives the policy memory; 0 means no memory.
         pictures: Shapes of the pictures that the policy sees, (height, width, channels), by the cameras' groups. An
-            observation is then a tuple: the vector, unless ``nobs`` is 0, and the pictures of each camera, (..., height,
+            observation is then a tuple: the vector, unless ``nobs`` is 0, and each camera's pictures, (..., height,
             width, channels).
         channels: See ``lw.PPOConfig``, like the next two arguments.
         spatial_softmax: See ``lw.PPOConfig``.
@@ -141,7 +141,7 @@ class GaussianPolicy(Normalized):
         """Select the argument of ``act`` from groups of observations: a tensor, or a tuple with pictures."""
         return tuple(groups[group] for group in self.groups) if self.pictures else groups["policy"]
 
-    def _normalized(self, obs: Any) -> Any:
+    def _inputs(self, obs: Any) -> Any:
         if not self.pictures:
             return self.normalizer(obs)
         return (self.normalizer(obs[0]), *obs[1:]) if self.nobs else tuple(obs)
@@ -151,7 +151,7 @@ class GaussianPolicy(Normalized):
         return self._mean(obs) if self.mirror is None else self.mirror.average(self._mean, obs)
 
     def _mean(self, obs: torch.Tensor) -> torch.Tensor:
-        mean: torch.Tensor = self.network(self._normalized(obs))
+        mean: torch.Tensor = self.network(self._inputs(obs))
         return mean
 
     def act(self, obs: torch.Tensor, state: torch.Tensor | None = None) -> Any:
@@ -160,7 +160,7 @@ class GaussianPolicy(Normalized):
         A policy with memory also needs its state, (n, state_size), and returns the actions and the next state. The
         state is 0 when an episode begins.
         """
-        return self(obs) if state is None else self.network(self._normalized(obs), state)
+        return self(obs) if state is None else self.network(self._inputs(obs), state)
 
     def unrolled(
         self, obs: torch.Tensor, state: torch.Tensor, began: torch.Tensor
@@ -172,7 +172,7 @@ class GaussianPolicy(Normalized):
         """
         if not self.state_size:
             return self(obs), state.expand(len(obs), *state.shape)
-        return unrolled(self.network, self._normalized(obs), state, began)
+        return unrolled(self.network, self._inputs(obs), state, began)
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
