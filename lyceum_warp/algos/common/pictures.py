@@ -19,6 +19,9 @@ Parts: TypeAlias = tuple[torch.Tensor, ...]
 
 PICTURE_BOUNDS: dict[str, Bound] = {"frames": 2, "random_shift": 0}
 
+_GAIN = 8.0
+"""Factor on changes of features, which are small between two steps."""
+
 _FEATURES = 64
 """Features of a picture without spatial softmax."""
 
@@ -106,7 +109,7 @@ class Encoder(nn.Module):
             linear = nn.Linear(channels[-1] * height * width, self.size)
             nn.init.xavier_uniform_(linear.weight, generator=generator)
             nn.init.zeros_(linear.bias)
-            self.head = nn.Sequential(linear, nn.LayerNorm(self.size), nn.Tanh())
+            self.head = nn.Sequential(linear, nn.LayerNorm(self.size))
         self.spatial_softmax = spatial_softmax
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
@@ -114,7 +117,7 @@ class Encoder(nn.Module):
         x = picture.flatten(0, -4).permute(0, 3, 1, 2)  # the memory format channels_last, which is slow on the CPU
         x = x if x.is_cuda else x.contiguous()
         # distances become closeness from 0 (nothing visible) to 1
-        x = x.float() / 255.0 - 0.5 if picture.dtype == torch.uint8 else (x > 0) / (1.0 + x)
+        x = x.float() / 64.0 - 1.0 if picture.dtype == torch.uint8 else (x > 0) / (1.0 + x)
         # the range of bfloat16 is that of float32, so that gradients cannot overflow
         half = MLP.in_half and x.is_cuda
         with torch.autocast(x.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
@@ -138,7 +141,7 @@ class Stack(nn.Module):
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the output, (n, frames * size), and the next state."""
         earlier, known = state.split([self.past * self.size, self.past], dim=-1)
-        changes = (x.unsqueeze(-2) - earlier.unflatten(-1, (self.past, self.size))) * known.unsqueeze(-1)
+        changes = (x.unsqueeze(-2) - earlier.unflatten(-1, (self.past, self.size))) * (_GAIN * known.unsqueeze(-1))
         kept = earlier[..., : (self.past - 1) * self.size], torch.ones_like(known[..., :1]), known[..., :-1]
         return torch.cat([x, changes.flatten(-2)], dim=-1), torch.cat([x, *kept], dim=-1)
 
