@@ -61,7 +61,7 @@ class Player:
         try:
             outputs = repeatable(self._act, self._inputs(obs), *state)
         except RuntimeError as error:
-            sizes = f"{described(obs)}, of the task {self.env.task.name!r}"
+            sizes = f"{described(obs)}{' and pictures' * (len(self._groups) > 1)}, of the task {self.env.task.name!r}"
             raise ValueError(f"policy cannot take the observations, {sizes}: {str(error).splitlines()[0]}") from error
         expected = self.env.action, *state
         if [getattr(one, "shape", None) for one in outputs] != [one.shape for one in expected]:
