@@ -219,7 +219,7 @@ class Distill(Learner):
             log_std=config.log_std, normalize=config.normalize, generator=init, **sees,
         )  # fmt: skip
         if policy is None:
-            initialize_as_torch(self.policy, init)
+            initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
         shape = self.policy.shape
         fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
         seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
@@ -233,6 +233,10 @@ class Distill(Learner):
         self.policy.to(device)
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
+        self._burn_in = getattr(self.policy.network, "burn_in", 0)
+        if self._burn_in >= config.gradient_length:
+            frames = self._burn_in + 1
+            raise ValueError(f"gradient_length={config.gradient_length} must be at least frames, which is {frames}")
         steps, nworld = config.num_steps, env.nworld * team.size
         self.count = steps * nworld
         self.rollout = Rollout(env, steps, groups=self.policy.groups)
@@ -311,9 +315,10 @@ class Distill(Learner):
 
         After each step, the normaliser is updated with the step's observations.
         """
-        rollout = self.rollout
+        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
+            self.policy.observe_pictures(self.env.obs_groups, team)
             self._state.copy_(self._player.state)
             rollout.begin()
             for _ in range(rollout.steps):
@@ -356,12 +361,15 @@ class Distill(Learner):
         rollout, state, length = self.rollout, self._state, self.config.gradient_length
         groups = {group: rollout.obs_groups[group] for group in self.policy.groups}
         for t in range(0, rollout.steps, length):
-            part = slice(t, t + length)
+            # repeat the steps whose features an older encoder would have computed
+            first = max(t - self._burn_in, 0)
+            part = slice(first, t + length)
             obs = self.policy.inputs({group: rows[part] for group, rows in groups.items()})
             mean, states = self.policy.unrolled(obs, state, rollout.step[part] == 0.0)
-            self._loss += self._step(length * loss_of(mean, self.label[part]) / self.team.size) / length
-            state = states[-1].detach()
-        self._next_state.copy_(state)
+            loss = loss_of(mean[t - first :], self.label[t : t + length])
+            self._loss += self._step(length * loss / self.team.size) / length
+            state = states[length - self._burn_in - 1 + t - first].detach()
+        self._next_state.copy_(states[-1])
 
     def enter(self, env: Env) -> None:
         """Go on in another environment of the same task; see ``Learner``."""

@@ -240,6 +240,9 @@ class PPO(OnPolicyLearner):
                 "(--symmetry none)"
             )
         self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
+        self._burn_in = getattr(self.policy.network, "burn_in", 0)
+        if self._burn_in >= steps:
+            raise ValueError(f"num_steps={steps} must be at least frames, which is {self._burn_in + 1}")
         count, items = steps * nworld // self._length, "worlds" if self._recurrent else "samples"
         if config.minibatches > count:
             raise ValueError(
@@ -347,9 +350,10 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        rollout = self.rollout
+        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
+            self.policy.observe_pictures(self.env.obs_groups, team)
             rollout.begin()
             self._first.copy_(self._player.state)
             for _ in range(rollout.steps):
@@ -427,7 +431,8 @@ class PPO(OnPolicyLearner):
         config, clip = self.config, self.config.clip
         if self._recurrent:
             samples = {name: part.transpose(0, 1) for name, part in samples.items()}
-            weight = (weight / self._length).expand(self._length, -1)
+            weight = (weight / (self._length - self._burn_in)).repeat(self._length, 1)
+            weight[: self._burn_in] = 0.0
         old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
@@ -513,10 +518,15 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """Compute the KL divergence from the old to the current policy, averaged over the samples."""
-        rollout, policy = self.rollout, self.policy
-        mean, _ = policy.unrolled(policy.inputs(rollout.obs_groups), self._first, rollout.step == 0.0)
-        kl = divergence(self._means, self._old_log_std, mean, policy.log_std).mean()
+        """Compute the KL divergence from the old to the current policy, averaged over the samples.
+
+        A policy that sees cameras goes on with the state that its new encoders compute.
+        """
+        rollout, policy, after = self.rollout, self.policy, slice(self._burn_in, None)
+        mean, states = policy.unrolled(policy.inputs(rollout.obs_groups), self._first, rollout.step == 0.0)
+        if policy.pictures:  # go on with the features of the new encoders
+            self._player.state.copy_(states[-1])
+        kl = divergence(self._means[after], self._old_log_std, mean[after], policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:

@@ -83,7 +83,7 @@ class OnPolicyLearner(Learner):
             time_orders=time_orders, group=group, recurrent=recurrent, **options,
         )  # fmt: skip
         if as_torch and policy is None:
-            initialize_as_torch(self.policy, init)
+            initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
         if as_torch and value is None:
             initialize_as_torch(self.value, init)
         self.value.discount = config.gamma

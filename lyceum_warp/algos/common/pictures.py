@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
+from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Activation, Bound
 from lyceum_warp.algos.common.networks import GRU, MLP, mlp, unrolled
 from lyceum_warp.env import Env
@@ -19,7 +20,7 @@ Parts: TypeAlias = tuple[torch.Tensor, ...]
 
 PICTURE_BOUNDS: dict[str, Bound] = {"frames": 2, "random_shift": 0}
 
-_GAIN = 8.0
+_GAIN = 2.0
 """Factor on changes of features, which are small between two steps."""
 
 _FEATURES = 64
@@ -83,15 +84,23 @@ def shift_pictures(pictures: torch.Tensor, limit: int, generator: torch.Generato
 
 
 class Encoder(nn.Module):
-    """Convolutional layers that map pictures of a camera, (..., height, width, channels), to features, (..., size)."""
+    """Convolutional layers that map pictures of a camera, (..., height, width, channels), to features, (..., size).
+
+    The mean picture is subtracted first. With a static background, a change of a weight then changes the features of
+    all pictures less, and an update of the same KL divergence can be larger.
+    """
 
     size: int
+    count: torch.Tensor
+    mean: torch.Tensor
 
     def __init__(
         self, shape: Sequence[int], channels: Sequence[int], spatial_softmax: bool, generator: torch.Generator | None
     ) -> None:
         super().__init__()
         height, width, depth = shape
+        self.register_buffer("count", torch.zeros(()))
+        self.register_buffer("mean", torch.zeros(*shape))
         layers: list[nn.Module] = []
         for i, (before, after) in enumerate(itertools.pairwise((depth, *channels))):
             layers += [nn.Conv2d(before, after, 5 if i == 0 else 3, stride=2, padding=2 if i == 0 else 1), nn.ReLU()]
@@ -101,7 +110,7 @@ class Encoder(nn.Module):
         self.layers = nn.Sequential(*layers)
         if spatial_softmax:
             self.size = 2 * channels[-1]
-            x, y = torch.linspace(-1.0, 1.0, width), torch.linspace(-1.0, 1.0, height)
+            x, y = torch.linspace(-4.0, 4.0, width), torch.linspace(-4.0, 4.0, height)
             self.register_buffer("places", torch.cartesian_prod(y, x), persistent=False)
             self.head: nn.Module = nn.Identity()
         else:
@@ -112,12 +121,16 @@ class Encoder(nn.Module):
             self.head = nn.Sequential(linear, nn.LayerNorm(self.size))
         self.spatial_softmax = spatial_softmax
 
+    @torch.no_grad()
+    def observe(self, picture: torch.Tensor, team: Team) -> None:
+        """Update the mean picture; every call has the same weight."""
+        self.count += 1.0
+        self.mean += (team.sum(_scaled(picture).mean(0)) / team.size - self.mean) / self.count
+
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
         """Compute the features."""
-        x = picture.flatten(0, -4).permute(0, 3, 1, 2)  # the memory format channels_last, which is slow on the CPU
-        x = x if x.is_cuda else x.contiguous()
-        # distances become closeness from 0 (nothing visible) to 1
-        x = x.float() / 64.0 - 1.0 if picture.dtype == torch.uint8 else (x > 0) / (1.0 + x)
+        x = (_scaled(picture) - self.mean).flatten(0, -4).permute(0, 3, 1, 2)
+        x = x if x.is_cuda else x.contiguous()  # the memory format channels_last is slow on the CPU
         # the range of bfloat16 is that of float32, so that gradients cannot overflow
         half = MLP.in_half and x.is_cuda
         with torch.autocast(x.device.type, torch.bfloat16, enabled=half, cache_enabled=False):
@@ -125,6 +138,11 @@ class Encoder(nn.Module):
         x = x.float().flatten(2)
         features = x.softmax(-1) @ self.places if self.spatial_softmax else self.head(x.flatten(1))
         return features.reshape(*picture.shape[:-3], self.size)
+
+
+def _scaled(picture: torch.Tensor) -> torch.Tensor:
+    """Scale colours to the range from 0 to 4, and distances to closeness from 0 (nothing visible) to 4."""
+    return picture.float() / 64.0 if picture.dtype == torch.uint8 else 4.0 * (picture > 0) / (1.0 + picture)
 
 
 class Stack(nn.Module):
@@ -154,6 +172,13 @@ class PictureNetwork(nn.Module):
         self.vector, self.encoders = vector, nn.ModuleList(encoders)
         self.memory, self.network = memory, network
         self.state_size: int = memory.state_size  # type: ignore[assignment]
+        self.burn_in: int = getattr(memory, "past", 0)
+        """Steps of a sequence whose outputs depend on features in the state, which older encoders computed."""
+
+    def observe(self, pictures: Sequence[torch.Tensor], team: Team) -> None:
+        """Update the encoders' mean pictures with the pictures of all worlds."""
+        for encoder, picture in zip(self.encoders, pictures, strict=True):
+            encoder.observe(picture, team)  # type: ignore[operator]
 
     def encode(self, x: Parts) -> torch.Tensor:
         """Compute the vector and the features of all pictures, (..., size)."""

@@ -7,9 +7,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
-from lyceum_warp.algos.common.pictures import picture_network
+from lyceum_warp.algos.common.pictures import PictureNetwork, picture_network
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
@@ -140,6 +141,11 @@ class GaussianPolicy(Normalized):
     def inputs(self, groups: Mapping[str, torch.Tensor]) -> Any:
         """Select the argument of ``act`` from groups of observations: a tensor, or a tuple with pictures."""
         return tuple(groups[group] for group in self.groups) if self.pictures else groups["policy"]
+
+    def observe_pictures(self, groups: Mapping[str, torch.Tensor], team: Team) -> None:
+        """Update the mean pictures that the default network subtracts. Learners call this before they sample."""
+        if isinstance(self.network, PictureNetwork):
+            self.network.observe([groups[group] for group in self.pictures], team)
 
     def _inputs(self, obs: Any) -> Any:
         if not self.pictures:
