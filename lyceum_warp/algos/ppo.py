@@ -21,7 +21,7 @@ from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fi
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
-from lyceum_warp.algos.common.pictures import PICTURE_BOUNDS, PictureConfig, shift_pictures
+from lyceum_warp.algos.common.pictures import PICTURE_BOUNDS, PictureConfig, PictureNetwork, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
 from lyceum_warp.algos.common.symmetry import apply_symmetry
@@ -48,7 +48,7 @@ _BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0, **PICTURE_BOUNDS,
+    "recurrent": 0, "state_coef": 0.0, **PICTURE_BOUNDS,
 }  # fmt: skip
 
 
@@ -123,6 +123,9 @@ class PPOConfig(PictureConfig):
     image. "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
+    state_coef: float = 1.0
+    """Coefficient of an additional loss for policies that see cameras: a linear layer must predict the value function's
+    normalised observations from the features of the pictures. 0 means no such loss."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
@@ -268,10 +271,16 @@ class PPO(OnPolicyLearner):
         self._value_state = torch.zeros(env.nworld, self.value.state_size, device=device)
 
         # the update
+        self._predictor: nn.Linear | None = None
+        if config.state_coef and isinstance(self.policy.network, PictureNetwork):
+            self._predictor = nn.Linear(self.policy.network.size, env.obs_spaces[self.value.group].size, device=device)
+            nn.init.zeros_(self._predictor.weight)
+            nn.init.zeros_(self._predictor.bias)
         log_std = self.policy.log_std
         self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
         self.std.requires_grad_(log_std.requires_grad)
-        acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
+        predicting = () if self._predictor is None else self._predictor.parameters()
+        acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std), *predicting]
         learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
         self._parameters = [p for group in learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
@@ -443,7 +452,8 @@ class PPO(OnPolicyLearner):
                 clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
                 error = torch.max(error, (clipped - samples["target"]).square())
             value_loss = (weight * error).sum()
-        mean, log_std = self._mean_of(samples), self._log_std()
+        mean, prediction_loss = self._mean_of(samples, weight)
+        log_std = self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
@@ -451,7 +461,7 @@ class PPO(OnPolicyLearner):
         surrogate_loss = (weight * surrogate).sum()
         self._branch.join()
         losses = torch.stack([value_loss, surrogate_loss, weight.sum() * entropy])
-        loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
+        loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2] + prediction_loss
         if config.symmetry == "loss":
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
@@ -473,14 +483,22 @@ class PPO(OnPolicyLearner):
             self.optimizer.step()
             self._losses += self._sums[-3:]
 
-    def _mean_of(self, samples: Samples) -> torch.Tensor:
-        """Compute the mean actions of a mini-batch."""
+    def _mean_of(self, samples: Samples, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
+        """Compute the mean actions of a mini-batch, and the loss of the predicted state."""
+        policy = self.policy
         if not self._recurrent:
-            return self.policy(samples["obs"])
-        seen = {group: samples[f"obs/{group}"] for group in self.policy.groups} if self.policy.pictures else None
-        obs = samples["obs"] if seen is None else self.policy.inputs(seen)
-        mean, _ = self.policy.unrolled(obs, samples["state"][0], samples["step"] == 0.0)
-        return mean
+            return policy(samples["obs"]), 0.0
+        began, state = samples["step"] == 0.0, samples["state"][0]
+        if not policy.pictures:
+            return policy.unrolled(samples["obs"], state, began)[0], 0.0
+        obs = policy.inputs({group: samples[f"obs/{group}"] for group in policy.groups})
+        if self._predictor is None:
+            return policy.unrolled(obs, state, began)[0], 0.0
+        features = policy.features(obs, state, began)
+        with torch.no_grad():
+            truth = self.value.normalizer(samples["value_obs"])
+        error = (self._predictor(features) - truth).square().mean(-1)
+        return policy.network.network(features), self.config.state_coef * (weight * error).sum()  # type: ignore[operator]
 
     def _value_of(self, samples: Samples) -> torch.Tensor:
         """Predict the values of a mini-batch."""
@@ -538,6 +556,8 @@ class PPO(OnPolicyLearner):
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
         state = {"optimizer": self.optimizer.state_dict(), "std": self.std.detach(), "recent": list(self._recent)}
+        if self._predictor is not None:
+            state["predictor"] = self._predictor.state_dict()
         if self._recurrent:
             state["memory"] = [self.team.gather(part) for part in (self._player.state, self._value_state)]
         return super().state_dict() | copy.deepcopy(state)
@@ -546,6 +566,8 @@ class PPO(OnPolicyLearner):
         """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
+        if self._predictor is not None:
+            self._predictor.load_state_dict(state["predictor"])
         with torch.no_grad():
             self.std.copy_(state["std"])
         self._recent.clear()

@@ -48,7 +48,8 @@ def test_pictures_agree_with_those_of_mujocos_renderer(shared_env, monkeypatch: 
     data.qpos[:] = env.field("qpos")[0].numpy()
     mujoco.mj_forward(model, data)
     try:
-        monkeypatch.setattr("mujoco.gl_context.GLContext", importlib.import_module("mujoco.egl").GLContext)
+        context = importlib.import_module("mujoco.egl").GLContext
+        monkeypatch.setattr("mujoco.rendering.classic.gl_context.GLContext", context)
         renderer = mujoco.Renderer(model, 96, 96)
     except Exception as error:  # each GL backend raises its own errors
         pytest.skip(f"no OpenGL: {error}")

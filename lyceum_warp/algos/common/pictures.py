@@ -171,6 +171,7 @@ class PictureNetwork(nn.Module):
         super().__init__()
         self.vector, self.encoders = vector, nn.ModuleList(encoders)
         self.memory, self.network = memory, network
+        self.size = next(network.parameters()).shape[1]  # of the memory's outputs
         self.state_size: int = memory.state_size  # type: ignore[assignment]
         self.burn_in: int = getattr(memory, "past", 0)
         """Steps of a sequence whose outputs depend on features in the state, which older encoders computed."""
@@ -191,9 +192,13 @@ class PictureNetwork(nn.Module):
         output, state = self.memory(self.encode(x), state)
         return self.network(output), state
 
+    def features(self, x: Parts, state: torch.Tensor, began: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Compute the memory's outputs and states along sequences. All pictures are encoded in one batch."""
+        return unrolled(self.memory, self.encode(x), state, began)
+
     def unrolled(self, x: Parts, state: torch.Tensor, began: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Run the network over sequences; see ``networks.unrolled``. All pictures are encoded in one batch."""
-        outputs, states = unrolled(self.memory, self.encode(x), state, began)
+        """Run the network over sequences; see ``networks.unrolled``."""
+        outputs, states = self.features(x, state, began)
         return self.network(outputs), states
 
 

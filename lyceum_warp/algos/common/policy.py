@@ -180,6 +180,11 @@ class GaussianPolicy(Normalized):
             return self(obs), state.expand(len(obs), *state.shape)
         return unrolled(self.network, self._inputs(obs), state, began)
 
+    def features(self, obs: Any, state: torch.Tensor, began: torch.Tensor) -> torch.Tensor:
+        """Compute what the last layers of a policy that sees cameras get, (steps, n, size); see ``unrolled``."""
+        features: torch.Tensor = self.network.features(self._inputs(obs), state, began)[0]
+        return features
+
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Sample actions, without gradients.
