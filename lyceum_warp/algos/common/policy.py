@@ -182,8 +182,8 @@ class GaussianPolicy(Normalized):
 
     def features(self, obs: Any, state: torch.Tensor, began: torch.Tensor) -> torch.Tensor:
         """Compute what the last layers of a policy that sees cameras get, (steps, n, size); see ``unrolled``."""
-        features: torch.Tensor = self.network.features(self._inputs(obs), state, began)[0]
-        return features
+        assert isinstance(self.network, PictureNetwork)
+        return self.network.features(self._inputs(obs), state, began)[0]
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
