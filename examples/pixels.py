@@ -38,8 +38,8 @@ def main(
             rate = it.samples / it.iteration / (it.time_sample + it.time_update)
             print(
                 f"{seconds:6.0f} s, {learner.algorithm} {it.iteration}: {it.samples:,} samples, return "
-                f"{returns.mean():.0f} of 1000, lowest {returns.min():.0f}; {rate:,.0f} samples/s: {it.time_sample:.2f} "
-                f"s sampling, {it.time_update:.2f} s update", flush=True,
+                f"{returns.mean():.0f} of 1000, lowest {returns.min():.0f}; {rate:,.0f} samples/s; sampling "
+                f"{it.time_sample:.2f} s and the update {it.time_update:.2f} s", flush=True,
             )  # fmt: skip
             if returns.min() >= target or last or seconds > 60.0 * minutes:
                 return learner.policy

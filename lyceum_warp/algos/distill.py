@@ -18,13 +18,11 @@ from torch import nn
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision
 from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
 from lyceum_warp.algos.common.pictures import (
-    PICTURE_BOUNDS,
-    PictureConfig,
     picture_settings,
     policy_inputs,
     shift_pictures,

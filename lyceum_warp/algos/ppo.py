@@ -17,11 +17,11 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
-from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
-from lyceum_warp.algos.common.pictures import PICTURE_BOUNDS, PictureConfig, PictureNetwork, shift_pictures
+from lyceum_warp.algos.common.pictures import PictureNetwork, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
 from lyceum_warp.algos.common.symmetry import apply_symmetry

@@ -6,20 +6,12 @@ from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
-import torch
 
-from lyceum_warp.core.spaces import Space
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_kind, check_word, finite_number, whole_number
 
 Kind = Literal["rgb", "depth", "segmentation"]
-
-_PIXELS: dict[str, tuple[int, torch.dtype, tuple[float, float]]] = {
-    "rgb": (3, torch.uint8, (0, 255)), "depth": (1, torch.float32, (0, np.inf)),
-    "segmentation": (2, torch.int32, (-1, 2**31 - 1)),
-}  # fmt: skip
-"""Channels, type and range of a pixel."""
 
 
 @suggest_arguments
@@ -71,14 +63,6 @@ class Camera:
                 raise ValueError(f"{name} must have three coordinates, not {point}")
             object.__setattr__(self, name, point)
         object.__setattr__(self, "fovy", finite_number("fovy", self.fovy, low=1.0, high=179.0))
-
-    @property
-    def space(self) -> Space:
-        """The space of a picture, of shape (height, width, channels)."""
-        channels, dtype, (low, high) = _PIXELS[self.kind]
-        shape = self.height, self.width, channels
-        bounds = {name: np.full(shape, bound) for name, bound in (("low", low), ("high", high))}
-        return Space.of({self.group: int(np.prod(shape))}, dtype=dtype, picture=shape, **bounds)
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the camera to a model, if it is given by its pose."""

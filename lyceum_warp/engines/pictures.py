@@ -75,7 +75,7 @@ class Pictures:
                 colors = wp.zeros((*pixels.shape, 3), dtype=wp.uint8, device=engine.device)
                 self._packed.append((pixels, colors))
                 pixels = colors
-            self.groups[camera.group] = torch_view(pixels).view(nworld, *camera.space.shape)
+            self.groups[camera.group] = torch_view(pixels).view(nworld, camera.height, camera.width, -1)
 
     def render(self) -> None:
         """Render all pictures, by Warp launches only."""

@@ -10,7 +10,15 @@ import warp as wp
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import sizes
 from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.core.spaces import (
+    OWN_PARTS,
+    Space,
+    action_space,
+    control_ranges,
+    control_scale,
+    picture_space,
+    state_space,
+)
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
@@ -65,6 +73,7 @@ class WorldArrays:
     def _allocate_pictures(self, final: bool) -> None:
         self.pictures, self._final_pictures = None, list[tuple[Any, Any]]()
         self.picture_groups, self.final_picture_groups = {}, {}
+        self.picture_spaces = {camera.group: picture_space(camera) for camera in self.task.cameras}
         if not self.task.cameras:
             return
         from lyceum_warp.engines.pictures import Pictures  # loads MuJoCo Warp

@@ -206,7 +206,7 @@ class Env:
                 self.obs_groups = worlds.obs_groups | worlds.picture_groups
                 self.final_obs_groups = worlds.final_obs_groups | worlds.final_picture_groups
                 self.obs_space = worlds.obs_spaces["policy"]
-                self.obs_spaces = worlds.obs_spaces | {camera.group: camera.space for camera in self.task.cameras}
+                self.obs_spaces = worlds.obs_spaces | worlds.picture_spaces
                 self.action_space, self.state_space = worlds.action_space, worlds.state_space
                 self.metrics, self.episode_metrics = (
                     Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))

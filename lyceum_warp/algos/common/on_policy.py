@@ -8,9 +8,10 @@ import warp as wp
 
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
+from lyceum_warp.algos.common.hyperparameters import PictureConfig
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.networks import LIMIT, initialize_as_torch, trainable
-from lyceum_warp.algos.common.pictures import PictureConfig, picture_settings, policy_inputs
+from lyceum_warp.algos.common.pictures import picture_settings, policy_inputs
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_value
 from lyceum_warp.algos.common.rollout_buffer import Rollout

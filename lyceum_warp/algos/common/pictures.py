@@ -1,6 +1,5 @@
-"""Define networks that see cameras, and the hyperparameters of these networks."""
+"""Define networks that see cameras."""
 
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
@@ -9,43 +8,19 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.hyperparameters import Activation, Bound
+from lyceum_warp.algos.common.hyperparameters import Activation, PictureConfig
 from lyceum_warp.algos.common.networks import GRU, MLP, mlp, unrolled
 from lyceum_warp.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_group
 
 Parts: TypeAlias = tuple[torch.Tensor, ...]
 """An observation's vector, if the network reads it, and the pictures of each camera, (..., height, width, channels)."""
-
-PICTURE_BOUNDS: dict[str, Bound] = {"frames": 2, "random_shift": 0}
 
 _GAIN = 2.0
 """Factor on changes of features, which are small between two steps."""
 
 _FEATURES = 64
 """Features of a picture without spatial softmax."""
-
-
-@document_attributes
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PictureConfig:
-    """Hyperparameters of policies that see cameras."""
-
-    policy_groups: tuple[str, ...] = ()
-    """Groups of observations for the policy; by default "policy" and all cameras. ("camera",) hides the numbers of the
-    group "policy" from the policy."""
-    channels: tuple[int, ...] = (16, 32, 32)
-    """Channels of the convolutional layers that encode a picture. Each layer halves its width and height."""
-    spatial_softmax: bool = False
-    """Whether the features of a picture are the mean positions of the last layer's channels (Levine et al. 2016,
-    "End-to-End Training of Deep Visuomotor Policies"). Otherwise, a linear layer computes them."""
-    frames: int = 3
-    """Number of a world's last pictures that the policy sees: the features of the current picture, and their changes
-    since earlier ones. The policy's state holds the features. With ``recurrent``, a GRU replaces them."""
-    random_shift: int = 0
-    """Largest random shift of the pictures in an update, in pixels (Yarats et al. 2021, "Image Augmentation Is All You
-    Need"). Each world has one shift in each iteration."""
 
 
 def policy_inputs(env: Env, config: PictureConfig) -> tuple[int, dict[str, Any]]:
