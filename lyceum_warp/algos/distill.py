@@ -367,7 +367,7 @@ class Distill(Learner):
             loss = loss_of(mean[t - first :], self.label[t : t + length])
             self._loss += self._step(length * loss / self.team.size) / length
             state = states[length - self._burn_in - 1 + t - first].detach()
-        self._next_state.copy_(states[-1])
+        self._next_state.copy_(states[-1].detach())
 
     def enter(self, env: Env) -> None:
         """Go on in another environment of the same task; see ``Learner``."""
