@@ -24,7 +24,7 @@ from experiment import Experiment, Row, Table, choose
 
 import lyceum_warp as lw
 
-TASKS = ("dm/cartpole_balance", "half_cheetah", "go1_velocity", "aloha_lift")
+TASKS = ("cartpole", "half_cheetah", "go1_velocity", "aloha_lift")
 CONTESTANTS = ("pictures", "final pictures")
 
 
