@@ -11,12 +11,12 @@ SIDE = [lw.Camera("side", 16, 12)]
 
 
 def test_gymnasium_gets_pictures_and_final_pictures_as_bytes() -> None:
-    env = GymnasiumVectorEnv("cartpole", 2, cameras=SIDE, max_episode_steps=3)
+    env = GymnasiumVectorEnv("cartpole", 2, cameras=SIDE, max_episode_steps=40)
     space = env.single_observation_space["camera"]
     assert (space.shape, space.dtype, space.low.min(), space.high.max()) == ((12, 16, 3), np.uint8, 0, 255)
     obs, _ = env.reset(seed=1)
     assert obs in env.observation_space and obs["camera"].std() > 0
-    for _ in range(3):
+    for _ in range(40):
         obs, _, _, truncated, infos = env.step(np.ones((2, 1), dtype=np.float32))
     assert truncated.all() and obs in env.observation_space
     assert all(final in env.single_observation_space for final in infos["final_obs"])
