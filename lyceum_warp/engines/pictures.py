@@ -52,7 +52,7 @@ class Pictures:
             for kind in ("rgb", "depth", "segmentation")
         }
         seen = [field for name, field in engine.dynamics.items() if name.startswith(_SEEN)]
-        with refusals(), wp.ScopedDevice(engine.device):
+        with refusals(fix="use no cameras"), wp.ScopedDevice(engine.device):
             self._model = put_varied_model(model, seen, nworld)
             self._data = data = mjw.make_data(model, nworld=nworld, naconmax=1, njmax=1)
             self._context = context = mjw.create_render_context(
@@ -64,7 +64,8 @@ class Pictures:
         if model.nmocap:
             data.mocap_pos, data.mocap_quat = engine.arrays["mocap_pos"], engine.arrays["mocap_quat"].view(wp.quat)
         self._rows = [(flat(engine.arrays[f.name]), flat(getattr(self._model, f.name))) for f in seen if f.size]
-        self._static, self._everyone = StaticGeoms(model, engine.dynamics, engine.device), wp.full(nworld, True, bool)
+        self._static = StaticGeoms(model, engine.dynamics, engine.device)
+        self._everyone = wp.full(nworld, True, dtype=bool, device=engine.device)
         self.groups, self._packed = {}, []
         addresses = {"rgb": context.rgb_adr, "depth": context.depth_adr, "segmentation": context.seg_adr}
         buffers = {"rgb": context.rgb_data, "depth": context.depth_data, "segmentation": context.seg_data}

@@ -92,21 +92,22 @@ def test_a_run_with_cameras_resumes_to_the_bit_and_its_policy_acts_elsewhere(env
         lw.evaluate(lw.make("cartpole", nworld=2, horizon=5), policy, 2)
 
 
-def test_an_exported_policy_takes_pictures(env: lw.Env, tmp_path: Path) -> None:
+@pytest.mark.parametrize("suffix", [".pt2", pytest.param(".onnx", marks=pytest.mark.long)])
+def test_an_exported_policy_takes_pictures(env: lw.Env, tmp_path: Path, suffix: str) -> None:
     policy = ppo(env, policy_groups=()).policy
-    state = torch.rand(4, policy.state_size)
-    obs = policy.inputs(env.obs_groups)
-    wanted = policy.act(obs, state)
-    path = lw.export_policy(policy, tmp_path / "policy.pt2")
-    for one, other in zip(torch.export.load(path).module()(obs, state), wanted, strict=True):
-        torch.testing.assert_close(one, other)
-    runtime = pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnxscript")
-    session = runtime.InferenceSession(str(lw.export_policy(policy, tmp_path / "policy.onnx", env=env)))
-    named = {"obs": obs[0], "camera": obs[1], "state": state}
-    results = session.run(None, {name: part.numpy() for name, part in named.items()})
-    for result, tensor in zip(results, wanted, strict=True):
-        torch.testing.assert_close(torch.from_numpy(result), tensor.detach(), rtol=1e-4, atol=1e-5)
+    state, obs = torch.rand(4, policy.state_size), policy.inputs(env.obs_groups)
+    if suffix == ".onnx":
+        runtime = pytest.importorskip("onnxruntime")
+        pytest.importorskip("onnxscript")
+    path = lw.export_policy(policy, tmp_path / f"policy{suffix}", env=env)
+    if suffix == ".pt2":
+        results = torch.export.load(path).module()(obs, state)
+    else:
+        inputs = {"obs": obs[0], "camera": obs[1], "state": state}
+        session = runtime.InferenceSession(str(path))
+        results = map(torch.from_numpy, session.run(None, {name: part.numpy() for name, part in inputs.items()}))
+    for result, wanted in zip(results, policy.act(obs, state), strict=True):
+        torch.testing.assert_close(result, wanted, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -323,15 +323,13 @@ class WarpEngine(Engine):
 
 
 @contextlib.contextmanager
-def refusals() -> Iterator[None]:
+def refusals(fix: str = "use engine='mujoco'") -> Iterator[None]:
     """Explain an error of MuJoCo Warp about a model."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
         reason = str(error).rstrip(".")
-        raise ValueError(
-            f"MuJoCo Warp refuses the model: {reason}; change the model, or use engine='mujoco'"
-        ) from error
+        raise ValueError(f"MuJoCo Warp refuses the model: {reason}; change the model, or {fix}") from error
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
