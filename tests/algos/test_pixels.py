@@ -92,7 +92,8 @@ def test_a_run_with_cameras_resumes_to_the_bit_and_its_policy_acts_elsewhere(env
         lw.evaluate(lw.make("cartpole", nworld=2, horizon=5), policy, 2)
 
 
-@pytest.mark.parametrize("suffix", [".pt2", pytest.param(".onnx", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("suffix", [".pt2", ".onnx"])
 def test_an_exported_policy_takes_pictures(env: lw.Env, tmp_path: Path, suffix: str) -> None:
     policy = ppo(env, policy_groups=()).policy
     state, obs = torch.rand(4, policy.state_size), policy.inputs(env.obs_groups)
