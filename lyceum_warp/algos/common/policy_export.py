@@ -2,7 +2,6 @@
 
 import contextlib
 import copy
-import dataclasses
 import importlib.util
 import json
 import logging
@@ -127,7 +126,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         for entry, part in zip(parts, env.obs_space.parts.values(), strict=True):
             entry |= {"offset": normalizer.shift[part].tolist(), "scale": normalizer.scale[part].tolist()}
     groups = getattr(policy, "groups", ("policy",))
-    cameras = [dataclasses.asdict(camera) for camera in task.cameras if camera.group in groups]
+    cameras = [vars(camera) for camera in task.cameras if camera.group in groups]
     return {
         "task": task.name,
         "timestep": env.timestep,
