@@ -35,6 +35,7 @@ from lyceum_warp.controllers.loop import control as control
 from lyceum_warp.controllers.real_time import control_async as control_async
 from lyceum_warp.controllers.report import ControlReport as ControlReport, control_report as control_report
 from lyceum_warp.controllers.trajectory import Trajectory as Trajectory
+from lyceum_warp.core.cameras import Camera as Camera
 from lyceum_warp.core.done import Done as Done
 from lyceum_warp.core.fields import quat as quat, vec10 as vec10
 from lyceum_warp.core.gate import Gate as Gate, Limit as Limit, Verdict as Verdict

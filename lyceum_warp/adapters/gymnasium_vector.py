@@ -86,6 +86,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if max_episode_steps is not None:
             options["horizon"] = max_episode_steps
         same_step = self.autoreset_mode is AutoresetMode.SAME_STEP
+        if same_step and not isinstance(task, Env):
+            options.setdefault("final_pictures", True)  # infos have the final observations
         self.env = env = environment_of(task, num_envs, options, autoreset=same_step)
         self.num_envs = env.nworld
         self.render_mode = render_mode
@@ -202,7 +204,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if not env.autoreset:
             # a world with a fault has already restarted, so its final observation is in final_obs
             done = env.done[:, None]
-            groups = {name: torch.where(done, env.final_obs_groups[name], obs) for name, obs in groups.items()}
+            rows = {name: final for name, final in env.final_obs_groups.items() if final.ndim == 2}
+            groups |= {name: torch.where(done, final, groups[name]) for name, final in rows.items()}
         if env.task.functions["success"] is not None:
             infos["success"] = env.success
         tables = {}
@@ -270,7 +273,7 @@ def check_array(actions: Any, shape: tuple[int, ...]) -> None:
 def _box(space: Space) -> gymnasium.spaces.Box:
     """Convert a space to a Gymnasium Box."""
     low, high = (-np.inf if space.low is None else space.low), (np.inf if space.high is None else space.high)
-    return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.float32)
+    return gymnasium.spaces.Box(low, high, shape=space.shape, dtype=np.dtype(str(space.dtype).partition(".")[2]).type)
 
 
 def _mapped(values: Any, function: Callable[[Any], Any]) -> Any:

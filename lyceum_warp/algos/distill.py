@@ -18,10 +18,15 @@ from torch import nn
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision
 from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
+from lyceum_warp.algos.common.pictures import (
+    picture_settings,
+    policy_inputs,
+    shift_pictures,
+)
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_sizes
 from lyceum_warp.algos.common.rollout_buffer import Rollout
@@ -37,14 +42,14 @@ _EPS = 1e-2
 
 _BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "gradient_length": 1, "learning_rate": 0.0, "max_grad_norm": 0.0,
-    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1,
+    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1, **PICTURE_BOUNDS,
 }  # fmt: skip
 
 
 @suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DistillConfig:
+class DistillConfig(PictureConfig):
     """Hyperparameters of ``Distill``.
 
     Raises:
@@ -169,6 +174,7 @@ class Distill(Learner):
         FloatingPointError: The loss, or a parameter, is not finite after an iteration.
     """
 
+    sees = True
     algorithm = "distill"
     """The name of the algorithm in a run's config.json."""
     config: DistillConfig
@@ -205,23 +211,33 @@ class Distill(Learner):
         if policy is not None:
             check_policy(trainable(policy), env, twice=False)
         init = torch.Generator().manual_seed(self.seed)
+        nobs, sees = policy_inputs(env, config)
         self.policy = policy or GaussianPolicy(
-            env.obs_space.size, env.action_space.size, config.hidden, recurrent=config.recurrent,
-            activation=config.activation, log_std=config.log_std, normalize=config.normalize, generator=init,
+            nobs, env.action_space.size, config.hidden, recurrent=config.recurrent, activation=config.activation,
+            log_std=config.log_std, normalize=config.normalize, generator=init, **sees,
         )  # fmt: skip
         if policy is None:
-            initialize_as_torch(self.policy, init)
+            initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
         shape = self.policy.shape
         fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
-        fitted |= {} if "own" in shape else {"recurrent": self.policy.state_size}
+        seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
+        fitted |= seen | ({} if "own" in shape else {"recurrent": shape.get("recurrent", 0)})
+        if self._clones and self.policy.pictures:
+            raise ValueError(
+                "demonstrations hold no pictures: use policy_groups=('policy',), or a policy as the teacher"
+            )
         self.config = config = dataclasses.replace(config, **fitted)
         self.teacher = teacher
         self.policy.to(device)
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
 
+        self._burn_in = getattr(self.policy.network, "burn_in", 0)
+        if self._burn_in >= config.gradient_length:
+            frames = self._burn_in + 1
+            raise ValueError(f"gradient_length={config.gradient_length} must be at least frames, which is {frames}")
         steps, nworld = config.num_steps, env.nworld * team.size
         self.count = steps * nworld
-        self.rollout = Rollout(env, steps)
+        self.rollout = Rollout(env, steps, groups=self.policy.groups)
         self._label = torch.zeros_like(env.action)
         self.label = self.rollout.store_too(self._label)
         """The teacher's actions, (steps, nworld, nact)."""
@@ -297,9 +313,10 @@ class Distill(Learner):
 
         After each step, the normaliser is updated with the step's observations.
         """
-        rollout = self.rollout
+        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
+            self.policy.observe_pictures(self.env.obs_groups, team)
             self._state.copy_(self._player.state)
             rollout.begin()
             for _ in range(rollout.steps):
@@ -328,6 +345,8 @@ class Distill(Learner):
 
     def update(self) -> None:
         """Run the epochs. Memory goes on from the last one, as in rsl_rl: this state is that of the new student."""
+        for group in self.policy.pictures if self.config.random_shift else ():
+            shift_pictures(self.rollout.obs_groups[group], self.config.random_shift, self.generator)
         self._loss.zero_()
         for _ in range(self.config.epochs):
             self._epoch()
@@ -338,12 +357,17 @@ class Distill(Learner):
         """Run an epoch: step through the samples in order, with a step of Adam after each ``gradient_length`` steps."""
         loss_of = nn.functional.mse_loss if self.config.loss == "mse" else nn.functional.huber_loss
         rollout, state, length = self.rollout, self._state, self.config.gradient_length
+        groups = {group: rollout.obs_groups[group] for group in self.policy.groups}
         for t in range(0, rollout.steps, length):
-            part = slice(t, t + length)
-            mean, states = self.policy.unrolled(rollout.obs[part], state, rollout.step[part] == 0.0)
-            self._loss += self._step(length * loss_of(mean, self.label[part]) / self.team.size) / length
-            state = states[-1].detach()
-        self._next_state.copy_(state)
+            # repeat the steps whose features an older encoder would have computed
+            first = max(t - self._burn_in, 0)
+            part = slice(first, t + length)
+            obs = self.policy.inputs({group: rows[part] for group, rows in groups.items()})
+            mean, states = self.policy.unrolled(obs, state, rollout.step[part] == 0.0)
+            loss = loss_of(mean[t - first :], self.label[t : t + length])
+            self._loss += self._step(length * loss / self.team.size) / length
+            state = states[length - self._burn_in - 1 + t - first].detach()
+        self._next_state.copy_(states[-1].detach())
 
     def enter(self, env: Env) -> None:
         """Go on in another environment of the same task; see ``Learner``."""

@@ -17,10 +17,11 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
-from lyceum_warp.algos.common.hyperparameters import Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
+from lyceum_warp.algos.common.pictures import PictureNetwork, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
 from lyceum_warp.algos.common.rollout_statistics import OnPolicyIteration, gathered
 from lyceum_warp.algos.common.symmetry import apply_symmetry
@@ -47,14 +48,14 @@ _BOUNDS: dict[str, Bound] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0,
+    "recurrent": 0, "state_coef": 0.0, **PICTURE_BOUNDS,
 }  # fmt: skip
 
 
 @suggest_arguments
 @document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PPOConfig:
+class PPOConfig(PictureConfig):
     """Hyperparameters of PPO. Except for ``desired_kl``, the defaults are mjlab's settings for legged robots.
 
     Raises:
@@ -114,13 +115,17 @@ class PPOConfig:
     value_activation: Activation = "elu"
     """Activation of the value function's hidden layers."""
     value_group: str | None = None
-    """Group of observations for the value function; by default "critic" if the task has this group, else "policy"."""
+    """Group of observations for the value function; by default "critic" if the task has this group, else "policy". It
+    cannot be a camera, so a policy that sees pictures learns with a value function that knows the state."""
     symmetry: Literal["none", "exact", "loss", "augment"] = "none"
     """How to use the mirror symmetry that a task declares (``lw.Mirror``). "exact" averages the policy with its mirror
     image. "loss" adds a term to the loss: symmetry_coef times the squared difference between the policy and its mirror
     image. "augment" also learns from the mirror images of all samples. "none" ignores the symmetry."""
     symmetry_coef: float = 1.0
     """Coefficient of the symmetry loss, if symmetry is "loss"."""
+    state_coef: float = 1.0
+    """Coefficient of an additional loss for policies that see cameras: a linear layer must predict the value function's
+    normalised observations from the features of the pictures. 0 means no such loss."""
     normalize: bool = True
     """Whether to normalise observations by their running mean and variance, updated in every step."""
     stagger: bool = True
@@ -209,7 +214,7 @@ class PPO(OnPolicyLearner):
 
     algorithm = "ppo"
     """The name of the algorithm in a run's config.json."""
-    config_type, twice = PPOConfig, False
+    config_type, twice, sees = PPOConfig, False, True
     config: PPOConfig
     """Hyperparameters."""
     rate: torch.Tensor
@@ -237,6 +242,9 @@ class PPO(OnPolicyLearner):
                 f"symmetry={config.symmetry!r} needs a policy without memory: use symmetry='none' (--symmetry none)"
             )
         self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
+        self._burn_in = getattr(self.policy.network, "burn_in", 0)
+        if self._burn_in >= steps:
+            raise ValueError(f"num_steps={steps} must be at least frames, which is {self._burn_in + 1}")
         count, items = steps * nworld // self._length, "worlds" if self._recurrent else "samples"
         if config.minibatches > count:
             raise ValueError(
@@ -262,10 +270,16 @@ class PPO(OnPolicyLearner):
         self._value_state = torch.zeros(env.nworld, self.value.state_size, device=device)
 
         # the update
+        self._predictor: nn.Linear | None = None
+        if config.state_coef and isinstance(self.policy.network, PictureNetwork):
+            self._predictor = nn.Linear(self.policy.network.size, env.obs_spaces[self.value.group].size, device=device)
+            nn.init.zeros_(self._predictor.weight)
+            nn.init.zeros_(self._predictor.bias)
         log_std = self.policy.log_std
         self.std = log_std if config.std_type == "log" else nn.Parameter(log_std.detach().exp())
         self.std.requires_grad_(log_std.requires_grad)
-        acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std)]
+        predicting = () if self._predictor is None else self._predictor.parameters()
+        acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std), *predicting]
         learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
         self._parameters = [p for group in learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
@@ -344,9 +358,10 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        rollout = self.rollout
+        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
+            self.policy.observe_pictures(self.env.obs_groups, team)
             rollout.begin()
             self._first.copy_(self._player.state)
             for _ in range(rollout.steps):
@@ -388,8 +403,10 @@ class PPO(OnPolicyLearner):
             variance = team.sum(advantage.square().sum()) / max(self.count - 1, 1)
             advantage = advantage / (variance.sqrt() + 1e-8)
         self._old_log_std.copy_(self.policy.log_std)
+        seen = {f"obs/{group}": rollout.obs_groups[group] for group in self.policy.groups}
         samples = {
-            "obs": rollout.obs, "value_obs": obs, "step": rollout.step, "action": rollout.action, "mean": self._means,
+            **(seen if self.policy.pictures else {"obs": rollout.obs}), "value_obs": obs, "step": rollout.step,
+            "action": rollout.action, "mean": self._means,
             "log_prob": log_density(rollout.action, self._means, self._old_log_std), "value": value, "target": target,
             "advantage": advantage,
         }  # fmt: skip
@@ -398,6 +415,8 @@ class PPO(OnPolicyLearner):
     def update(self, samples: Samples) -> None:
         """Run the epochs of mini-batches."""
         config, team, length = self.config, self.team, self._length
+        for group in self.policy.pictures if config.random_shift else ():
+            shift_pictures(samples[f"obs/{group}"], config.random_shift, self.generator)
         if self._recurrent:  # for the mini-batches, a sequence is one sample
             samples = {name: part.transpose(0, 1)[None] for name, part in samples.items()}
         parts = self.minibatches.shuffle(samples, self.generator)
@@ -420,7 +439,8 @@ class PPO(OnPolicyLearner):
         config, clip = self.config, self.config.clip
         if self._recurrent:
             samples = {name: part.transpose(0, 1) for name, part in samples.items()}
-            weight = (weight / self._length).expand(self._length, -1)
+            weight = (weight / (self._length - self._burn_in)).repeat(self._length, 1)
+            weight[: self._burn_in] = 0.0
         old_mean, kl_weight = samples["mean"], weight
         if config.symmetry == "augment":
             samples, weight = self._with_images(samples), torch.cat([weight, weight]) / 2.0
@@ -431,7 +451,8 @@ class PPO(OnPolicyLearner):
                 clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
                 error = torch.max(error, (clipped - samples["target"]).square())
             value_loss = (weight * error).sum()
-        mean, log_std = self._mean_of(samples), self._log_std()
+        mean, prediction_loss = self._mean_of(samples, weight)
+        log_std = self._log_std()
         ratio = torch.exp(log_density(samples["action"], mean, log_std) - samples["log_prob"])
         advantage = samples["advantage"]
         surrogate = torch.max(-advantage * ratio, -advantage * ratio.clamp(1.0 - clip, 1.0 + clip))
@@ -439,7 +460,7 @@ class PPO(OnPolicyLearner):
         surrogate_loss = (weight * surrogate).sum()
         self._branch.join()
         losses = torch.stack([value_loss, surrogate_loss, weight.sum() * entropy])
-        loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2]
+        loss = config.value_coef * losses[0] + losses[1] - self._entropy_coef * losses[2] + prediction_loss
         if config.symmetry == "loss":
             assert self._mirror is not None
             image = self._mirror.action(self.policy(self._mirror.obs(samples["obs"])))
@@ -461,12 +482,22 @@ class PPO(OnPolicyLearner):
             self.optimizer.step()
             self._losses += self._sums[-3:]
 
-    def _mean_of(self, samples: Samples) -> torch.Tensor:
-        """Compute the mean actions of a mini-batch."""
+    def _mean_of(self, samples: Samples, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | float]:
+        """Compute the mean actions of a mini-batch, and the loss of the predicted state."""
+        policy = self.policy
         if not self._recurrent:
-            return self.policy(samples["obs"])
-        mean, _ = self.policy.unrolled(samples["obs"], samples["state"][0], samples["step"] == 0.0)
-        return mean
+            return policy(samples["obs"]), 0.0
+        began, state = samples["step"] == 0.0, samples["state"][0]
+        if not policy.pictures:
+            return policy.unrolled(samples["obs"], state, began)[0], 0.0
+        obs = policy.inputs({group: samples[f"obs/{group}"] for group in policy.groups})
+        if self._predictor is None:
+            return policy.unrolled(obs, state, began)[0], 0.0
+        features = policy.features(obs, state, began)
+        with torch.no_grad():
+            truth = self.value.normalizer(samples["value_obs"])
+        error = (self._predictor(features) - truth).square().mean(-1)
+        return policy.network.network(features), self.config.state_coef * (weight * error).sum()  # type: ignore[operator]
 
     def _value_of(self, samples: Samples) -> torch.Tensor:
         """Predict the values of a mini-batch."""
@@ -504,10 +535,15 @@ class PPO(OnPolicyLearner):
 
     @torch.no_grad()
     def divergence(self) -> torch.Tensor:
-        """Compute the KL divergence from the old to the current policy, averaged over the samples."""
-        rollout, policy = self.rollout, self.policy
-        mean, _ = policy.unrolled(rollout.obs, self._first, rollout.step == 0.0)
-        kl = divergence(self._means, self._old_log_std, mean, policy.log_std).mean()
+        """Compute the KL divergence from the old to the current policy, averaged over the samples.
+
+        A policy that sees cameras goes on with the state that its new encoders compute.
+        """
+        rollout, policy, after = self.rollout, self.policy, slice(self._burn_in, None)
+        mean, states = policy.unrolled(policy.inputs(rollout.obs_groups), self._first, rollout.step == 0.0)
+        if policy.pictures:  # go on with the features of the new encoders
+            self._player.state.copy_(states[-1])
+        kl = divergence(self._means[after], self._old_log_std, mean[after], policy.log_std).mean()
         return self.team.sum(kl) / self.team.size
 
     def _returns(self) -> list[float]:
@@ -519,6 +555,8 @@ class PPO(OnPolicyLearner):
     def state_dict(self) -> dict[str, Any]:
         """Copy the complete state; see ``Learner``."""
         state = {"optimizer": self.optimizer.state_dict(), "std": self.std.detach(), "recent": list(self._recent)}
+        if self._predictor is not None:
+            state["predictor"] = self._predictor.state_dict()
         if self._recurrent:
             state["memory"] = [self.team.gather(part) for part in (self._player.state, self._value_state)]
         return super().state_dict() | copy.deepcopy(state)
@@ -527,6 +565,8 @@ class PPO(OnPolicyLearner):
         """Resume from a result of ``state_dict``; see ``Learner``."""
         super().load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
+        if self._predictor is not None:
+            self._predictor.load_state_dict(state["predictor"])
         with torch.no_grad():
             self.std.copy_(state["std"])
         self._recent.clear()

@@ -16,6 +16,7 @@ from lyceum_warp.binding.functions import TaskSource, draws_noise
 from lyceum_warp.binding.layouts import layouts_of
 from lyceum_warp.binding.parameters import Parameters
 from lyceum_warp.binding.registry import task_name
+from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
 from lyceum_warp.core.fitted import Fitted
 from lyceum_warp.core.model_fields import describe_model_field
@@ -38,6 +39,7 @@ class BoundTask:
         params: Values for the fields of ``Params``: one value, or one value per world.
         fitted: Folder of a fit.
         fitted_draws: Whether the fitted fields may differ between worlds.
+        cameras: Cameras whose pictures are observations; None for those of the task.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class BoundTask:
         params: Mapping[str, Any] | None = None,
         fitted: str | None = None,
         fitted_draws: bool = False,
+        cameras: Collection[Camera] | None = None,
     ) -> None:
         physics = physics or PhysicsOptions()
         self.definition = task
@@ -63,6 +66,10 @@ class BoundTask:
         self.metrics, self.curriculum = source.terms.metrics, source.curriculum
         self.writes = source.writes
         """What each function writes: fields of World and rows of memory."""
+        self.cameras = cameras_of(task.cameras if cameras is None else cameras)
+        """The cameras whose pictures are observations."""
+        if self.cameras:
+            fields = [*fields, "qpos", "mocap_pos", "mocap_quat"]
         names = [name for name in dict.fromkeys([*self.types, *fields]) if name not in MEMORIES]
         data_fields = [name for name in names if is_data_field(name)]
         model_fields = [name for name in names if not is_data_field(name)]
@@ -77,6 +84,8 @@ class BoundTask:
         if self.fit:
             self.fit.delay(edited, physics.timestep or edited.option.timestep)
         varied = {*model_fields, *dynamics, *fields_of_fit}
+        for camera in self.cameras:
+            camera.add_to(edited)
         with _file_in_errors(task.model if model is None else model):
             self.nominal = models.compile_model(edited, data_fields, physics, varied=varied)
             """The compiled model without the values of a fit."""

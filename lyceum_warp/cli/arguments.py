@@ -66,7 +66,7 @@ class OptionFlags:
         docs = attribute_docs(cls)
         for kind in options:
             types |= {name: hint for name, hint in typing.get_type_hints(kind).items() if name not in types}
-            docs = attribute_docs(kind) | docs
+            docs = attribute_docs(*filter(dataclasses.is_dataclass, reversed(kind.__mro__))) | docs
         cls.__annotations__ = {}
         for name, hint in (types | declared).items():
             if name in omit:
@@ -93,7 +93,10 @@ def given(flags: Any) -> dict[str, Any]:
     return values
 
 
-NO_FLAGS = ("nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "physics")
+NO_FLAGS = (
+    "nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "cameras", "final_pictures",
+    "physics",
+)  # fmt: skip
 """Options of an environment for which no flag is generated.
 
 Each command declares its own flags for nworld, seed and the model. ``Physics`` declares the physics options. The other

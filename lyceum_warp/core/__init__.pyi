@@ -1,3 +1,4 @@
+from lyceum_warp.core.cameras import Camera as Camera
 from lyceum_warp.core.done import (
     FAULTS as FAULTS,
     Done as Done,

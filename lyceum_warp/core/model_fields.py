@@ -35,6 +35,9 @@ _WRAPPED = {"geom_pos", "geom_quat", "geom_size"}
 
 _WRAPS = [int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)]
 
+PICTURED = ("cam_fovy", "geom_rgba", "mat_rgba", "light_ambient", "light_diffuse")
+"""Fields that can differ between worlds and affect only pictures."""
+
 VARYING_FIELDS = (
     dict.fromkeys(
         # contacts
@@ -63,6 +66,7 @@ VARYING_FIELDS = (
         _POSES,
     )
     | dict.fromkeys(("cam_pos", "cam_quat"), Constants.KINEMATIC | Constants.PRIVATE)
+    | dict.fromkeys(PICTURED, Constants.NONE)
     | {"body_mass": _ALL, "geom_size": Constants.FIXED | Constants.PRIVATE}
 )
 """Fields that can differ between worlds, each with the constants that follow from it."""

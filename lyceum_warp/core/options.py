@@ -11,6 +11,7 @@ from typing import Any
 
 import mujoco
 
+from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.model_files import ModelSource
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
@@ -185,6 +186,11 @@ class EnvOptions:
     fitted_draws: bool = False
     """Whether each world draws its own values from what the fit left uncertain. A world keeps them for all episodes,
     and the task's own draws start from them."""
+    cameras: Collection[Camera] | None = None
+    """Cameras whose pictures are observations, such as ``[lw.Camera("fixed")]``; by default those of the task."""
+    final_pictures: bool = False
+    """Whether ``final_obs_groups`` holds pictures, too. All worlds are then rendered a second time in each step in
+    which an episode ends. PPO and Distill do not need these pictures."""
     physics: PhysicsOptions = PhysicsOptions()
     """Physics options, or the name of options in the task's ``physics``. "exact" means the options of the task's
     model."""
@@ -207,6 +213,9 @@ class EnvOptions:
         elif self.fitted_draws:
             raise ValueError("fitted_draws=True needs a fit: pass its folder as fitted=...")
         check_flag("graphs", self.graphs)
+        check_flag("final_pictures", self.final_pictures)
+        if self.cameras is not None:
+            object.__setattr__(self, "cameras", cameras_of(self.cameras))
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
             names = getattr(self, option)
             if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):

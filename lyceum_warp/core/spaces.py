@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 import torch
 
+from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.fields import STATE_FIELDS, Field
 from lyceum_warp.core.model_fields import ModelField
 
@@ -25,6 +26,8 @@ class Space:
     """Lower bounds, of shape ``shape``."""
     high: np.ndarray | None = None
     """Upper bounds, of shape ``shape``."""
+    picture: tuple[int, int, int] | None = None
+    """Height, width and channels of a camera's picture."""
 
     @classmethod
     def of(cls, sizes: Mapping[str, int], **rest: object) -> "Space":
@@ -42,8 +45,8 @@ class Space:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the vector, (size,), or () for a scalar."""
-        return (self.size,) if self.parts else ()
+        """Shape of the vector, (size,), or () for a scalar; of a picture, (height, width, channels)."""
+        return self.picture or ((self.size,) if self.parts else ())
 
     @property
     def columns(self) -> list[str]:
@@ -97,6 +100,21 @@ def _controls(model: mujoco.MjModel) -> dict[str, int]:
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])
     return sizes
+
+
+_PIXELS: dict[str, tuple[int, torch.dtype, tuple[float, float]]] = {
+    "rgb": (3, torch.uint8, (0, 255)), "depth": (1, torch.float32, (0, np.inf)),
+    "segmentation": (2, torch.int32, (-1, 2**31 - 1)),
+}  # fmt: skip
+"""Channels, type and range of the pixels of each kind."""
+
+
+def picture_space(camera: Camera) -> Space:
+    """Make the space of a camera's pictures, of shape (height, width, channels)."""
+    channels, dtype, bounds = _PIXELS[camera.kind]
+    shape = camera.height, camera.width, channels
+    low, high = (np.full(shape, bound) for bound in bounds)
+    return Space.of({camera.group: int(np.prod(shape))}, dtype=dtype, low=low, high=high, picture=shape)
 
 
 def control_scale(model: mujoco.MjModel, action_range: tuple[float, float] | None) -> np.ndarray:

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
+from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.gate import Gate
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.support.docstrings import document_attributes
@@ -387,6 +388,8 @@ class Task:
     "critic": {"position": 5, "mass": 1}}``. Then ``observe`` writes the group ``policy`` (``env.obs``).
     ``observe_critic`` has the same arguments and writes the group ``critic``. Omit ``obs`` if the last argument of
     ``observe`` is a Warp struct whose fields have the default ``lw.part(size)``."""
+    cameras: ClassVar[tuple[Camera, ...]] = ()
+    """Cameras whose pictures are further groups of observations, such as ``(lw.Camera("fixed", width=64),)``."""
     params: ClassVar[Mapping[str, Any]] = {}
     """Defaults that replace those of ``Params``, such as ``{"move_speed": 8.0}`` for a faster variant of a task."""
     rewards: ClassVar[Mapping[str, float]] = {}

@@ -10,11 +10,19 @@ import warp as wp
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import sizes
 from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.spaces import OWN_PARTS, Space, action_space, control_ranges, control_scale, state_space
+from lyceum_warp.core.spaces import (
+    OWN_PARTS,
+    Space,
+    action_space,
+    control_ranges,
+    control_scale,
+    picture_space,
+    state_space,
+)
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
-from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, zeros_of
+from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_view, with_memory, words, zeros_of
 from lyceum_warp.support.tensors import check_tensor
 
 
@@ -24,7 +32,12 @@ def own_bytes_per_world(task: BoundTask) -> int:
     state_size = state_space(task.model, snapshots, task.dynamics, own).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
-    return 4 * copies + 8 * state_size + 8 * observations + 300
+    total = 4 * copies + 8 * state_size + 8 * observations + 300
+    if task.cameras:
+        from lyceum_warp.engines.pictures import picture_bytes  # loads MuJoCo Warp
+
+        total += picture_bytes(task.model, task.cameras)
+    return total
 
 
 def own_parts(task: BoundTask) -> dict[str, int]:
@@ -45,7 +58,7 @@ def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
 class WorldArrays:
     """All arrays of an environment's worlds."""
 
-    def __init__(self, task: BoundTask, engine: Engine) -> None:
+    def __init__(self, task: BoundTask, engine: Engine, *, final_pictures: bool = False) -> None:
         self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
         with wp.ScopedDevice(self.device):
             self._allocate_fields()
@@ -57,6 +70,23 @@ class WorldArrays:
         self.state_view = torch_view(self.state)
         self.drawn: dict[str, wp.array] = {}
         """Each world's own values of fitted model fields, (nworld, size), which take the place of the nominal ones."""
+        self._allocate_pictures(final_pictures)
+
+    def _allocate_pictures(self, final: bool) -> None:
+        self.pictures, self._final_pictures = None, list[tuple[Any, Any]]()
+        self.picture_groups, self.final_picture_groups = {}, {}
+        self.picture_spaces = {camera.group: picture_space(camera) for camera in self.task.cameras}
+        if not self.task.cameras:
+            return
+        from lyceum_warp.engines.pictures import Pictures  # loads MuJoCo Warp
+
+        self.pictures = Pictures(self.engine, self.task.cameras)
+        self.picture_groups = self.pictures.groups
+        if final:
+            self.final_picture_groups = {group: torch.zeros_like(now) for group, now in self.picture_groups.items()}
+            for pair in zip(self.picture_groups.values(), self.final_picture_groups.values(), strict=True):
+                live, kept = (wp.from_torch(words(picture)) for picture in pair)
+                self._final_pictures.append((live, kept))
 
     def _allocate_fields(self) -> None:
         n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels

@@ -15,6 +15,7 @@ from lyceum_warp.binding.attributes import check_fields
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.compile_errors import explained
 from lyceum_warp.binding.registry import errors_of, find_task, task_name
+from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.done import FAULTS
 from lyceum_warp.core.fields import describe, elements, has_several_rows, is_data_field
 from lyceum_warp.core.model_fields import describe_model_field, is_model_field, put_rows
@@ -58,6 +59,8 @@ def make(  # noqa: D417
     dynamics: Collection[str] = (),
     fitted: str | Path | None = None,
     fitted_draws: bool | None = None,
+    cameras: Collection[Camera] | None = None,
+    final_pictures: bool = False,
     physics: str | PhysicsOptions | None = None,
     frame_skip: int | None = None,
     timestep: float | None = None,
@@ -120,9 +123,10 @@ class Env:
     final_obs: torch.Tensor
     """Observations after the last step, before any reset, (nworld, nobs), float32."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations by group, each (nworld, group size). The group ``policy`` is ``obs``."""
+    """Observations by group, each (nworld, group size). The group ``policy`` is ``obs``. A camera's group has its
+    pictures, (nworld, height, width, channels); see ``lw.Camera``."""
     final_obs_groups: dict[str, torch.Tensor]
-    """``final_obs`` of each group."""
+    """``final_obs`` of each group. Cameras have final pictures only if the option ``final_pictures`` is set."""
     reward: torch.Tensor
     """Rewards of the last step, (nworld,), float32."""
     eval: torch.Tensor
@@ -201,8 +205,10 @@ class Env:
                 call_once_gone(self, worlds.drop_programs)
                 for name, buffer in worlds.buffers.items():
                     setattr(self, name, buffer)
-                self.obs_groups, self.final_obs_groups = worlds.obs_groups, worlds.final_obs_groups
-                self.obs_spaces, self.obs_space = worlds.obs_spaces, worlds.obs_spaces["policy"]
+                self.obs_groups = worlds.obs_groups | worlds.picture_groups
+                self.final_obs_groups = worlds.final_obs_groups | worlds.final_picture_groups
+                self.obs_space = worlds.obs_spaces["policy"]
+                self.obs_spaces = worlds.obs_spaces | worlds.picture_spaces
                 self.action_space, self.state_space = worlds.action_space, worlds.state_space
                 self.metrics, self.episode_metrics = (
                     Named("metric", zip(self.task.metrics, torch_view(array).unbind(1), strict=True))
@@ -608,9 +614,12 @@ class Env:
     def replicate_few(self, nworld: int, **changes: Any) -> "Env":
         """Replicate the environment with only a few worlds, with the C engine if ``engine`` is "auto".
 
-        On a GPU, a step of a few worlds takes nearly as long as a step of thousands.
+        On a GPU, a step of a few worlds takes nearly as long as a step of thousands. An environment with cameras keeps
+        its engine.
         """
-        return self.replicate(nworld=nworld, **(options_for_few_worlds(self.options.engine, self.device) | changes))
+        # pictures of few worlds are rendered much faster on a GPU, and the C engine would render them on the CPU
+        few = {} if self.task.cameras else options_for_few_worlds(self.options.engine, self.device)
+        return self.replicate(nworld=nworld, **(few | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
         known, worlds = self.task.parameters, np.arange(nworld) % self.nworld

@@ -101,9 +101,9 @@ class OpenLoop:
             self._reward = wp.zeros(self.horizon * n, dtype=float)
             self._terminated = wp.zeros(self.horizon * n, dtype=bool)
             self._fault = wp.zeros(n, dtype=int)
-            shapes = {group: (n, space.size) for group, space in env.obs_spaces.items()}
+            shapes = {group: (n, space.size) for group, space in env.worlds.obs_spaces.items()}
             self._obs = zeros_of(task.kernels.Observations, **shapes)
-            self._finite = wp.zeros((len(env.obs_spaces), n), dtype=bool)
+            self._finite = wp.zeros((len(env.worlds.obs_spaces), n), dtype=bool)
             self._no_memory = wp.zeros(((self.horizon + 1) * n, 0), dtype=float)
             self._make_rows()
         self.states, self.actions = torch_view(self._state), torch_view(self._actions)
@@ -111,7 +111,7 @@ class OpenLoop:
         self.reward = torch_view(self._reward).view(self.horizon, n)
         self.terminated = torch_view(self._terminated).view(self.horizon, n)
         self.fault = torch_view(self._fault)
-        self.final_obs_groups = {group: torch_view(getattr(self._obs, group)) for group in env.obs_spaces}
+        self.final_obs_groups = {group: torch_view(getattr(self._obs, group)) for group in env.worlds.obs_spaces}
         self.final_obs = self.final_obs_groups["policy"]
         self.phases = self._step_by_step() if stepwise else self._whole_horizon()
         self._calls = self.sequence(self.phases)

@@ -9,7 +9,7 @@ from torch import nn
 
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.tensors import repeatable
-from lyceum_warp.support.validate import described
+from lyceum_warp.support.validate import check_group, described
 
 Policy: TypeAlias = nn.Module | Callable[[torch.Tensor], torch.Tensor]
 """A module with the method ``act``, or a function from observations to actions."""
@@ -21,7 +21,8 @@ class Player:
     """A function from observations, (nworld, nobs), to a policy's actions, (nworld, nact).
 
     A policy with memory has the attribute ``state_size``, and its ``act(obs, state)`` returns the actions and the next
-    state. Its state is 0 when an episode begins. Each call must be followed by a step of the environment.
+    state. Its state is 0 when an episode begins. Each call must be followed by a step of the environment. A policy that
+    sees cameras has the attribute ``groups``; its observations are a tuple, to which the player adds the pictures.
 
     Args:
         policy: The policy. If it is a module on another device than the environment, a copy of it acts.
@@ -36,14 +37,17 @@ class Player:
             policy = moved(policy, env)
         self._act: Callable[..., Any] = getattr(policy, "act", policy)
         self.env, self.state_size = env, getattr(policy, "state_size", 0)
+        self._groups: tuple[str, ...] = getattr(policy, "groups", ("policy",))
+        for group in self._groups:
+            check_group(group, env.obs_groups, env.task.name)
         self.state = torch.zeros(env.nworld, self.state_size, device=env.obs.device)
 
     def __call__(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute the actions, and keep the next state."""
         if not self.state_size:
-            action: torch.Tensor = self._act(obs)
+            action: torch.Tensor = self._act(self._inputs(obs))
             return action
-        action, state = self._act(obs, self._state())
+        action, state = self._act(self._inputs(obs), self._state())
         self.state.copy_(state.detach())
         return action
 
@@ -55,9 +59,9 @@ class Player:
         """
         state = (self._state(),) if self.state_size else ()
         try:
-            outputs = repeatable(self._act, obs, *state)
+            outputs = repeatable(self._act, self._inputs(obs), *state)
         except RuntimeError as error:
-            sizes = f"{described(obs)}, of the task {self.env.task.name!r}"
+            sizes = f"{described(obs)}{' and pictures' * (len(self._groups) > 1)}, of the task {self.env.task.name!r}"
             raise ValueError(f"policy cannot take the observations, {sizes}: {str(error).splitlines()[0]}") from error
         expected = self.env.action, *state
         if [getattr(one, "shape", None) for one in outputs] != [one.shape for one in expected]:
@@ -67,6 +71,12 @@ class Player:
             self.state.copy_(outputs[1].detach())
         action: torch.Tensor = outputs[0]
         return action
+
+    def _inputs(self, obs: torch.Tensor) -> Any:
+        """Add the pictures of the cameras that the policy sees."""
+        if self._groups == ("policy",):
+            return obs
+        return tuple(obs if group == "policy" else self.env.obs_groups[group] for group in self._groups)
 
     def _state(self) -> torch.Tensor:
         return self.state.masked_fill((self.env.episode_step == 0).unsqueeze(-1), 0.0)

@@ -18,11 +18,12 @@ from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.resets import Resets
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
 from lyceum_warp.graphs.workers import Workers
-from lyceum_warp.kernels import rows
+from lyceum_warp.kernels import rows, state
 from lyceum_warp.support.arrays import (
     flat,
     launch_lanes,
     launch_parts,
+    launch_rows,
     launch_worlds,
     torch_view,
 )
@@ -45,6 +46,7 @@ def open_worlds(task: type[Task], options: EnvOptions, params: Mapping[str, Any]
     bound = BoundTask(
         task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
         physics=options.physics, params=params, fitted=options.fitted, fitted_draws=options.fitted_draws,
+        cameras=options.cameras,
     )  # fmt: skip
     engine = open_engine(
         options.engine, bound.model, options.nworld, find_device(options.device), bound.fields,
@@ -60,7 +62,7 @@ class Worlds(Resets):
     """
 
     def __init__(self, task: BoundTask, engine: Engine, options: EnvOptions) -> None:
-        super().__init__(task, engine)
+        super().__init__(task, engine, final_pictures=options.final_pictures)
         if task.fit is not None and options.fitted_draws:
             draws = task.fit.draws(task.model, self.nworld, options.seed, options.first_world)
             self.drawn = {name: wp.array(rows, dtype=float, device=self.device) for name, rows in draws.items()}
@@ -116,7 +118,19 @@ class Worlds(Resets):
                 Phase("event", partial(self._event, kernel)), *only(self._physics_changed, self._moved_phases()),
             ]  # fmt: skip
             episodes = [*only(restarting, restart), *events, *only(restarting, refresh), *observe]
-        return [*self.transition_phases(substeps), *episodes]
+        final = [Phase("final pictures", self._keep_final_pictures)] if self._final_pictures else []
+        return [*self.transition_phases(substeps), *only(restarting, final), *episodes, *self.picture_phases()]
+
+    def picture_phases(self) -> list[Phase]:
+        """List the phase that renders the pictures of all worlds, if there are cameras."""
+        return [] if self.pictures is None else [Phase("pictures", self.pictures.render)]
+
+    def _keep_final_pictures(self) -> None:
+        """Render the worlds whose episode ended, before they restart. The renderer has no mask of worlds."""
+        assert self.pictures is not None
+        self.pictures.render()
+        for live, final in self._final_pictures:
+            launch_rows(state.copy_rows, self.restarting, live, final)
 
     def _merged(self, mask: wp.array, phases: list[Phase]) -> Phase:
         """Merge phases into one that is skipped if the mask is empty."""
@@ -154,6 +168,7 @@ class Worlds(Resets):
             *self.restart_phases(self.mask, randomly=randomly),
             *self.refresh_phases(self.mask),
             Phase("judge", self._judge_state, by_world=True),
+            *self.picture_phases(),
         ]
 
     def _moved_phases(self) -> list[Phase]:
@@ -182,6 +197,7 @@ class Worlds(Resets):
             Phase("restore engine", partial(self.engine.set_state, engine_columns, self.mask), engine=True),
             Phase("restore counters", self.unpack_state),
             Phase("judge", partial(self._judge_state, keep_reason=True), by_world=True),
+            *self.picture_phases(),
         ]
 
     def rehearsal(self) -> None:

@@ -65,6 +65,11 @@ def torch_view(array: wp.array) -> torch.Tensor:
     return wp.to_torch(array, requires_grad=False)
 
 
+def words(pictures: torch.Tensor) -> torch.Tensor:
+    """View pictures, (nworld, height, width, channels), as rows of float32, so that a kernel for rows copies them."""
+    return pictures.flatten(1).view(torch.float32)
+
+
 _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
 """The part of the worlds to which launches are restricted: the index of the part, and the number of parts."""
 

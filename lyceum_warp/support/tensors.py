@@ -16,8 +16,10 @@ def check_tensor(value: Any, name: str, like: torch.Tensor) -> None:
         raise ValueError(f"{name} must be on {like.device}, not on {value.device}: move it with .to()")
 
 
-def repeatable(act: Callable[..., Any], obs: torch.Tensor, *state: torch.Tensor) -> tuple[Any, ...]:
+def repeatable(act: Callable[..., Any], obs: Any, *state: torch.Tensor) -> tuple[Any, ...]:
     """Call a policy, and check that its actions do not depend on earlier calls. Return its outputs.
+
+    The observations are a tensor, or a tuple of tensors with pictures.
 
     Hidden memory would leak from one episode into the next. Policies may draw from torch's global random generators.
 
@@ -25,14 +27,16 @@ def repeatable(act: Callable[..., Any], obs: torch.Tensor, *state: torch.Tensor)
         ValueError: After a call with other observations, the policy gives other actions for the same arguments.
     """
 
-    def outputs(obs: torch.Tensor) -> tuple[Any, ...]:
+    def outputs(obs: Any) -> tuple[Any, ...]:
         result = act(obs, *state)
         return result if isinstance(result, tuple) else (result,)
 
-    with torch.random.fork_rng([obs.device] if obs.is_cuda else []):
+    parts = obs if isinstance(obs, tuple) else (obs,)
+    others = tuple(part + (0.1 if part.is_floating_point() else 1) for part in parts)
+    with torch.random.fork_rng([parts[0].device] if parts[0].is_cuda else []):
         first = outputs(obs)[0]
         first = first.clone() if isinstance(first, torch.Tensor) else None  # a policy may return a buffer
-        outputs(obs + 0.1)
+        outputs(others if isinstance(obs, tuple) else others[0])
     found = outputs(obs)
     if first is not None and not torch.equal(first.nan_to_num(), found[0].nan_to_num()):
         raise ValueError(

@@ -44,6 +44,10 @@ def mppi(*results: Result) -> None:
     assert len(returns) == 2 and max(returns) - min(returns) < 0.2 * abs(min(returns))
 
 
+def pictures(*results: Result) -> None:
+    assert len(results) == 2 and all(result["frames_per_second"] > 0.0 for result in results)
+
+
 def policies(result: Result) -> None:
     engines, physics = result["comparisons"]
     assert (engines["first"], engines["second"]) == ("C engine", "Warp engine on cpu")
@@ -67,6 +71,7 @@ SHORT: dict[Callable[..., None], str] = {
     humanoid: "--threads 1",
     latency: "--threads 1 --samples 8",
     mppi: "--threads 1 --contestants mppi python",
+    pictures: "",
     policies: "",
     soak: "--parts random memory --threads 1 --nworld 16 --steps 1600",
     throughput: "--tasks hopper --contestants native c gymnasium gym-sync --threads 1 --parts sampling single kept",

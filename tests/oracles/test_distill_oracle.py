@@ -54,7 +54,9 @@ def test_updates_give_the_same_student_as_rsl_rl(changes: dict[str, Any], shared
     for _ in range(2):
         obs, label = (torch.randn(STEPS, N, 1, generator=generator) for _ in range(2))
         starts = torch.cat([done[None], torch.rand(STEPS, N, generator=generator) < 0.15])
-        learner.rollout.obs, learner.label, learner.rollout.step = obs, label, (~starts[:-1]).double()
+        learner.rollout.obs_groups, learner.label, learner.rollout.step = (
+            {"policy": obs}, label, (~starts[:-1]).double()
+        )  # fmt: skip
         learner._state.copy_(learner._player.state)
         learner.update()
         groups = {"policy": obs, "critic": torch.zeros(STEPS, N, 2)}

@@ -1,4 +1,4 @@
-"""Check that the fields of a configuration match their annotations and bounds."""
+"""Check that the fields of a configuration match their annotations and bounds, and define fields that several have."""
 
 import dataclasses
 import math
@@ -7,6 +7,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias
 
+from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, finite_number, layer_sizes, whole_number
 
 Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
@@ -15,8 +16,32 @@ Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "ge
 Bound: TypeAlias = float | tuple[float, float]
 """The minimum of a number, or its minimum and its maximum."""
 
+PICTURE_BOUNDS: dict[str, Bound] = {"frames": 2, "random_shift": 0}
+"""Bounds of ``PictureConfig``."""
+
 LEAST = -math.inf
 """Lower bound that admits every finite number."""
+
+
+@document_attributes
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PictureConfig:
+    """Hyperparameters of policies that see cameras."""
+
+    policy_groups: tuple[str, ...] = ()
+    """Groups of observations for the policy; by default "policy" and all cameras. ("camera",) hides the numbers of the
+    group "policy" from the policy."""
+    channels: tuple[int, ...] = (16, 32, 32)
+    """Channels of the convolutional layers that encode a picture. Each layer halves its width and height."""
+    spatial_softmax: bool = False
+    """Whether the features of a picture are the mean positions of the last layer's channels (Levine et al. 2016,
+    "End-to-End Training of Deep Visuomotor Policies"). Otherwise, a linear layer computes them."""
+    frames: int = 3
+    """Number of a world's last pictures that the policy sees: the features of the current picture, and their changes
+    since earlier ones. The policy's state holds the features. With ``recurrent``, a GRU replaces them."""
+    random_shift: int = 0
+    """Largest random shift of the pictures in an update, in pixels (Yarats et al. 2021, "Image Augmentation Is All You
+    Need"). Each world has one shift in each iteration."""
 
 
 def check_fields(config: Any, bounds: Mapping[str, Bound]) -> None:
@@ -43,6 +68,10 @@ def _checked(name: str, value: Any, kinds: tuple[Any, ...], bound: Bound | None)
         return finite_number(name, value, low=low, high=high)
     if tuple[int, ...] in kinds:
         return tuple(layer_sizes(value, name))
+    if tuple[str, ...] in kinds:
+        if isinstance(value, str) or not all(isinstance(word, str) for word in value):
+            raise ValueError(f"{name} must be names of groups of observations, as in ('camera',), not {value!r}")
+        return tuple(value)
     if bool in kinds:
         check_flag(name, value)
     if kinds[0] == str | None:

@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import inspect
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
@@ -101,6 +101,8 @@ class Learner(abc.ABC):
             the seed is not a whole number.
     """
 
+    sees: ClassVar[bool] = False
+    """Whether the policy may see cameras."""
     algorithm: str
     """Name of the algorithm, and the key of its hyperparameters in a run's config.json."""
     env: Env
@@ -143,6 +145,8 @@ class Learner(abc.ABC):
                 f"process {team.rank} of {team.size} with {n} worlds needs an environment with "
                 f"first_world={self.own_worlds.start}, not {env.first_world}"
             )
+        if env.task.cameras and not self.sees:
+            raise ValueError(f"{type(self).__name__} cannot learn from cameras: make the environment with cameras=[]")
         if not env.autoreset:
             raise ValueError(
                 f"{type(self).__name__} needs an environment that resets automatically: make the environment with "

@@ -101,6 +101,11 @@ class GRU(nn.Module):
         state = self.cell(x, state)
         return self.network(state), state
 
+    def unrolled(self, x: torch.Tensor, state: torch.Tensor, began: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Run the network over sequences; see ``unrolled``. After the cell, all steps are one batch."""
+        states, _ = unrolled(lambda x, state: 2 * (self.cell(x, state),), x, state, began)
+        return self.network(states), states
+
 
 def unrolled(
     network: Callable[..., Any], x: torch.Tensor, state: torch.Tensor, began: torch.Tensor
@@ -116,10 +121,9 @@ def unrolled(
     Returns:
         The outputs (steps, n, ...), and the states after each step, (steps, n, state_size).
     """
-    if isinstance(network, GRU):  # after the cell, all steps are one batch
-        cell = network.cell
-        states, _ = unrolled(lambda x, state: 2 * (cell(x, state),), x, state, began)
-        return network.network(states), states
+    if hasattr(network, "unrolled"):
+        result: tuple[torch.Tensor, torch.Tensor] = network.unrolled(x, state, began)
+        return result
     outputs, after = [], []
     for x_now, starts in zip(x, began, strict=True):
         output, state = network(x_now, state.masked_fill(starts.unsqueeze(-1), 0.0))

@@ -8,8 +8,10 @@ import warp as wp
 
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
+from lyceum_warp.algos.common.hyperparameters import PictureConfig
 from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.networks import LIMIT, initialize_as_torch, trainable
+from lyceum_warp.algos.common.pictures import picture_settings, policy_inputs
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_value
 from lyceum_warp.algos.common.rollout_buffer import Rollout
@@ -66,20 +68,23 @@ class OnPolicyLearner(Learner):
         as_torch: bool = False,
     ) -> None:
         env, config, device = self.env, self.config, self.env.obs.device
-        nobs, nact = env.obs_space.size, env.action_space.size
+        nobs, nact, sees = env.obs_space.size, env.action_space.size, dict[str, Any]()
+        if isinstance(config, PictureConfig):
+            nobs, sees = policy_inputs(env, config)
         group = value_group(env, config.value_group) if value is None else value.group
         init = torch.Generator().manual_seed(self.seed)
         options: dict[str, Any] = dict(normalize=config.normalize, limit=limit, generator=init)
         self.policy = policy or GaussianPolicy(
             nobs, nact, config.hidden, activation=config.activation, log_std=config.log_std,
-            recurrent=getattr(config, "recurrent", 0), **options,
+            recurrent=getattr(config, "recurrent", 0), **sees, **options,
         )  # fmt: skip
+        recurrent = self.policy.state_size if group == "policy" and not self.policy.pictures else 0
         self.value = value or ValueFunction(
             env.obs_spaces[group].size, config.value_hidden, activation=config.value_activation, scale=scale,
-            time_orders=time_orders, group=group, recurrent=self.policy.state_size * (group == "policy"), **options,
+            time_orders=time_orders, group=group, recurrent=recurrent, **options,
         )  # fmt: skip
         if as_torch and policy is None:
-            initialize_as_torch(self.policy, init)
+            initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
         if as_torch and value is None:
             initialize_as_torch(self.value, init)
         self.value.discount = config.gamma
@@ -89,7 +94,8 @@ class OnPolicyLearner(Learner):
 
     def _make_rollout(self, steps: int, *, first_only: bool = False) -> None:
         self.count = steps * self.env.nworld * self.team.size
-        self.rollout = Rollout(self.env, steps, groups=(self.value.group,), first_only=first_only)
+        groups = dict.fromkeys((self.value.group, *self.policy.groups))
+        self.rollout = Rollout(self.env, steps, groups=list(groups), first_only=first_only)
         self._advantage = torch.empty_like(self.rollout.reward)
         self._return = torch.empty_like(self.rollout.reward)
         self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config, self.team)
@@ -107,6 +113,7 @@ class OnPolicyLearner(Learner):
         """Return the hyperparameters and the networks' sizes for a run's config.json."""
         policy, value = self.policy.shape, self.value.shape
         settings = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
+        settings |= picture_settings(self.policy)
         settings |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
         settings["time_orders"] = value["time_orders"]
         settings["recurrent"] = policy.get("recurrent", None if "own" in policy else 0)

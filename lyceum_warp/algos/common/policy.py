@@ -7,8 +7,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
+from lyceum_warp.algos.common.pictures import PictureNetwork, picture_network
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
 from lyceum_warp.support.docstrings import document_attributes
@@ -34,6 +36,12 @@ class GaussianPolicy(Normalized):
             For NPG, the network must be twice differentiable. A network with memory has the attribute ``state_size``,
             and maps observations (n, nobs) and states (n, state_size) to mean actions and the next states.
         recurrent: Units of a GRU before the hidden layers, which gives the policy memory; 0 means no memory.
+        pictures: Shapes of the pictures that the policy sees, (height, width, channels), by the cameras' groups. An
+            observation is then a tuple: the vector, unless ``nobs`` is 0, and each camera's pictures, (..., height,
+            width, channels).
+        channels: See ``lw.PPOConfig``, like the next two arguments.
+        spatial_softmax: See ``lw.PPOConfig``.
+        frames: See ``lw.PPOConfig``.
         activation: Activation of the hidden layers.
         log_std: Initial logarithm of the standard deviations.
         normalize: Whether to normalise observations by their running mean and variance.
@@ -47,6 +55,8 @@ class GaussianPolicy(Normalized):
 
     shape: dict[str, Any]
     """Arguments of ``like``."""
+    groups: tuple[str, ...]
+    """The groups of observations that the policy reads."""
 
     def __init__(
         self,
@@ -56,20 +66,33 @@ class GaussianPolicy(Normalized):
         *,
         network: nn.Module | None = None,
         recurrent: int = 0,
+        pictures: Mapping[str, Sequence[int]] | None = None,
+        channels: Sequence[int] = (16, 32, 32),
+        spatial_softmax: bool = False,
+        frames: int = 3,
         activation: Activation = "tanh",
         log_std: float = -0.5,
         normalize: bool = False,
         limit: float = LIMIT,
         generator: torch.Generator | None = None,
     ) -> None:
-        nobs, nact = whole_number("nobs", nobs, low=1), whole_number("nact", nact, low=1)
+        nobs, nact = whole_number("nobs", nobs, low=0 if pictures else 1), whole_number("nact", nact, low=1)
         recurrent = whole_number("recurrent", recurrent, low=0)
         sizes = [recurrent or nobs, *layer_sizes(hidden), nact]
         check_memory(sizes)
-        super().__init__(nobs, normalize, limit)
+        super().__init__(nobs, normalize and nobs > 0, limit)
         self.nobs, self.nact = nobs, nact
         self.shape = {"nobs": nobs, "nact": nact, "normalize": normalize, "limit": limit}
-        if network is None:
+        self.pictures = {group: tuple(shape) for group, shape in (pictures or {}).items()}
+        self.groups = (*(("policy",) if nobs else ()), *self.pictures)
+        if pictures:
+            self.shape["pictures"] = {group: list(shape) for group, shape in pictures.items()}
+        if network is None and pictures:
+            own: dict[str, Any] = {"channels": list(channels), "spatial_softmax": spatial_softmax, "frames": frames}
+            own |= {"activation": activation, "recurrent": recurrent}
+            self.shape |= own | {"hidden": layer_sizes(hidden)}
+            network = picture_network(nobs, nact, hidden, pictures=pictures, generator=generator, **own)
+        elif network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
             # make initial mean actions near zero (as in mjrl)
             network = mlp(sizes, activation=activation, last_scale=1e-2, generator=generator)
@@ -116,12 +139,26 @@ class GaussianPolicy(Normalized):
             policy.use_mirror(shape["mirror"])
         return policy
 
+    def inputs(self, groups: Mapping[str, torch.Tensor]) -> Any:
+        """Select the argument of ``act`` from groups of observations: a tensor, or a tuple with pictures."""
+        return tuple(groups[group] for group in self.groups) if self.pictures else groups["policy"]
+
+    def observe_pictures(self, groups: Mapping[str, torch.Tensor], team: Team) -> None:
+        """Update the mean pictures that the default network subtracts. Learners call this before they sample."""
+        if isinstance(self.network, PictureNetwork):
+            self.network.observe([groups[group] for group in self.pictures], team)
+
+    def _inputs(self, obs: Any) -> Any:
+        if not self.pictures:
+            return self.normalizer(obs)
+        return (self.normalizer(obs[0]), *obs[1:]) if self.nobs else tuple(obs)
+
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         """Compute mean actions, (..., nact)."""
         return self._mean(obs) if self.mirror is None else self.mirror.average(self._mean, obs)
 
     def _mean(self, obs: torch.Tensor) -> torch.Tensor:
-        mean: torch.Tensor = self.network(self.normalizer(obs))
+        mean: torch.Tensor = self.network(self._inputs(obs))
         return mean
 
     def act(self, obs: torch.Tensor, state: torch.Tensor | None = None) -> Any:
@@ -130,7 +167,7 @@ class GaussianPolicy(Normalized):
         A policy with memory also needs its state, (n, state_size), and returns the actions and the next state. The
         state is 0 when an episode begins.
         """
-        return self(obs) if state is None else self.network(self.normalizer(obs), state)
+        return self(obs) if state is None else self.network(self._inputs(obs), state)
 
     def unrolled(
         self, obs: torch.Tensor, state: torch.Tensor, began: torch.Tensor
@@ -142,7 +179,12 @@ class GaussianPolicy(Normalized):
         """
         if not self.state_size:
             return self(obs), state.expand(len(obs), *state.shape)
-        return unrolled(self.network, self.normalizer(obs), state, began)
+        return unrolled(self.network, self._inputs(obs), state, began)
+
+    def features(self, obs: Any, state: torch.Tensor, began: torch.Tensor) -> torch.Tensor:
+        """Compute what the last layers of a policy that sees cameras get, (steps, n, size); see ``unrolled``."""
+        assert isinstance(self.network, PictureNetwork)
+        return self.network.features(self._inputs(obs), state, began)[0]
 
     @torch.no_grad()
     def sample(self, obs: torch.Tensor, noise: torch.Tensor, out: torch.Tensor) -> torch.Tensor:

@@ -34,6 +34,8 @@ def check_policy(policy: object, env: Env, *, twice: bool = True) -> None:
     check_sizes(policy, env)
     if not any(p.requires_grad for p in policy.parameters() if p is not policy.log_std):
         raise ValueError("the policy's network has no trainable parameter: use policy.requires_grad_(True)")
+    if policy.pictures:  # memory and pictures need sequences of observations, and learners check their results
+        return
     obs = env.obs.repeat(-(-_ROWS // env.nworld), 1)[:_ROWS]
     noise = torch.randn(obs.shape, generator=torch.Generator().manual_seed(0))
     obs = obs + 0.1 * noise.to(obs.device)
@@ -47,7 +49,12 @@ def check_sizes(module: Any, env: Env, name: str = "the policy", *, group: str =
     Raises:
         ValueError: The sizes of the module and the environment differ.
     """
-    nobs, nact = env.obs_spaces[group].size, env.action_space.size
+    nact, pictures = env.action_space.size, getattr(module, "pictures", {})
+    nobs = 0 if pictures and "policy" not in module.groups else env.obs_spaces[group].size
+    for camera, shape in pictures.items():
+        check_group(camera, env.obs_groups, env.task.name)
+        if env.obs_spaces[camera].shape != shape:
+            raise ValueError(f"{name} is made for pictures {shape}, but {camera!r} has {env.obs_spaces[camera].shape}")
     if (module.nobs, module.nact) != (nobs, nact):
         raise ValueError(
             f"{name} is made for {module.nobs} observations and {module.nact} actions, but the task "

@@ -35,7 +35,8 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     ===========  ======================================================================================
 
     A policy with memory has a second input ``state`` (n, state_size), which is 0 when an episode begins, and a second
-    output ``next_state``.
+    output ``next_state``. For each camera, there is an input with the name of its group after ``obs``, such as
+    ``camera`` (n, height, width, channels). A policy that sees only cameras has no input ``obs``.
 
     Example:
         >>> export_policy(load("runs/mine"), "policy.onnx")
@@ -63,8 +64,16 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     size = getattr(policy, "state_size", 0)
     alone = (_Remembering if size else _Acting)(copy.deepcopy(policy)).cpu().eval().requires_grad_(False)
     inputs, outputs = (["obs", "state"], ["action", "next_state"]) if size else (["obs"], ["action"])
-    example = (torch.zeros(2, nobs), torch.zeros(2, size))[: len(inputs)]
-    shapes = len(inputs) * ({0: torch.export.Dim("batch")},)
+    batch, pictures = {0: torch.export.Dim("batch")}, getattr(policy, "pictures", {})
+    obs: Any = torch.zeros(2, nobs)
+    if pictures:
+        # an rgb picture has three channels, and a depth picture one
+        kinds = {group: torch.uint8 if shape[-1] == 3 else torch.float32 for group, shape in pictures.items()}
+        seen = tuple(torch.zeros(2, *shape, dtype=kinds[group]) for group, shape in pictures.items())
+        obs = (obs, *seen) if nobs else seen
+        inputs = [*(["obs"] if nobs else []), *pictures, "state"]
+    example = (obs, torch.zeros(2, size))[: 2 if size else 1]
+    shapes = (tuple(batch for _ in obs) if pictures else batch, batch)[: len(example)]
     try:
         with _quiet():
             repeatable(alone, *example)
@@ -99,6 +108,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     ``physics``       the physics of ``env``, in which the policy has learned
     ``observations``  the parts of an observation in order: name, size, and the normaliser's offset and
                       scale of each column; the file applies them: (obs - offset) * scale
+    ``cameras``       the cameras whose pictures the policy sees, if any; see ``lw.Camera``
     ``actions``       the parts of an action in order: name and size
     ``actuators``     names of the model's actuators, in order
     ``fit``           values and intervals of the fit (``lw.fit``) that ``env`` used, if any
@@ -114,12 +124,15 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
     if isinstance(normalizer, Normalizer):
         for entry, part in zip(parts, env.obs_space.parts.values(), strict=True):
             entry |= {"offset": normalizer.shift[part].tolist(), "scale": normalizer.scale[part].tolist()}
+    groups = getattr(policy, "groups", ("policy",))
+    cameras = [vars(camera) for camera in task.cameras if camera.group in groups]
     return {
         "task": task.name,
         "timestep": env.timestep,
         "substep": model.opt.timestep,
         "physics": simulation(env).partition(", ")[2],
-        "observations": parts,
+        "observations": parts if "policy" in groups else [],
+        **({"cameras": cameras} if cameras else {}),
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
         "actuators": [model.actuator(i).name or f"actuator_{i}" for i in range(model.nactuator)],
         **({} if task.fit is None else {"fit": task.fit.metadata}),

@@ -14,7 +14,7 @@ from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
-from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.arrays import torch_view, words
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
@@ -46,9 +46,10 @@ class Rollout:
     final_obs: torch.Tensor
     """Observations after each step, before any reset, (steps, nworld, nobs)."""
     obs_groups: dict[str, torch.Tensor]
-    """Observations of each group before each step; the entry "policy" is ``obs``."""
+    """Observations of each group before each step; the entry "policy" is ``obs``. Pictures have the shape (steps,
+    nworld, height, width, channels)."""
     final_obs_groups: dict[str, torch.Tensor]
-    """Observations of each group after each step; the entry "policy" is ``final_obs``."""
+    """Observations of each group after each step, without pictures; the entry "policy" is ``final_obs``."""
     reward: torch.Tensor
     """Rewards, (steps, nworld)."""
     eval: torch.Tensor
@@ -87,6 +88,8 @@ class Rollout:
         self._first_only = first_only
         n, nobs, nact = env.nworld, env.obs_space.size, env.action_space.size
         numbers = len(collect.RolloutArrays.vars) + 2 * nobs + nact  # type: ignore[attr-defined]
+        # a learner shuffles a copy of the pictures
+        numbers += 2 * sum(words(env.obs_groups[g]).shape[1] for g in groups if g not in env.worlds.obs_spaces)
         check_fit(4 * steps * numbers, n, env.device, model=f"{steps} steps")
         flags = {"terminated", "done", "success"}
         self._arrays = collect.RolloutArrays()
@@ -105,8 +108,13 @@ class Rollout:
         self.action = self._stored(env.action, self._rows_before)
         self.obs_groups, self.final_obs_groups = {}, {}
         for group in dict.fromkeys(("policy", *groups)):
-            self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
-            self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+            if group in env.worlds.obs_spaces:
+                self.obs_groups[group] = self._stored(env.obs_groups[group], self._rows_before)
+                self.final_obs_groups[group] = self._stored(env.final_obs_groups[group], self._rows_after)
+            else:
+                picture = env.obs_groups[group]
+                rows = self._stored(words(picture), self._rows_before)
+                self.obs_groups[group] = rows.view(picture.dtype).view(steps, *picture.shape)
         self.obs, self.final_obs = self.obs_groups["policy"], self.final_obs_groups["policy"]
         self.metrics, self.episode_metrics = {}, {}
         if env.metrics:
@@ -209,7 +217,8 @@ class Rollout:
     def extremes(self) -> str:
         """Describe the reward and the observation of each group that have the largest magnitude, for error messages."""
         rows = {"reward": (self.reward.unsqueeze(-1), Space())}
-        for group, obs in self.obs_groups.items():
+        for group in self.final_obs_groups:
+            obs = self.obs_groups[group]
             name = "observation" if group == "policy" else f"observation of the group {group!r}"
             rows[name] = obs, self.env.obs_spaces[group]
         texts = []

@@ -184,5 +184,5 @@ def value_group(env: Env, name: str | None) -> str:
         ValueError: The task has no observation group of this name.
     """
     group = name or ("critic" if "critic" in env.obs_groups else "policy")
-    check_group(group, env.obs_groups, env.task.name)
+    check_group(group, env.worlds.obs_spaces, env.task.name)  # without cameras
     return group

@@ -123,6 +123,7 @@ _OWN_OPTIONS = {
     "autoreset": "its worlds never reset",
     "horizon": "episodes of its worlds have no limit, and the horizon of a plan is a setting",
     "seed": "every sample starts from the state to plan from",
+    "cameras": "plans are judged by states",
     "first_world": "no other process has samples",
 }
 """Options that only the planner may set, each with the reason."""

@@ -74,7 +74,7 @@ class WarpEngine(Engine):
         self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics)
         if None in (nconmax, njmax):
             warn_of_unknown_sizes(self.dynamics, self.nconmax, self.njmax)
-        with _refusals():
+        with refusals():
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
             self.d = self._make_data(nworld)
@@ -143,7 +143,7 @@ class WarpEngine(Engine):
     ) -> int:
         dynamics = list(dynamics)
         sizes = _sizes(model, options.get("nconmax"), options.get("njmax"), [field.name for field in dynamics])
-        with _refusals():
+        with refusals():
             data = data_bytes(model, *sizes)
         floats = mujoco.mj_stateSize(model, _SPEC) + sum(field.size for field in fields if field.snapshot)
         floats += 2 * sum(field.size for field in dynamics)
@@ -323,18 +323,17 @@ class WarpEngine(Engine):
 
 
 @contextlib.contextmanager
-def _refusals() -> Iterator[None]:
+def refusals(fix: str = "use engine='mujoco'") -> Iterator[None]:
+    """Explain an error of MuJoCo Warp about a model."""
     try:
         yield
     except (NotImplementedError, ValueError) as error:
         reason = str(error).rstrip(".")
-        raise ValueError(
-            f"MuJoCo Warp refuses the model: {reason}; change the model, or use engine='mujoco'"
-        ) from error
+        raise ValueError(f"MuJoCo Warp refuses the model: {reason}; change the model, or {fix}") from error
 
 
 def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
-    with _refusals():
+    with refusals():
         if (model.geom_plugin >= 0).any() and not has_sdf_functions():
             raise NotImplementedError("SDF plugins need a registered distance function")
         contacts, constraints = probe_sizes(model, varied) if None in (nconmax, njmax) else (0, 0)

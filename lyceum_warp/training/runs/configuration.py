@@ -56,6 +56,8 @@ def describe(learner: Learner) -> dict[str, Any]:
     if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
         names.append("nthread")
     entries = {name: value for name, value in options.given().items() if name in names}
+    if options.cameras is not None:
+        entries["cameras"] = [dataclasses.asdict(camera) for camera in options.cameras]
     if isinstance(options.model, str | Path):
         entries["model"] = str(Path(options.model).absolute()) if Path(options.model).is_file() else str(options.model)
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}

@@ -1,0 +1,100 @@
+"""Declare cameras whose pictures are observations."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, Literal, get_args
+
+import mujoco
+import numpy as np
+
+from lyceum_warp.support.docstrings import document_attributes
+from lyceum_warp.support.suggestions import suggest_arguments
+from lyceum_warp.support.validate import check_kind, check_word, finite_number, whole_number
+
+Kind = Literal["rgb", "depth", "segmentation"]
+
+
+@suggest_arguments
+@document_attributes
+@dataclasses.dataclass(frozen=True)
+class Camera:
+    """A camera whose pictures are a group of observations, ``env.obs_groups["camera"]``, (nworld, height, width, ...).
+
+    The name is that of a camera of the model. With ``pos`` and ``lookat``, a camera with this name is added.
+
+    Raises:
+        ValueError: A value is of the wrong type or out of range.
+    """
+
+    name: str
+    """Name of the camera."""
+    width: int = 64
+    """Columns of a picture, a multiple of 4."""
+    height: int = 64
+    """Rows of a picture."""
+    kind: Kind = "rgb"
+    """What a pixel holds. "rgb": red, green and blue, uint8. "depth": distance along the camera's axis in metres,
+    float32; 0 if nothing is visible. "segmentation": id and type (mjtObj) of the object, int32; -1 if nothing is
+    visible."""
+    group: str = "camera"
+    """Name of the group of observations. Several cameras need different groups."""
+    pos: tuple[float, float, float] | None = None
+    """Position of an added camera, in the frame of ``body``, in metres."""
+    lookat: tuple[float, float, float] | None = None
+    """A point at the picture's centre, in the frame of ``body``, in metres."""
+    body: str = "world"
+    """Body that carries an added camera."""
+    fovy: float = 45.0
+    """Vertical field of view of an added camera, in degrees."""
+
+    def __post_init__(self) -> None:
+        for name in ("name", "group", "body"):
+            check_kind(name, getattr(self, name), str, "as Camera('fixed')")
+        for name in ("width", "height"):
+            object.__setattr__(self, name, whole_number(name, getattr(self, name), low=1, high=4096))
+        if self.width % 4:
+            raise ValueError(f"width must be a multiple of 4, not {self.width}: use {self.width // 4 * 4 + 4}")
+        check_word("kind", self.kind, get_args(Kind))
+        if (self.pos is None) is not (self.lookat is None):
+            raise ValueError(f"an added camera needs both pos and lookat, not pos={self.pos} and lookat={self.lookat}")
+        for name in ("pos", "lookat") if self.pos is not None else ():
+            point = tuple(finite_number(name, number) for number in getattr(self, name))
+            if len(point) != 3:
+                raise ValueError(f"{name} must have three coordinates, not {point}")
+            object.__setattr__(self, name, point)
+        object.__setattr__(self, "fovy", finite_number("fovy", self.fovy, low=1.0, high=179.0))
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the camera to a model, if it is given by its pose."""
+        if self.pos is None or self.lookat is None:
+            return
+        body = spec.worldbody if self.body == "world" else spec.body(self.body)
+        if body is None:
+            raise ValueError(f"the model has no body {self.body!r}, to which the camera {self.name!r} is to be added")
+        back = np.subtract(self.pos, self.lookat)
+        if not (length := np.linalg.norm(back)):
+            raise ValueError(f"pos and lookat of the camera {self.name!r} must differ, not both be {self.pos}")
+        back /= length
+        right = np.cross((0.0, 0.0, 1.0) if abs(back[2]) < 0.999 else (0.0, 1.0, 0.0), back)
+        right /= np.linalg.norm(right)
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
+        body.add_camera(name=self.name, pos=self.pos, quat=quat, fovy=self.fovy)
+
+
+def cameras_of(given: Any) -> tuple[Camera, ...]:
+    """Convert cameras, their names, or dicts of their arguments to cameras with different groups.
+
+    Raises:
+        ValueError: An entry is none of these, or two cameras have the same group.
+    """
+    if not isinstance(given, Iterable) or isinstance(given, str):
+        raise ValueError(f"cameras must be a list, as in cameras=[lw.Camera('fixed')], not {given!r}")
+    cameras: dict[str, Camera] = {}
+    for entry in given:
+        camera = Camera(entry) if isinstance(entry, str) else Camera(**entry) if isinstance(entry, dict) else entry
+        check_kind("a camera", camera, Camera, "as lw.Camera('fixed', width=64)")
+        if camera.group in cameras:
+            raise ValueError(f"two cameras have the group {camera.group!r}: give each one its own group=...")
+        cameras[camera.group] = camera
+    return tuple(cameras.values())
