@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say_entries, table
+from lyceum_warp.cli.display import console, say, say_entries, table
 
 _COLUMNS = 4
 """Maximum number of groups in the table of differences."""
@@ -18,8 +18,8 @@ class Plot:
     """Plot the curves of runs over samples and seconds, and compare their final returns, settings and versions.
 
     Runs with the same settings are one group, whatever their seeds: the plot shows its mean and a 95 % interval
-    (Student's t). A folder stands for all runs in it. A folder with files for TensorBoard is read as a run of rsl_rl or
-    Stable-Baselines3. For a single run, the plot shows its reward terms, metrics and ends of episodes, too.
+    (percentile bootstrap). A folder stands for all runs in it. A folder with files for TensorBoard is read as a run of
+    rsl_rl or Stable-Baselines3. For a single run, the plot shows its reward terms, metrics and ends of episodes, too.
 
     $ lyceum-warp plot runs/hopper-20260101-120000
     $ lyceum-warp plot runs/hopper-npg runs/hopper-ppo --out comparison.png
@@ -29,7 +29,8 @@ class Plot:
     folders: Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="RUN|FOLDER ...")]
     """Folders of runs, or folders that contain runs."""
     out: Path = Path("comparison.png")
-    """The file of the plot of several runs. The curve of a single run is curve.png in its folder."""
+    """The file of the plot of several runs, such as .png, .pdf or .svg. The curve of a single run is curve.png in its
+    folder."""
 
     def run(self) -> None:
         if not self.folders:
@@ -62,6 +63,14 @@ def print_groups(groups: "list[training.RunGroup]") -> None:
     )  # fmt: skip
     columns = dict(zip(headings, zip(*rows, strict=True), strict=True))
     console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
+    runs = [run for group in groups for run in group.runs if len(run.returns)]
+    if len({run.evaluated for run in runs}) > 1:
+        say("some returns are those of the mean policy, others those of sampled episodes: train with --mean-every")
+    for task in dict.fromkeys(group.task for group in groups):
+        samples = [max(run.samples[-1] for run in group.runs if len(run.returns)) for group in groups
+                   if group.task == task and any(len(run.returns) for run in group.runs)]  # fmt: skip
+        if samples and max(samples) > 1.1 * min(samples):
+            say(f"{task}: groups have {min(samples):,.0f} to {max(samples):,.0f} samples; a fair comparison has equal")
 
 
 def _interval(summary: dict[str, Any], name: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lyceum_warp.fitting.result import Fit
 from lyceum_warp.training import html_page
-from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_png
+from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_figure
 
 
 def write_report(
@@ -34,7 +34,7 @@ def write_report(
         ("95 % intervals and correlations", "intervals.png", _intervals(fit)),
         ("Residuals over time, in multiples of the noise", "residuals.png", _residuals(fit, times, residuals, groups)),
     ):
-        data = base64.b64encode(save_png(figure, folder / file).read_bytes()).decode()
+        data = base64.b64encode(save_figure(figure, folder / file).read_bytes()).decode()
         parts.append(f"<h2>{title}</h2><img alt='{title}' style='max-width: 100%' src='data:image/png;base64,{data}'>")
     parts.append(f"<p>{fit.substeps:,} substeps in {fit.seconds:.0f} s</p>")
     return html_page(folder / "report.html", f"Fit of {name}", parts)

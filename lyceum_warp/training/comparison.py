@@ -11,15 +11,18 @@ import numpy as np
 
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.extras import check_extra
-from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval, student_quantile
-from lyceum_warp.training.runs.folder import Run, runs_in
-from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_png
+from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval
+from lyceum_warp.training.runs.folder import CONFIG, Run
+from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_figure
 
 _SETTINGS = ("algorithm", "network", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
 """Entries of config.json that tell one kind of run from another, besides the algorithm's own."""
 
-_POINTS = 200
-"""Number of points of a mean curve."""
+_EVALUATION = (".mean_every", ".mean_episodes")
+"""Settings that do not change what a run learns."""
+
+_POINTS, _RESAMPLES = 200, 1000
+"""Numbers of points of a mean curve, and of bootstrap resamples of its interval."""
 
 _EVENTS = "events.out.tfevents.*"
 
@@ -43,6 +46,8 @@ class RunCurve:
     first point."""
     returns: np.ndarray
     """Return of the mean policy at each point, (n,), or that of the sampled episodes if there is no evaluation."""
+    evaluated: bool
+    """Whether the returns are those of the mean policy."""
     gate: str = ""
     """Whether a policy has passed the gate of the task, if it was tested."""
     transfer: str = ""
@@ -84,8 +89,8 @@ def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
     """Read the curves of runs.
 
     Args:
-        paths: Folders of runs, or folders that contain them. Folders with files for TensorBoard are read as runs of
-            rsl_rl or Stable-Baselines3.
+        paths: Folders of runs, or folders that contain them at any depth. Folders with files for TensorBoard are read
+            as runs of rsl_rl or Stable-Baselines3.
 
     Raises:
         FileNotFoundError: A path has no run.
@@ -94,7 +99,7 @@ def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
     """
     curves = []
     for path in map(Path, paths):
-        folders = [path] if (path / "config.json").is_file() else list(map(Path, runs_in(path)))
+        folders = [path] if (path / CONFIG).is_file() else sorted(file.parent for file in path.rglob(CONFIG))
         others = [] if folders else sorted({file.parent for file in path.rglob(_EVENTS)})
         if not folders and not others:
             Run.open(path)  # raises an error that names what is there
@@ -108,18 +113,19 @@ def read_curve(run: Run) -> RunCurve:
     table = {name: np.array([row.get(name) for row in rows], dtype=float) for name in (rows[0] if rows else ())}
     nothing = np.full(len(rows), math.nan)
     seconds = np.cumsum([row_seconds(row) for row in rows])
-    evaluated = table.get("mean_return", nothing)
-    returns = evaluated if np.isfinite(evaluated).any() else table.get("return_mean", nothing)
+    evaluated = bool(np.isfinite(means := table.get("mean_return", nothing)).any())
+    returns = means if evaluated else table.get("return_mean", nothing)
     known = np.isfinite(returns)
     config, passed = run.config, run.config.get("passed")
+    settings = flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))})
     gate = "not passed" if (run.folder / "gate.jsonl").exists() else ""
     return RunCurve(
         folder=run.folder,
         task=run.task_name,
-        settings=flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))}),
+        settings={name: value for name, value in settings.items() if not name.endswith(_EVALUATION)},
         versions={**config.get("versions", {}), "task source": run.manifest.get("source_hash", "")[:12]},
         samples=table.get("samples", nothing)[known], seconds=seconds[known], returns=returns[known],
-        gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
+        evaluated=evaluated, gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
         transfer=json.loads(run.transfer.read_text()).get("line", "") if run.transfer.is_file() else "",
     )  # fmt: skip
 
@@ -160,7 +166,7 @@ def _read_events(folder: Path) -> RunCurve:
         each = np.round(np.median((rate[:, 2] + 0.5) * (sampling[:, 2] + learning[:, 2])))
         samples = (points[:, 0] + 1) * each
     seconds = points[:, 1] - points[0, 1]
-    return RunCurve(folder, "", {"algorithm": library}, {}, samples, seconds, points[:, 2])
+    return RunCurve(folder, "", {"algorithm": library}, {}, samples, seconds, points[:, 2], evaluated=False)
 
 
 def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
@@ -191,9 +197,10 @@ def differing(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
-    """Plot the mean return of each group over samples and over seconds, with 95 % intervals (Student's t).
+    """Plot the mean return of each group over samples and over seconds, with 95 % intervals (percentile bootstrap).
 
-    A run that ends before the others of its group counts with its last return from there on.
+    A run that ends before the others of its group counts with its last return from there on. The suffix of the file
+    chooses the format, such as .pdf or .png.
 
     Raises:
         ValueError: No run has a return.
@@ -213,30 +220,36 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
             n = len(group.runs)
             label = f"{group.label} ({n} run{'s' * (n > 1)})"
             for axes, name in zip(panels, ("samples", "seconds"), strict=True):
-                x, mean, half = mean_curve(group.runs, name)
+                x, mean, low, high = mean_curve(group.runs, name)
                 axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="." if len(x) < 3 else "")
-                axes.fill_between(x, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
+                axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
         panels[0].set_title(row, loc="left")
-        panels[0].set_ylabel("return")
-        panels[0].legend(frameon=False, loc="best", fontsize="small")
+        evaluated = {run.evaluated for group in known if group.task == row for run in group.runs}
+        panels[0].set_ylabel("return of the mean policy" if evaluated == {True} else "return")
+        panels[0].legend(
+            title="mean, 95 % interval", frameon=False, loc="best", fontsize="small", title_fontsize="small"
+        )
         panels[0].set_xlabel("samples")
         panels[1].set_xlabel("seconds of sampling and updates")
         panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
         finish_axes(panels)
-    return save_png(figure, out)
+    return save_figure(figure, out)
 
 
-def mean_curve(runs: Sequence[RunCurve], over: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the mean curve of runs, and the half-width of its 95 % interval (Student's t); 0 for a single run.
+def mean_curve(runs: Sequence[RunCurve], over: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Compute the mean curve of runs, and the ends of its 95 % interval (percentile bootstrap over the runs).
 
     Args:
         runs: The runs, each with at least one return.
         over: "samples" or "seconds".
+
+    Returns:
+        The samples or seconds, the mean, and the lower and upper ends, each (points,).
     """
     xs = [getattr(run, over) for run in runs]
     n = len(runs)
     x = xs[0] if n == 1 else np.linspace(max(each[0] for each in xs), max(each[-1] for each in xs), _POINTS)
     values = np.array([np.interp(x, each, run.returns) for each, run in zip(xs, runs, strict=True)])
-    if n == 1:
-        return x, values[0], np.zeros(len(x))
-    return x, values.mean(0), student_quantile(0.975, n - 1) * values.std(0, ddof=1) / math.sqrt(n)
+    index = np.random.default_rng(0).integers(n, size=(_RESAMPLES, n))
+    low, high = np.percentile(values[index].mean(axis=1), (2.5, 97.5), axis=0)
+    return x, values.mean(axis=0), low, high

@@ -8,7 +8,7 @@ from typing import Any
 
 from lyceum_warp.algos import METRIC_COLUMN, STEP_METRIC_COLUMN, Iteration
 from lyceum_warp.training.runs.folder import Run
-from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_png
+from lyceum_warp.viz import ACCENT, LINE, finish_axes, new_figure, save_figure
 
 GROUPS = ("returns", "reward terms", "metrics", "ends of episodes", "faults", "learning")
 """Groups of panels."""
@@ -128,4 +128,4 @@ def learning_curve(run: str | Path | Run) -> Path:
     all_axes[0].legend(frameon=False, loc="best")
     all_axes[0].set_xlabel("samples")
     finish_axes(all_axes)
-    return save_png(figure, run.folder / "curve.png")
+    return save_figure(figure, run.folder / "curve.png")

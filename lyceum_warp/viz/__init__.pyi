@@ -28,7 +28,7 @@ from lyceum_warp.viz.style import (
     STYLES as STYLES,
     finish_axes as finish_axes,
     new_figure as new_figure,
-    save_png as save_png,
+    save_figure as save_figure,
 )
 from lyceum_warp.viz.video import (
     Recorder as Recorder,

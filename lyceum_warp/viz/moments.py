@@ -8,7 +8,7 @@ from lyceum_warp.algos import ClipResults
 from lyceum_warp.env import Env
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.renderer import Renderer
-from lyceum_warp.viz.style import new_figure, save_png
+from lyceum_warp.viz.style import new_figure, save_figure
 from lyceum_warp.viz.video import shots
 
 
@@ -35,4 +35,4 @@ def draw_moments(
             all_axes[i].imshow(renderer.picture())
             end = f", failed at {results.tracked[i]:.2f} s" if results.failed[i] else ""
             all_axes[i].set_title(f"{names[i]}\n{results.worst[i]:.2f} s{end}", fontsize=9)
-    return save_png(figure, out)
+    return save_figure(figure, out)

@@ -35,9 +35,15 @@ def finish_axes(all_axes: Iterable[Any]) -> None:
         axes.spines[["top", "right"]].set_visible(False)
 
 
-def save_png(figure: Any, out: str | Path) -> Path:
-    """Write a figure to a PNG file in a new or existing folder, and return the path."""
+def save_figure(figure: Any, out: str | Path) -> Path:
+    """Write a figure to a file in a new or existing folder, and return the path.
+
+    Raises:
+        ValueError: matplotlib has no format with the file's suffix.
+    """
     path = Path(out)
+    if path.suffix[1:] not in (formats := figure.canvas.get_supported_filetypes()):
+        raise ValueError(f"a figure's file must end in one of {', '.join(sorted(formats))}, not {path.name!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=150, format="png")
+    figure.savefig(path, dpi=150)
     return path

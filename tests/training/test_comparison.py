@@ -7,7 +7,7 @@ import pytest
 from training_runs import TINY, metrics, refused, train
 
 import lyceum_warp as lw
-from lyceum_warp import cli
+from lyceum_warp import cli, training
 from lyceum_warp.training import Run, curve, group_runs, mean_curve, read_curves
 from lyceum_warp.training.report import write_report
 
@@ -25,13 +25,15 @@ def test_runs_are_grouped_by_the_settings_that_differ(runs: Path, capsys: pytest
     assert [(group.label, [run.folder.name for run in group.runs]) for group in groups] == [
         ("gamma 0.995", ["a", "b"]), ("gamma 0.9", ["c"]),
     ]  # fmt: skip
-    x, mean, half = mean_curve(groups[0].runs, "samples")
+    x, mean, low, high = mean_curve(groups[0].runs, "samples")
     finals = [run.final for run in groups[0].runs]
     assert (x[0], x[-1], mean[-1]) == (1024, 2048, pytest.approx(np.mean(finals)))
-    assert half[-1] == pytest.approx(12.706 * np.std(finals, ddof=1) / math.sqrt(2), rel=1e-3)  # Student's t
-    assert cli.main(["plot", str(runs), "--out", str(runs / "all.png")]) == 0
+    assert (low[-1], high[-1]) == pytest.approx((min(finals), max(finals)))  # of two runs
+    assert cli.main(["plot", str(runs.parent), "--out", str(runs / "all.pdf")]) == 0
     shown = capsys.readouterr().out
-    assert re.search(r"gamma +0\.995 +0\.9", shown) and (runs / "all.png").stat().st_size > 1000
+    assert re.search(r"gamma +0\.995 +0\.9", shown) and (runs / "all.pdf").read_bytes()[:4] == b"%PDF"
+    with pytest.raises(ValueError, match="must end in one of .*pdf.* not 'all.doc'"):
+        training.comparison_figure(groups, runs / "all.doc")
 
 
 def test_a_run_of_rsl_rl_is_read_from_its_tensorboard_files(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from lyceum_warp.support.versions import versions
 from lyceum_warp.training.runs.checkpoints import FORMAT, network_of, read_checkpoint, write_content
 from lyceum_warp.training.runs.trust import is_trusted, remember
 
-_CONFIG, _TASK, _POLICIES = "config.json", "task", "policies"
+CONFIG, _TASK, _POLICIES = "config.json", "task", "policies"
 
 NETWORK = "network"
 """The folder for the file of the user's network, in the folder ``task``."""
@@ -31,7 +31,7 @@ NETWORK = "network"
 PRETRAINED = Path(__file__).resolve().parents[2] / "pretrained"
 """The folder of the package's pretrained runs."""
 
-_UNFINISHED = {f"{_CONFIG}.tmp", f"{_TASK}.tmp"}
+_UNFINISHED = {f"{CONFIG}.tmp", f"{_TASK}.tmp"}
 """Temporary files that remain if a process is killed while it creates a run."""
 
 _COUNT = 0
@@ -116,7 +116,7 @@ class Run:
             ValueError: The folder is not empty, or is a file.
         """
         folder = Path(folder)
-        if (folder / _CONFIG).exists():
+        if (folder / CONFIG).exists():
             way = f", or continue the run (train --resume {folder}, or resume=True in Python)"
             trained = (folder / "checkpoint.pt").exists()  # a planner run has no checkpoint
             raise ValueError(f"{folder} contains a run: use another folder{way if trained else ''}")
@@ -132,7 +132,7 @@ class Run:
         if (folder / "checkpoint.pt").exists() or (folder / "previous.pt").exists():
             return True
         left = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if _CONFIG in left and "metrics.csv" not in left:
+        if CONFIG in left and "metrics.csv" not in left:
             Run.open(folder)  # raises an error in a planner's folder
             shutil.rmtree(folder)
         return False
@@ -168,7 +168,7 @@ class Run:
                 path = task / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content if isinstance(content, bytes) else content.read_bytes())
-            with replaced(folder / _CONFIG) as temporary:
+            with replaced(folder / CONFIG) as temporary:
                 temporary.write_text(text)
                 if files:
                     task.rename(run.task_folder)
@@ -187,7 +187,7 @@ class Run:
             FileNotFoundError: The folder has no run.
             ValueError: The configuration cannot be read, is from a newer release, or is that of a planner.
         """
-        path = Path(folder) / _CONFIG
+        path = Path(folder) / CONFIG
         if not path.is_file():
             raise FileNotFoundError(f"there is no run in {folder}{_instead(Path(folder))}")
         try:
@@ -212,13 +212,13 @@ class Run:
     def amend(self, **changes: Any) -> None:
         """Change entries of the configuration, in memory and in the file."""
         self.config = {**self.config, **changes}
-        with replaced(self.folder / _CONFIG) as temporary:
+        with replaced(self.folder / CONFIG) as temporary:
             temporary.write_text(json.dumps(self.config, indent=2))
 
     def note_settings(self, error: Exception) -> None:
         """Add the path of ``config.json`` to an error that one of its settings may have caused."""
         if str(self.folder) not in str(error):
-            error.add_note(f"with the settings in {self.folder / _CONFIG}")
+            error.add_note(f"with the settings in {self.folder / CONFIG}")
 
     # metrics
 
@@ -369,7 +369,7 @@ def _check_entries(entries: Mapping[str, Any], kinds: Mapping[str, Any]) -> None
 
 def runs_in(folder: Path) -> list[str]:
     """Return the paths of the runs in a folder of runs."""
-    return sorted(str(path.parent) for path in folder.glob(f"*/{_CONFIG}"))
+    return sorted(str(path.parent) for path in folder.glob(f"*/{CONFIG}"))
 
 
 def _instead(folder: Path) -> str:
@@ -378,8 +378,8 @@ def _instead(folder: Path) -> str:
         return ", which is a file: pass a run's folder (in Python, lw.load also takes a policy's file)"
     if folder.is_dir():
         runs = runs_in(folder)
-        return f": it has no {_CONFIG}" + (f"; the last run in this folder is {runs[-1]}" if runs else "")
-    if (PRETRAINED / file_name(str(folder)) / _CONFIG).is_file():
+        return f": it has no {CONFIG}" + (f"; the last run in this folder is {runs[-1]}" if runs else "")
+    if (PRETRAINED / file_name(str(folder)) / CONFIG).is_file():
         return f": for the package's policy, add --pretrained, or open lw.pretrained_run({str(folder)!r})"
     hint = did_you_mean(str(folder), runs_in(folder.parent), "pass the folder that lyceum-warp train or lw.train wrote")
     return f", which does not exist: {hint}"
@@ -420,7 +420,7 @@ def policy_of(content: Mapping[str, Any], path: Path, policy: Any = None) -> Any
     """
     folder = path.parents[path.parent.name == _POLICIES]
     shape = content["policy"]["shape"] or {}
-    if policy is None and "own" in shape and (folder / _CONFIG).is_file():
+    if policy is None and "own" in shape and (folder / CONFIG).is_file():
         run = Run.open(folder)
         if "network" in run.config and is_trusted(folder, run.config):
             spelled = str(run.task_folder / NETWORK / run.config["network"])
