@@ -15,6 +15,8 @@ import numpy as np
 import warp as wp
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
+from gallery import turnable_tasks
+
 import lyceum_warp as lw
 from lyceum_warp.binding import file_name, find_task
 from lyceum_warp.binding.bound_task import BoundTask
@@ -163,7 +165,7 @@ def task_section(name: str) -> str:
     picture = f"images/gallery/{file_name(name)}.webp"
     if (DOCS / picture).exists():
         lines += [f"![{name}](../{picture})", ""]
-    lines += [about, "", markdown(body), "", *facts(task), ""]
+    lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
         lines += table((f"{title}, {count(sum(layout.values()), 'number')}", "size"),
@@ -180,6 +182,19 @@ def task_section(name: str) -> str:
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
     return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def frame(name: str, up: str) -> str:
+    """Return the frame of a robot that can be turned; ``up`` is the path from the page to docs/."""
+    page = f"{up}turnable/{file_name(name)}.html"
+    return f'<iframe src="{page}" title="{name}: drag to turn the view" loading="lazy"></iframe>'
+
+
+def turnable(name: str, up: str = "") -> str:
+    """Return a fold with a task's robot, if it can be turned."""
+    if name.strip() not in turnable_tasks():
+        return ""
+    return f'<details class="turnable"><summary>Turn the robot</summary>{frame(name.strip(), up)}</details>'
 
 
 def facts(task: BoundTask) -> list[str]:
