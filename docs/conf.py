@@ -112,13 +112,13 @@ def link_names(app: Any, doctree: nodes.document) -> None:
 
 
 def load_late(app: Any, doctree: nodes.document) -> None:
-    """Let pictures load when they are seen, and animations stand still for those who prefer that."""
+    """Let pictures load when they are near, and animations stand still until site.js replaces the still picture."""
     up = "../" * (app.env.docname.count("/") - 1)
     for image in list(doctree.findall(nodes.image)):
         image["loading"] = "lazy"
         if "images/gallery/" in image["uri"]:
             still = f"{up}stills/{Path(image['uri']).name}"
-            source = f'<picture><source media="(prefers-reduced-motion: reduce)" srcset="{still}">'
+            source = f'<picture><source media="all" srcset="{still}">'
             image.replace_self([nodes.raw("", source, format="html"), image, nodes.raw("", "</picture>", format="html")])
 
 

@@ -2,21 +2,31 @@
 for (const block of document.querySelectorAll("div.highlight")) {
   const button = document.createElement("button");
   button.className = "copy";
-  button.textContent = "copy";
+  button.title = "copy";
+  button.textContent = "⧉";
   button.onclick = async () => {
     await navigator.clipboard.writeText(block.querySelector("pre").textContent.trimEnd());
-    button.textContent = "copied";
-    setTimeout(() => (button.textContent = "copy"), 1500);
+    button.textContent = "✓";
+    setTimeout(() => (button.textContent = "⧉"), 1500);
   };
   block.append(button);
 }
 
-// Over a robot, the wheel scrolls the page, and zooms with Ctrl; the robot stands still for those who prefer that.
+// A still picture is replaced by the animation while it is seen, except for those who prefer reduced motion.
 const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+const seen = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) {
+    target.previousElementSibling.media = isIntersecting ? "not all" : "all";
+  }
+});
+if (!calm) for (const still of document.querySelectorAll("picture > source")) seen.observe(still.nextElementSibling);
+
+// Over a robot, the wheel scrolls the page, and zooms with Ctrl. The robot stands still for those who prefer that.
 const prepare = (frame) => {
-  if (frame.contentDocument?.querySelector("canvas") === null || !frame.contentDocument) return;
+  const button = frame.contentDocument?.querySelector("canvas ~ form button");
+  if (!button) return;
   frame.contentWindow.addEventListener("wheel", (e) => e.ctrlKey || e.stopImmediatePropagation(), true);
-  if (calm) frame.contentDocument.querySelector("button").click();
+  if (calm) button.click();
 };
 for (const frame of document.querySelectorAll("iframe")) {
   frame.addEventListener("load", () => prepare(frame));
