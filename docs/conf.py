@@ -118,8 +118,8 @@ def load_late(app: Any, doctree: nodes.document) -> None:
         image["loading"] = "lazy"
         if "images/gallery/" in image["uri"]:
             still = f"{up}stills/{Path(image['uri']).name}"
-            source = f'<picture><source media="all" srcset="{still}">'
-            image.replace_self([nodes.raw("", source, format="html"), image, nodes.raw("", "</picture>", format="html")])
+            before = nodes.raw("", f'<picture><source media="all" srcset="{still}">', format="html")
+            image.replace_self([before, image, nodes.raw("", "</picture>", format="html")])
 
 
 def describe(app: Any, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:

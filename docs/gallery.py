@@ -292,9 +292,9 @@ def page(results: dict[str, dict[str, str]]) -> str:
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():
-        cards = [card(name, stem, results[name]) for name in names if name in results]
+        cards = [line for name in names if name in results for line in card(name, stem, results[name])]
         if cards:
-            lines += [f"## {title}", "", '<div class="cards">', "", *sum(cards, []), "</div>", ""]
+            lines += [f"## {title}", "", '<div class="cards">', "", *cards, "</div>", ""]
     missing = " ".join(
         f"[{name}]({address(name, stem)})," for stem, (_, names) in families().items()
         for name in names if name not in results

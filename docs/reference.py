@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from sphinx.ext.napoleon import Config, GoogleDocstring
-
 from gallery import turnable_tasks
+from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
 from lyceum_warp.binding import file_name, find_task

@@ -231,3 +231,9 @@ def test_notebooks_are_stored_without_output() -> None:
 def test_table_of_terms_is_up_to_date() -> None:
     page = (ROOT / "docs" / "terms.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
+
+
+def test_the_gallery_is_up_to_date() -> None:
+    program = runpy.run_path(str(ROOT / "docs" / "gallery.py"))
+    page = program["page"](json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text()))
+    assert (ROOT / "docs" / "gallery.md").read_text() == page

@@ -26,7 +26,8 @@ const prepare = (frame) => {
   const button = frame.contentDocument?.querySelector("canvas ~ form button");
   if (!button) return;
   frame.contentWindow.addEventListener("wheel", (e) => e.ctrlKey || e.stopImmediatePropagation(), true);
-  if (calm) button.click();
+  const stop = () => button.textContent === "pause" && (button.click(), setTimeout(stop, 100)); // its script may load
+  if (calm) stop();
 };
 for (const frame of document.querySelectorAll("iframe")) {
   frame.addEventListener("load", () => prepare(frame));
