@@ -51,7 +51,8 @@ nb_merge_streams = nb_execution_in_temp = True
 KernelManager.transport_encryption.default_value = "auto"  # with any other value, Jupyter kernels print a warning
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
-autodoc_member_order, autodoc_typehints = "bysource", "none"
+autodoc_member_order, autodoc_typehints = "bysource", "description"
+autodoc_typehints_description_target = "documented"
 
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",

@@ -167,8 +167,8 @@ def task_section(name: str) -> str:
     lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
-        lines += table((f"{title}, {count(sum(layout.values()), 'number')}", "size"),
-                       [(f"`{part}`", size) for part, size in layout.items()])  # fmt: skip
+        lines += table(("index", f"{title}, {count(sum(layout.values()), 'number')}"),
+                       list(zip(indices(list(layout.values())), (f"`{part}`" for part in layout), strict=True)))  # fmt: skip
     lines += actions(task)
     lines += metrics(task)
     rows = parameters(task)
@@ -232,8 +232,16 @@ def actions(task: BoundTask) -> list[str]:
             rows[-1] = ([*rows[-1][0], part], rows[-1][1] + columns.stop - columns.start, text)
         else:
             rows.append(([part], columns.stop - columns.start, text))
-    cells = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
-    return table((f"action, {count(space.size, 'number')}", "size", "bounds"), cells)
+    places = indices([size for _, size, _ in rows])
+    cells = [(place, ", ".join(f"`{part}`" for part in parts), text)
+             for place, (parts, _, text) in zip(places, rows, strict=True)]  # fmt: skip
+    return table(("index", f"action, {count(space.size, 'number')}", "bounds"), cells)
+
+
+def indices(sizes: list[int]) -> list[str]:
+    """Return the range of indices of each part of an array."""
+    ends = np.cumsum(sizes).tolist()
+    return [f"{end - size} to {end - 1}" if size > 1 else f"{end - 1}" for end, size in zip(ends, sizes, strict=True)]
 
 
 def metrics(task: BoundTask) -> list[str]:
