@@ -285,9 +285,9 @@ def families() -> dict[str, tuple[str, list[str]]]:
 def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     introduction = (
-        "Each picture links to its task, and each command shows the task. Where the animation has a command of its own, "
-        "the result unfolds it. A policy's return is the mean over whole episodes. A planner's return is the sum of the "
-        "rewards from the start of the episode to the last frame of the animation."
+        "Each picture links to its task, and each command shows the task. Where the animation has a command of its "
+        "own, the result unfolds it. A policy's return is the mean over whole episodes. A planner's return is the sum "
+        "of the rewards from the start of the episode to the last frame of the animation."
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():

@@ -167,8 +167,8 @@ def task_section(name: str) -> str:
     lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
-        lines += table(("index", f"{title}, {count(sum(layout.values()), 'number')}"),
-                       list(zip(indices(list(layout.values())), (f"`{part}`" for part in layout), strict=True)))  # fmt: skip
+        parts = zip(indices(list(layout.values())), (f"`{part}`" for part in layout), strict=True)
+        lines += table(("index", f"{title}, {count(sum(layout.values()), 'number')}"), list(parts))
     lines += actions(task)
     lines += metrics(task)
     rows = parameters(task)

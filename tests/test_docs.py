@@ -233,7 +233,15 @@ def test_table_of_terms_is_up_to_date() -> None:
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
 
 
+GALLERY = str(ROOT / "docs" / "gallery.py")
+
+
+def test_the_robot_of_the_first_page_loads_quickly(tmp_path: Path) -> None:
+    (robot,) = words_of(ROOT / "docs" / "index.md", "robot")
+    runpy.run_path(GALLERY)["write_turnable"](robot, tmp_path)
+    assert 50_000 < (tmp_path / f"{robot}.html").stat().st_size < 400_000
+
+
 def test_the_gallery_is_up_to_date() -> None:
-    program = runpy.run_path(str(ROOT / "docs" / "gallery.py"))
-    page = program["page"](json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text()))
+    page = runpy.run_path(GALLERY)["page"](json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text()))
     assert (ROOT / "docs" / "gallery.md").read_text() == page
