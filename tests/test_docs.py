@@ -243,5 +243,5 @@ def test_the_robot_of_the_first_page_loads_quickly(tmp_path: Path) -> None:
 
 
 def test_the_gallery_is_up_to_date() -> None:
-    page = runpy.run_path(GALLERY)["page"](json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text()))
-    assert (ROOT / "docs" / "gallery.md").read_text() == page
+    results = json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text())
+    assert (ROOT / "docs" / "gallery.md").read_text() == runpy.run_path(GALLERY)["page"](results)
