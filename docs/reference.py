@@ -11,6 +11,7 @@ import types
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import warp as wp
 from gallery import turnable_tasks
@@ -233,9 +234,18 @@ def actions(task: BoundTask) -> list[str]:
         else:
             rows.append(([part], columns.stop - columns.start, text))
     places = indices([size for _, size, _ in rows])
-    cells = [(place, ", ".join(f"`{part}`" for part in parts), text)
+    joints = {} if task.layouts.actions else dict(zip(space.parts, actuated_joints(task.model), strict=True))
+    cells = [(place, ", ".join(f"`{part}`{joints.get(part, '')}" for part in parts), text)
              for place, (parts, _, text) in zip(places, rows, strict=True)]  # fmt: skip
     return table(("index", f"action, {count(space.size, 'number')}", "bounds"), cells)
+
+
+def actuated_joints(model: mujoco.MjModel) -> list[str]:
+    """Return the name of each actuator's joint in parentheses, or "" without one or where the names are equal."""
+    kind = mujoco.mjtTrn.mjTRN_JOINT
+    names = [model.joint(model.actuator_trnid[i, 0]).name if model.actuator_trntype[i] == kind else ""
+             for i in range(model.nu)]  # fmt: skip
+    return [f" ({name})" if name not in ("", model.actuator(i).name) else "" for i, name in enumerate(names)]
 
 
 def indices(sizes: list[int]) -> list[str]:
