@@ -4,9 +4,12 @@ The source folder is the repository's root, so the same relative links work in t
 The build replaces comments ``<!-- KIND: words -->`` by generated text. ``PLACES`` lists the kinds.
 """
 
+import html
 import logging
+import os
 import re
 import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,7 @@ from jupyter_client.manager import KernelManager
 from sphinx.addnodes import pending_xref
 
 sys.path.insert(0, str(Path(__file__).parent))
+import gallery
 import reference
 
 import lyceum_warp as lw
@@ -30,8 +34,11 @@ include_patterns = ["docs/**", "CONTRIBUTING.md", "CHANGELOG.md", "bench/README.
 exclude_patterns = [".*", "build", "runs", "**/__pycache__"]
 
 html_theme, html_title = "furo", "lyceum_warp"
-html_static_path = ["static"]
-html_css_files = ["site.css"]
+html_baseurl = os.environ.get("SITE_URL", "")  # the site's address, for canonical links and the page 404.html
+html_static_path, html_favicon = ["static"], "static/favicon.svg"
+html_css_files, html_js_files = ["site.css"], [("site.js", {"defer": "defer"})]
+templates_path, html_additional_pages = ["templates"], {"404": "404.html"}
+html_context = {"site_root": html_baseurl.rstrip("/") + "/"}
 html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
 html_show_copyright = html_show_sourcelink = False
 
@@ -44,7 +51,8 @@ nb_merge_streams = nb_execution_in_temp = True
 KernelManager.transport_encryption.default_value = "auto"  # with any other value, Jupyter kernels print a warning
 
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
-autodoc_member_order, autodoc_typehints = "bysource", "none"
+autodoc_member_order, autodoc_typehints = "bysource", "description"
+autodoc_typehints_description_target = "documented"
 
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
@@ -69,7 +77,16 @@ def contents(_: str) -> str:
     )
 
 
-PLACES = {"contents": contents, "names": reference.names, "modules": reference.modules, "tasks": reference.tasks}
+def robot(name: str) -> str:
+    """Return a turnable robot, and a still picture for those without scripts."""
+    picture = '<noscript><style>.robot iframe { display: none }</style><img src="stills/robots.webp" alt=""></noscript>'
+    return f'<div class="robot">{reference.frame(name.strip(), "")}{picture}</div>'
+
+
+PLACES = {
+    "contents": contents, "names": reference.names, "modules": reference.modules, "tasks": reference.tasks,
+    "turnable": reference.turnable, "robot": robot,
+}  # fmt: skip
 
 
 def fill(app: Any, docname: str, source: list[str]) -> None:
@@ -95,9 +112,37 @@ def link_names(app: Any, doctree: nodes.document) -> None:
             link += literal
 
 
-def redirect(app: Any, error: Exception | None) -> None:
-    """Redirect from the site's address to its first page."""
+def load_late(app: Any, doctree: nodes.document) -> None:
+    """Let pictures load when they are near, and animations stand still until site.js replaces the still picture."""
+    up = "../" * (app.env.docname.count("/") - 1)
+    for image in list(doctree.findall(nodes.image)):
+        image["loading"] = "lazy"
+        if "images/gallery/" in image["uri"]:
+            still = f"{up}stills/{Path(image['uri']).name}"
+            before = nodes.raw("", f'<picture><source media="all" srcset="{still}">', format="html")
+            image.replace_self([before, image, nodes.raw("", "</picture>", format="html")])
+
+
+def describe(app: Any, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
+    """Describe a page to search engines by its first paragraph."""
+    paragraph = next(doctree.findall(nodes.paragraph), None) if doctree else None
+    if paragraph:
+        text = html.escape(textwrap.shorten(paragraph.astext(), 160, placeholder=" …"))
+        context["metatags"] = f'{context.get("metatags", "")}<meta name="description" content="{text}">'
+
+
+def write_files(app: Any, error: Exception | None) -> None:
+    """Write turnable robots and still pictures, and redirect from the site's address to its first page."""
+    if error or app.builder.format != "html":
+        return
     Path(app.outdir, "index.html").write_text('<meta http-equiv="refresh" content="0; url=docs/index.html">\n')
+    pages, stills = (Path(app.outdir, "docs", name) for name in ("turnable", "stills"))
+    for folder in (pages, stills):
+        folder.mkdir(exist_ok=True)
+    for name in gallery.turnable_tasks():
+        gallery.write_turnable(name, pages)
+    for animation in [gallery.DOCS / "images" / "robots.webp", *gallery.FOLDER.glob("*.webp")]:
+        gallery.write_still(animation, stills)
 
 
 def setup(app: Any) -> None:
@@ -106,4 +151,6 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-docstring", reference.convert)
     app.connect("autodoc-process-signature", reference.short_signature)
     app.connect("doctree-read", link_names)
-    app.connect("build-finished", redirect)
+    app.connect("doctree-read", load_late)
+    app.connect("html-page-context", describe)
+    app.connect("build-finished", write_files)

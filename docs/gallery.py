@@ -2,12 +2,15 @@
 
 If FOLDER contains a run, its policy controls the run's task. Otherwise, a pretrained policy does. MPPI controls the
 other tasks. The program writes animations and results into docs/images/gallery/, and then the page gallery.md. By
-default, it renders all tasks.
+default, it renders all tasks; with --page, it only writes the page.
+
+The site's build imports this file to write still pictures and pages with turnable robots.
 """
 
 import argparse
 import copy
 import dataclasses
+import functools
 import io
 import json
 import re
@@ -21,8 +24,9 @@ from PIL import Image
 
 import lyceum_warp as lw
 from lyceum_warp.binding import file_name, find_task
-from lyceum_warp.training import ALGORITHMS
-from lyceum_warp.viz import CameraChoice, FreeCamera
+from lyceum_warp.binding.bound_task import BoundTask
+from lyceum_warp.training import ALGORITHMS, pretrained_tasks
+from lyceum_warp.viz import CameraChoice, FreeCamera, write_page
 from lyceum_warp.viz.cameras import camera_values
 from lyceum_warp.viz.render import Painter
 from lyceum_warp.viz.video import shots
@@ -281,27 +285,17 @@ def families() -> dict[str, tuple[str, list[str]]]:
 def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     introduction = (
-        "Each animation shows a task under a policy or a planner, with the result and a command that shows or "
-        "trains it. A policy's return is the mean over whole episodes. A planner's return is the sum of the rewards "
-        "from the start of the episode to the last frame of the animation. Each name links to the task's details."
+        "Each picture links to its task, and each command shows the task. Where the animation has a command of its "
+        "own, the result unfolds it. A policy's return is the mean over whole episodes. A planner's return is the sum "
+        "of the rewards from the start of the episode to the last frame of the animation."
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
     for stem, (title, names) in families().items():
-        cells = []
-        for name in names:
-            result = results.get(name)
-            if result:
-                picture = f"![{name}](images/gallery/{file_name(name)}.webp)"
-                link = f"[{name}](tasks/{stem}.md#{name.replace('/', '')})"
-                cells.append(f"{picture}<br>{link}<br>{result['result']}<br>`{result['command']}`")
-        if not cells:
-            continue
-        lines += [f"## {title}", "", "| | | |", "|---|---|---|"]
-        cells += [""] * (-len(cells) % 3)
-        lines += [f"| {' | '.join(cells[i : i + 3])} |" for i in range(0, len(cells), 3)]
-        lines.append("")
+        cards = [line for name in names if name in results for line in card(name, stem, results[name])]
+        if cards:
+            lines += [f"## {title}", "", '<div class="cards">', "", *cards, "</div>", ""]
     missing = " ".join(
-        f"[{name}](tasks/{stem}.md#{name.replace('/', '')})," for stem, (_, names) in families().items()
+        f"[{name}]({address(name, stem)})," for stem, (_, names) in families().items()
         for name in names if name not in results
     )  # fmt: skip
     if missing:
@@ -309,12 +303,62 @@ def page(results: dict[str, dict[str, str]]) -> str:
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
+def card(name: str, stem: str, result: dict[str, str]) -> list[str]:
+    """Return a task's picture, its shortest command, and its result."""
+    command = f"lyceum-warp view {name} --pretrained" if name in pretrained_tasks() else f"lyceum-warp plan {name}"
+    link = f"]({address(name, stem)})"
+    lines = ["<div>", "", f"[![{name}](images/gallery/{file_name(name)}.webp){link}", "", f"[{name}{link}", ""]
+    lines += ["```", command, "```", ""]
+    if result["command"] == command:
+        lines += [result["result"], ""]
+    else:
+        head = f"<details><summary>{result['result']}</summary>"
+        lines += [head, "", "```", result["command"], "```", "", "</details>", ""]
+    if name in pretrained_tasks():
+        lines += [f"<!-- turnable: {name} -->", ""]
+    return [*lines, "</div>", ""]
+
+
+def address(name: str, stem: str) -> str:
+    """Return the link from the gallery to a task's section."""
+    return f"tasks/{stem}.md#{name.replace('/', '')}"
+
+
+# still pictures and turnable robots, which the build of the site writes
+
+
+@functools.cache
+def turnable_tasks() -> list[str]:
+    """List the tasks with a pretrained policy and a model of plain shapes, whose pages are smaller than 0.4 MB."""
+    models = {name: BoundTask(find_task(name)).model for name in pretrained_tasks()}
+    return [name for name, model in models.items() if not model.nmesh and not model.nhfield]
+
+
+def write_turnable(name: str, folder: Path) -> None:
+    """Write four seconds of an episode under the pretrained policy as a page with a turnable robot."""
+    show = SHOWS.get(name, Show())
+    env = lw.make(name, autoreset=False, device="cpu")
+    states = acted(env, lw.load(lw.pretrained_run(name)), show, round((show.start + 4) / env.timestep))
+    write_page(env, states[round(show.start / env.timestep) :], folder / f"{file_name(name)}.html", camera=show.camera)
+
+
+def write_still(animation: Path, folder: Path) -> None:
+    """Write the middle frame of an animation as a picture of the same name."""
+    with Image.open(animation) as image:
+        image.seek(getattr(image, "n_frames", 1) // 2)
+        image.save(folder / animation.name, "WEBP", quality=80)
+
+
 def main() -> None:
     """Render the animations of the given tasks, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("tasks", nargs="*", metavar="TASK")
     parser.add_argument("--runs", type=Path, metavar="FOLDER", default=PRETRAINED)
+    parser.add_argument("--page", action="store_true")
     arguments = parser.parse_args()
+    if arguments.page:
+        (DOCS / "gallery.md").write_text(page(json.loads(RESULTS.read_text())))
+        return
     runs = {json.loads(path.read_text())["task"]: path.parent for path in sorted(arguments.runs.glob("*/config.json"))}
     for name in arguments.tasks or [name for _, names in families().values() for name in names]:
         result = render(name, runs.get(name))

@@ -11,8 +11,10 @@ import types
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import warp as wp
+from gallery import turnable_tasks
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
@@ -163,11 +165,11 @@ def task_section(name: str) -> str:
     picture = f"images/gallery/{file_name(name)}.webp"
     if (DOCS / picture).exists():
         lines += [f"![{name}](../{picture})", ""]
-    lines += [about, "", markdown(body), "", *facts(task), ""]
+    lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         title = "observation" if group == "policy" else f"`{group}` observation"
-        lines += table((f"{title}, {count(sum(layout.values()), 'number')}", "size"),
-                       [(f"`{part}`", size) for part, size in layout.items()])  # fmt: skip
+        parts = zip(indices(list(layout.values())), (f"`{part}`" for part in layout), strict=True)
+        lines += table(("index", f"{title}, {count(sum(layout.values()), 'number')}"), list(parts))
     lines += actions(task)
     lines += metrics(task)
     rows = parameters(task)
@@ -180,6 +182,19 @@ def task_section(name: str) -> str:
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
     return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def frame(name: str, up: str) -> str:
+    """Return the frame of a robot that can be turned; ``up`` is the path from the page to docs/."""
+    page = f"{up}turnable/{file_name(name)}.html"
+    return f'<iframe src="{page}" title="{name}: drag to turn the view" loading="lazy"></iframe>'
+
+
+def turnable(name: str, up: str = "") -> str:
+    """Return a fold with a task's robot, if it can be turned."""
+    if name.strip() not in turnable_tasks():
+        return ""
+    return f'<details class="turnable"><summary>Turn the robot</summary>{frame(name.strip(), up)}</details>'
 
 
 def facts(task: BoundTask) -> list[str]:
@@ -218,8 +233,25 @@ def actions(task: BoundTask) -> list[str]:
             rows[-1] = ([*rows[-1][0], part], rows[-1][1] + columns.stop - columns.start, text)
         else:
             rows.append(([part], columns.stop - columns.start, text))
-    cells = [(", ".join(f"`{part}`" for part in parts), size, text) for parts, size, text in rows]
-    return table((f"action, {count(space.size, 'number')}", "size", "bounds"), cells)
+    places = indices([size for _, size, _ in rows])
+    joints = {} if task.layouts.actions else dict(zip(space.parts, actuated_joints(task.model), strict=True))
+    cells = [(place, ", ".join(f"`{part}`{joints.get(part, '')}" for part in parts), text)
+             for place, (parts, _, text) in zip(places, rows, strict=True)]  # fmt: skip
+    return table(("index", f"action, {count(space.size, 'number')}", "bounds"), cells)
+
+
+def actuated_joints(model: mujoco.MjModel) -> list[str]:
+    """Return the name of each actuator's joint in parentheses, or "" without one or where the names are equal."""
+    kind = mujoco.mjtTrn.mjTRN_JOINT
+    names = [model.joint(model.actuator_trnid[i, 0]).name if model.actuator_trntype[i] == kind else ""
+             for i in range(model.nu)]  # fmt: skip
+    return [f" ({name})" if name not in ("", model.actuator(i).name) else "" for i, name in enumerate(names)]
+
+
+def indices(sizes: list[int]) -> list[str]:
+    """Return the range of indices of each part of an array."""
+    ends = np.cumsum(sizes).tolist()
+    return [f"{end - size} to {end - 1}" if size > 1 else f"{end - 1}" for end, size in zip(ends, sizes, strict=True)]
 
 
 def metrics(task: BoundTask) -> list[str]:

@@ -232,3 +232,17 @@ def test_notebooks_are_stored_without_output() -> None:
 def test_table_of_terms_is_up_to_date() -> None:
     page = (ROOT / "docs" / "terms.md").read_text()
     assert runpy.run_path(str(ROOT / "docs" / "terms_table.py"))["written"](page) == page
+
+
+GALLERY = str(ROOT / "docs" / "gallery.py")
+
+
+def test_the_robot_of_the_first_page_loads_quickly(tmp_path: Path) -> None:
+    (robot,) = words_of(ROOT / "docs" / "index.md", "robot")
+    runpy.run_path(GALLERY)["write_turnable"](robot, tmp_path)
+    assert 50_000 < (tmp_path / f"{robot}.html").stat().st_size < 400_000
+
+
+def test_the_gallery_is_up_to_date() -> None:
+    results = json.loads((ROOT / "docs" / "images" / "gallery" / "results.json").read_text())
+    assert (ROOT / "docs" / "gallery.md").read_text() == runpy.run_path(GALLERY)["page"](results)
