@@ -106,8 +106,8 @@ def convert(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[
 
 
 def converted(text: str) -> list[str]:
-    """Convert a docstring to lines of reStructuredText, and escape vertical bars outside of code."""
-    text = re.sub(r"``.*?``|\|", lambda match: "\\|" if match[0] == "|" else match[0], text, flags=re.DOTALL)
+    """Convert a docstring to lines of reStructuredText; outside of code, escape vertical bars and ``file:``."""
+    text = re.sub(r"(``.*?``)|(\||\bfile(?=:))", lambda match: match[1] or f"\\{match[2]}", text, flags=re.DOTALL)
     return str(GoogleDocstring(text, SECTIONS)).splitlines()
 
 
