@@ -58,7 +58,7 @@ def make(  # noqa: D417
     fields: Collection[str] = (),
     dynamics: Collection[str] = (),
     fitted: str | Path | None = None,
-    fitted_draws: bool | None = None,
+    fitted_draws: bool = False,
     cameras: Collection[Camera] | None = None,
     final_pictures: bool = False,
     physics: str | PhysicsOptions | None = None,

@@ -99,7 +99,7 @@ def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
     """
     curves = []
     for path in map(Path, paths):
-        folders = [path] if (path / CONFIG).is_file() else sorted(file.parent for file in path.rglob(CONFIG))
+        folders = [path] if (path / CONFIG).is_file() else sorted(file.parent for file in path.rglob("metrics.csv"))
         others = [] if folders else sorted({file.parent for file in path.rglob(_EVENTS)})
         if not folders and not others:
             Run.open(path)  # raises an error that names what is there

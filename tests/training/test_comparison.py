@@ -14,7 +14,7 @@ from lyceum_warp.training.report import write_report
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs")
+    folder = tmp_path_factory.mktemp("study") / "runs"
     for name, options in {"a": ["--seed", "0"], "b": ["--seed", "1"], "c": ["--gamma", "0.9"]}.items():
         assert train(folder / name, "--iterations", "4", *options) == 0
     return folder

@@ -69,7 +69,7 @@ def _checked(name: str, value: Any, kinds: tuple[Any, ...], bound: Bound | None)
     if tuple[int, ...] in kinds:
         return tuple(layer_sizes(value, name))
     if tuple[str, ...] in kinds:
-        if isinstance(value, str) or not all(isinstance(word, str) for word in value):
+        if not isinstance(value, list | tuple) or not all(isinstance(word, str) for word in value):
             raise ValueError(f"{name} must be names of groups of observations, as in ('camera',), not {value!r}")
         return tuple(value)
     if bool in kinds:

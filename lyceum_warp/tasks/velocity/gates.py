@@ -77,15 +77,12 @@ class Walks(lw.Gate):
         for prefix, params in (("", {"push_seconds": [NEVER, NEVER]}), ("pushed_", {})):
             env = worlds(len(commands), **params)
             play = Play(env, commands, env.get_state())
-            play.step(act, PART)
-            if not prefix:
-                yield {"start_error": float(play.results()[0].mean())}
-            for _ in range(STEPS // PART - 1):
-                yield {f"{prefix}falls": play.falls.count_nonzero().item()}
+            for part in range(STEPS // PART):
                 play.step(act, PART)
+                start = {"start_error": float(play.results()[0].mean())} if not prefix and part == 0 else {}
+                yield {f"{prefix}falls": play.falls.count_nonzero().item()} | start
             velocity_error, yaw_rate_error, *_ = play.results()
             yield {
-                f"{prefix}falls": play.falls.count_nonzero().item(),
                 f"{prefix}velocity_error": float(velocity_error.mean()),
                 f"{prefix}yaw_rate_error": float(yaw_rate_error.mean()),
             }

@@ -11,7 +11,8 @@ from lyceum_warp.env import Env
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
 STARTS = ("start_clip", "start_frame")
 """Parameters of tracking tasks. A change puts the displayed world there."""
-_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world")  # options that a planner sets itself
+_OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world", "cameras")
+"""Options that a planner sets itself."""
 
 Numbers = tuple[tuple[str, float], ...]
 
