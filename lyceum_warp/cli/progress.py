@@ -90,7 +90,7 @@ class Display(Callback):
     def work(self, text: str, unit: str, done: int, total: int) -> None:
         """Show the progress of work between two iterations, such as rendering a video."""
         if self.console.is_terminal:
-            self.progress.text = f"{text}: {done}/{total} {unit}"
+            self.progress.text = escape(f"{text}: {done}/{total} {unit}")
             return
         if self.long_work is None or (self.long_work.text, self.long_work.unit) != (text, unit):
             self.long_work = LongWork(text, unit, self.console)

@@ -10,6 +10,7 @@ from lyceum_warp.core.fields import (
     quat as quat,
     vec10 as vec10,
 )
+from lyceum_warp.core.fitted import FIT_FORMAT as FIT_FORMAT
 from lyceum_warp.core.gate import (
     Gate as Gate,
     Limit as Limit,

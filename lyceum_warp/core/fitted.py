@@ -15,7 +15,8 @@ from lyceum_warp.support.files import unknown_format
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import first_sentence
 
-FORMAT = 1
+FIT_FORMAT = 1
+"""Format of the folder of a fit."""
 
 
 class Fitted:
@@ -37,9 +38,9 @@ class Fitted:
         content: dict[str, Any] = {}
         with self._damage(path):
             content = json.loads(path.read_text(encoding="utf-8"))
-            newer = isinstance(content["format"], int) and content["format"] > FORMAT
+            newer = isinstance(content["format"], int) and content["format"] > FIT_FORMAT
         if newer:
-            raise unknown_format(path, content["format"], FORMAT)
+            raise unknown_format(path, content["format"], FIT_FORMAT)
         with self._damage(path):
             self.values: dict[str, dict[str, np.ndarray]] = {
                 field: {str(name): _finite(rows) for name, rows in parts.items()}

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.binding import compile_model, find_task, task_spec
-from lyceum_warp.core import MOVED_INERTIA, EnvOptions, ModelFile, Task, load_spec
+from lyceum_warp.core import FIT_FORMAT, MOVED_INERTIA, EnvOptions, ModelFile, Task, load_spec
 from lyceum_warp.env import Env
 from lyceum_warp.fitting.least_squares import Estimate, LeastSquares, Linear, search
 from lyceum_warp.fitting.log import Column, Controls, Log, LogSource, read_log
@@ -25,7 +25,6 @@ from lyceum_warp.support.files import replaced
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number, positive_number, whole_number
 
-FORMAT = 1
 DRAWS = 1024
 """Draws from the posterior that the folder holds."""
 DEFAULT = ("kp.*", "kd.*", "dof_armature.*", "dof_damping.*", "dof_frictionloss.*", "delay.ctrl.*")
@@ -265,7 +264,7 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
     xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
     rows = [bound.fields(bound.model(x)) for x in np.clip(xs, bound.low, bound.high)]
     draws: dict[str, Any] = {field: np.array([list(row[field].values()) for row in rows]) for field in result.fields}
-    content = {"format": FORMAT, "model": name} | {
+    content = {"format": FIT_FORMAT, "model": name} | {
         field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value
         for field in dataclasses.fields(result) if field.name not in ("folder", "correlation")
     }  # fmt: skip

@@ -28,3 +28,22 @@ def test_number_beyond_any_limit_fails_the_gate(limit: str) -> None:
     assert not lw.Verdict(numbers=ends | {limit: beyond}, **content).passed
     missing = {name: number for name, number in ends.items() if name != limit}
     assert not lw.Verdict(numbers=missing, **content).passed
+
+
+def test_a_quick_test_ends_at_the_fall_that_decides_it(shared_env: SharedEnv) -> None:
+    class Short(gates.Walks):
+        COMMANDS, starts = ((0.0, 0.0, 0.0),), 1
+
+    steps = 0
+
+    def act(obs: torch.Tensor) -> torch.Tensor:
+        nonlocal steps
+        steps += 1
+        return torch.zeros(1, 12) if steps <= 150 else torch.full((1, 12), 8.0)  # stands, then falls
+
+    def worlds(nworld: int, **params: Any) -> lw.Env:
+        return shared_env("go1_velocity", nworld=nworld, horizon=0, **params)
+
+    parts = Short().measure(worlds, act)
+    assert next(parts)["falls"] == 0 and next(part["falls"] for part in parts if part["falls"]) == 1
+    assert 150 < steps < gates.STEPS // 2
