@@ -130,6 +130,11 @@ class ModelField:
         return self.name in _OPTIONS
 
     @property
+    def in_model(self) -> bool:
+        """Whether the field is a field of MjModel, not the index of the world's object."""
+        return self.name != "object"
+
+    @property
     def follows(self) -> bool:
         """Whether MuJoCo computes the field from other fields."""
         return self.name in _COMPUTED

@@ -19,7 +19,7 @@ class WorldModels:
 
     def __init__(self, batch: Batch, fields: Iterable[ModelField]) -> None:
         self.batch = batch
-        self.fields = [field for field in fields if field.size and field.name != "object"]
+        self.fields = [field for field in fields if field.size and field.in_model]
         self._follows = {field.name for field in self.fields if field.constants}
         self._rows: dict[str, np.ndarray] = {}
         self._nominal: dict[str, np.ndarray] = {}

@@ -61,7 +61,7 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[ModelField] = ()) -> t
         NotImplementedError, ValueError: MuJoCo Warp does not support the model.
     """
     names = {field.name for field in varied}
-    objects = {field.name: field.rows for field in varied if field.rows is not None and field.name != "object"}
+    objects = {field.name: field.rows for field in varied if field.rows is not None and field.in_model}
     contacts, constraints = _probe_once(_with_friction_losses(model, names), objects)
     constraints += _inactive(model)
     if not _LIMITS.isdisjoint(names):

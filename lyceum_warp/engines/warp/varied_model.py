@@ -75,7 +75,7 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
     ``mjw.put_model`` disables parts of the physics whose fields are all zero. This function enables the parts whose
     fields may become non-zero in a world.
     """
-    fields = [field for field in fields if field.size and field.name != "object"]
+    fields = [field for field in fields if field.size and field.in_model]
     names = [field.name for field in fields if not field.option]
     names += [name for name in outputs_of(fields) if np.size(getattr(model, name))]
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))

@@ -297,7 +297,7 @@ class WarpEngine(Engine):
     def _group_of_worlds(self) -> PartialForward:
         size = group_size(self.nworld, self.device)
         fields = list(self.dynamics.values())
-        names = [field.name for field in fields if field.size and field.name != "object"] + outputs_of(fields)
+        names = [field.name for field in fields if field.size and field.in_model] + outputs_of(fields)
         with wp.ScopedDevice(self.device):
             rows = ModelRows(self.m, names, size)
         return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
