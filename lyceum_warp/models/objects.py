@@ -17,7 +17,7 @@ _GEOM = (
 
 _UNUSED = {"size": [1e-3] * 3, "mass": 0.0, "margin": -1e9, "rgba": [0.0] * 4}
 """Attributes of a geom that an object does not use. The margin excludes it from collisions on both engines, and MuJoCo
-neither renders nor measures distances to a transparent geom."""
+neither renders a transparent geom nor lets rays hit it."""
 
 
 class ObjectModels:
@@ -90,14 +90,12 @@ class ObjectModels:
 
     def _add_geoms(self, target: mujoco.MjsBody, body: mujoco.MjsBody, name: str, meshes: Mapping[int, str]) -> None:
         """Give a body the geoms of an object, in the order of ``_types``, with the default class of ``body``."""
-        geoms = list(self._objects.models[name])
+        geoms = {kind: [geom for geom in self._objects.models[name] if geom.type == kind] for kind in self._types}
         for kind in self._types:
-            geom = next((geom for geom in geoms if geom.type == kind), None)
-            attributes = dict(self._objects.common) | (_UNUSED if geom is None else dict(geom.attributes))
-            if geom is not None:
-                geoms.remove(geom)
+            geom = geoms[kind].pop() if geoms[kind] else None
+            attributes = {**self._objects.common, **(_UNUSED if geom is None else geom.attributes)}
             if kind == mujoco.mjtGeom.mjGEOM_MESH:
-                attributes["meshname"] = meshes[id(geom)] if geom is not None else next(iter(meshes.values()))
+                attributes["meshname"] = meshes.get(id(geom)) or next(iter(meshes.values()))
             try:
                 target.add_geom(body.classname, type=kind, **attributes)
             except (TypeError, ValueError) as error:
@@ -118,7 +116,7 @@ def _add_meshes(spec: mujoco.MjSpec, objects: Objects, indices: Mapping[str, int
     names = {}
     for name in indices:
         for i, geom in enumerate(objects.models[name]):
-            if (path := objects.path(geom, owner)) is None:
+            if (path := objects.path(geom, owner)) is None or id(geom) in names:
                 continue
             if not path.is_file():
                 raise FileNotFoundError(f"the object {name!r} has no file {path}: check the path in lw.mesh")

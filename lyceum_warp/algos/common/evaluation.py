@@ -82,7 +82,7 @@ def evaluate(
     Every world contributes the same number of episodes. Otherwise, worlds with short episodes would contribute more
     episodes and bias the results. If the task has a curriculum in lasting memory, one episode does not change the level
     of the next: all worlds play one episode, and then begin again as if they were further worlds. If worlds keep
-    different objects, they begin again, too, so that all objects are used.
+    different objects, they begin again, too, so that a seed leads to all objects.
 
     Args:
         env: The environment; its worlds are reset.
