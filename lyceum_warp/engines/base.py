@@ -113,9 +113,9 @@ class Engine(abc.ABC):
             wp.copy(flat(array), wp.array(rows, dtype=wp.float32, device=self.device))
         return array
 
-    def _in_every_world(self, field: ModelField) -> wp.array:
-        """Make an array of a model field, (nworld, ...), with the model's values."""
-        return self._array_of(field, np.tile(field.value(self.model).reshape(1, -1), (self.nworld, 1)))
+    def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
+        """Make an array of a model field, (rows, ...), with the model's values."""
+        return self._array_of(field, np.tile(field.value(self.model).reshape(1, -1), (rows, 1)))
 
     @classmethod
     def bytes_per_world(

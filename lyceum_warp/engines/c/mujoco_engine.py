@@ -92,7 +92,7 @@ class MujocoEngine(Engine):
         self._masks: dict[int, tuple[wp.array, np.ndarray]] = {}
         self._values: dict[str, np.ndarray] = {}
         for name, varied in self.dynamics.items():
-            self.arrays[name] = self._in_every_world(varied)
+            self.arrays[name] = self._nominal_rows(varied, nworld)
             self._values[name] = flat(self.arrays[name]).numpy()
         self._models = WorldModels(self.batch, self.dynamics.values())
         self._models.apply(self._values)

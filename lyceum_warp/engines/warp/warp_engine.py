@@ -156,7 +156,7 @@ class WarpEngine(Engine):
 
     def _alias_model(self, field: ModelField) -> wp.array:
         if field.name in OBJECT_FIELDS:  # ``apply_model`` copies them into the model
-            return self._in_every_world(field)
+            return self._nominal_rows(field, self.nworld)
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
