@@ -104,7 +104,7 @@ class FrameMaker:
         self, state: np.ndarray, status: Status, ghosts: Sequence[Ghost], paths: np.ndarray | None = None
     ) -> Frame:
         parts = self._env.state_space.parts
-        fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
+        fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics if field.in_model}
         ghosts = [*(Ghost(pose, REFERENCE) for pose in reference_states(self._env, state)), *ghosts]
         return Frame(self._physics(state), fields, status, tuple(ghosts), paths, self._driving.arrows(state))
 
