@@ -1,4 +1,4 @@
-"""LeapRotate and LeapReorient: a LEAP hand turns a cube (MuJoCo Playground's scene)."""
+"""LeapRotate and LeapReorient: a LEAP hand turns a cube (MuJoCo Playground's scene), or objects of MyoSuite."""
 
 import mujoco
 
@@ -6,6 +6,17 @@ import lyceum_warp as lw
 from lyceum_warp.tasks.hands import reorienting, rotating
 
 MODEL = lw.playground_model("manipulation/leap_hand/xmls/scene_mjx_cube.xml")
+LONGEST = {
+    "airplane": 0.171, "alarmclock": 0.126, "apple": 0.1, "binoculars": 0.142, "bowl": 0.149, "camera": 0.116,
+    "coffeemug": 0.116, "cubemedium": 0.08, "cup": 0.1, "cylindermedium": 0.08, "duck": 0.107, "elephant": 0.136,
+    "flashlight": 0.139, "gamecontroller": 0.155, "hammer": 0.182, "hand": 0.149, "lightbulb": 0.085, "mouse": 0.117,
+    "mug": 0.116, "piggybank": 0.186, "pyramidmedium": 0.107, "spheremedium": 0.08, "stamp": 0.1,
+    "stanfordbunny": 0.163, "stapler": 0.123, "teapot": 0.236, "torusmedium": 0.08, "train": 0.114, "watch": 0.083,
+    "waterbottle": 0.137,
+}  # fmt: skip
+"""Longest side of the bounding box of MyoSuite's objects that a hand of this size can turn, m."""
+SIDE = 0.085
+"""Longest side of all objects, m."""
 
 
 def edit(spec: mujoco.MjSpec) -> None:
@@ -24,3 +35,11 @@ class LeapRotate(rotating.Rotate):
 @lw.register
 class LeapReorient(reorienting.Reorient):
     model, edit_model = MODEL, staticmethod(edit)
+    objects = lw.Objects(
+        "cube",
+        {
+            name: lw.myosuite_objects(name, scale=SIDE / side, density=315, maxhullvert=32)[name]
+            for name, side in LONGEST.items()
+        },
+        condim=3,
+    )
