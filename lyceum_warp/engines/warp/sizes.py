@@ -19,7 +19,7 @@ from lyceum_warp.kernels import faults
 
 log = logging.getLogger(__name__)
 
-_WORLDS, _HOLDS, _SUBSTEPS = 48, 25, 20
+_WORLDS, _WORLDS_OF_OBJECT, _HOLDS, _SUBSTEPS = 48, 16, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
@@ -46,8 +46,8 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[ModelField] = ()) -> t
     In the rollouts, 48 worlds run 500 substeps on the C engine. Two thirds of the worlds draw new controls every 20
     substeps. The others hold each control at one of its bounds, because random controls average out: an arm that is
     driven by velocities would hardly leave its initial pose. The worlds start in the model's initial state or a
-    keyframe, half of them with random velocities. If the worlds hold different objects, at least four
-    worlds hold each object. Results are cached for each model.
+    keyframe, half of them with random velocities. If the worlds hold different objects, at least 16 worlds hold each
+    object. Results are cached for each model.
 
     Args:
         model: The compiled model.
@@ -110,18 +110,26 @@ def _probe_once(model: mujoco.MjModel, objects: Mapping[str, np.ndarray]) -> tup
     return _known[key]
 
 
+def _worlds_with(model: mujoco.MjModel, objects: Mapping[str, np.ndarray], rng: np.random.Generator) -> Batch:
+    """Make worlds that hold the objects in a random order. The rows of fields are (objects, size)."""
+    if not objects:
+        return Batch(model, _WORLDS)
+    used = np.unique(np.hstack([*objects.values()]), axis=0, return_index=True)[1]
+    held = rng.permutation(np.resize(used, max(_WORLDS, _WORLDS_OF_OBJECT * len(used))))
+    batch = Batch(model, len(held))
+    for name, rows in objects.items():
+        expanded = batch.expand(name)
+        expanded[:] = rows[held].reshape(expanded.shape)
+    batch.set_const()
+    return batch
+
+
 def _probe(model: mujoco.MjModel, objects: Mapping[str, np.ndarray]) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
         mjw.put_model(model)  # refuse an unsupported model before the probe, which may take a minute
-    nworld = max([_WORLDS, *(4 * len(rows) for rows in objects.values())])
-    batch = Batch(model, nworld)
     rng = np.random.default_rng(0)
-    held = rng.permutation(nworld)  # modulo the number of objects
-    for name, rows in objects.items():
-        expanded = batch.expand(name)
-        expanded[:] = rows[held % len(rows)].reshape(expanded.shape)
-    if objects:
-        batch.set_const()
+    batch = _worlds_with(model, objects, rng)
+    nworld = batch.nsim
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
     if model.nkey:
         batch.reset(keyframe=np.arange(nworld, dtype=np.int32) % (model.nkey + 1) - 1)
