@@ -56,7 +56,7 @@ autodoc_typehints_description_target = "documented"
 
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
-    "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/control tasks/arms tasks/balance "
+    "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/hands tasks/control tasks/arms tasks/balance "
     "tasks/velocity velocity terrain objects tasks/tracking tracking dm_suite",
     "Learning": "runs many_runs clusters ppo sac memory pixels policies learners deployment fitting adapters "
     "notebooks/own_robot notebooks/deploy",

@@ -5,6 +5,10 @@ import mujoco
 import lyceum_warp as lw
 from lyceum_warp.tasks.hands import reorienting, rotating
 
+FINGERS = ("if", "mf", "rf")
+JOINTS = [f"{finger}_{joint}" for finger in FINGERS for joint in ("mcp", "rot", "pip", "dip")]
+JOINTS += ["th_cmc", "th_axl", "th_mcp", "th_ipl"]
+PARAMS = {"joints": lw.joints(*JOINTS), "tips": lw.sites(*(f"{finger}_tip" for finger in (*FINGERS, "th")))}
 MODEL = lw.playground_model("manipulation/leap_hand/xmls/scene_mjx_cube.xml")
 LONGEST = {
     "airplane": 0.171, "alarmclock": 0.126, "apple": 0.1, "binoculars": 0.142, "bowl": 0.149, "camera": 0.116,
@@ -29,12 +33,12 @@ def edit(spec: mujoco.MjSpec) -> None:
 
 @lw.register
 class LeapRotate(rotating.Rotate):
-    model, edit_model = MODEL, staticmethod(edit)
+    model, params, edit_model = MODEL, PARAMS, staticmethod(edit)
 
 
 @lw.register
 class LeapReorient(reorienting.Reorient):
-    model, edit_model = MODEL, staticmethod(edit)
+    model, params, edit_model = MODEL, PARAMS, staticmethod(edit)
     objects = lw.Objects(
         "cube",
         {

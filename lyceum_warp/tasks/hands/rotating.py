@@ -1,8 +1,8 @@
 """Define in-hand rotation: spin an object about the vertical axis, as in MuJoCo Playground's LeapCubeRotateZAxis.
 
-The palm faces upwards and does not move. The model has a site ``grasp_site`` above the palm, a geom and a site for each
-fingertip, whose names end with "_tip", one free joint, which is the object's, and a keyframe "home". All actuators are
-position servos of the hand's joints. An action is an offset of the servos' targets from the pose of the keyframe.
+The palm faces upwards and does not move. The model has a site ``grasp_site`` above the palm, a geom and a site of the
+same name at each fingertip, one free joint, which is the object's, a keyframe "home", and a position servo for each joint
+of the hand. An action is an offset of the servos' targets from the pose of the keyframe.
 
 Differences from Playground: the last action in an observation is the latest one, the critic's observation has no noise,
 positions are those after the last substep, and worlds differ in friction, damping, gains and the object's mass.
@@ -47,27 +47,18 @@ def free_joint(model: mujoco.MjModel) -> int:
     return int(joints[0])
 
 
-def fingertips(kind: str) -> Any:
-    """Find the sites or geoms whose names end with "_tip"."""
-
-    def find(model: mujoco.MjModel, p: Any) -> list[int]:
-        return [i for i in range(getattr(model, f"n{kind}")) if getattr(model, kind)(i).name.endswith("_tip")]
-
-    return lw.from_model(find)
-
-
 @wp.struct
 class Params:
     dt: float  # seconds in a step
     # the hand and the object
-    joints: wp.array[int] = lw.from_model(lambda model, p: model.actuator_trnid[:, 0])  # in the order of the servos
+    joints: wp.array[int] = lw.joints()  # the hand's joints, in the order of actions and observations
     joint_qpos: wp.array[int] = lw.from_model(walkers.joint_qpos)  # indices of the joints in qpos
     joint_dof: wp.array[int] = lw.from_model(walkers.joint_dof)  # indices of the joints in qvel
     servos: wp.array[int] = lw.from_model(walkers.servos)  # of the joints
     default_pose: wp.array[float] = lw.from_model(walkers.home_pose)  # of the joints, rad
     palm: int = lw.site("grasp_site")
-    tips: wp.array[int] = fingertips("site")
-    tip_geoms: wp.array[int] = fingertips("geom")
+    tips: wp.array[int] = lw.sites()  # a site at each fingertip
+    tip_geoms: wp.array[int] = lw.from_model(lambda model, p: [model.geom(model.site(i).name).id for i in p.tips])
     object: wp.array[int] = lw.from_model(lambda model, p: [model.jnt_bodyid[free_joint(model)]])  # its body
     object_qpos: int = lw.from_model(lambda model, p: int(model.jnt_qposadr[free_joint(model)]))
     object_dof: int = lw.from_model(lambda model, p: int(model.jnt_dofadr[free_joint(model)]))
