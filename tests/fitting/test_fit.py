@@ -142,3 +142,15 @@ def test_robot_that_hangs_is_fitted_without_its_base() -> None:
     fit = lw.fit(hopping, log, ["kp.leg", "dof_damping.leg"], hangs=True, samples=0, nthread=1)
     assert np.log(fit.value[0]) == pytest.approx(0.3, abs=0.02)
     assert fit.value[1] == pytest.approx(1.0, abs=0.1)
+
+
+def test_base_without_a_measured_position_starts_from_the_imu() -> None:
+    names, truth = ["kp.leg", "body_mass.body"], {"kp.leg": 0.2, "body_mass.body": -0.2}
+    control = lw.excitation([-0.05], [0.08], "walk", seconds=4.0, rate=100, frequencies=(0.1, 8.0))
+    whole = log_of(HOPPING, names, truth, control, noise=0.3)
+    log = {"time": whole["time"], "ctrl": control, "qpos.leg": whole["qpos"][:, 7], "qvel.leg": whole["qvel"][:, 6]}
+    log |= {f"qpos.base[{k}]": whole["qpos"][:, k] for k in (3, 4, 5, 6)}  # the orientation
+    log |= {f"qvel.base[{k}]": whole["qvel"][:, k] for k in (3, 4, 5)}  # the gyro
+    fit = lw.fit(mujoco.MjSpec.from_string(HOPPING), log, names, samples=0, nthread=1, window=0.1, iterations=10)
+    for name, x in coordinates(fit, fit.value).items():
+        assert abs(x - truth[name]) < 0.05, name
