@@ -132,17 +132,15 @@ def fit(
     held = LeastSquares(windows.chosen(slice(kept, None)), predictor, {}) if kept < len(windows) else problem
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
-    result = _result(bound, problem.covariance(linear), at, linear, groups, errors, notes)
-    result = dataclasses.replace(result, seconds=time.perf_counter() - began, substeps=predictor.substeps)
-    if out is None:
-        return result
-    result = dataclasses.replace(result, folder=Path(out))
-    _write(result, name, bound, problem.covariance(linear), at, seed)
-    times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-    residuals = np.where(problem.seen, linear.residuals * at.noise, np.nan)
-    with replaced(Path(out) / "residuals.npz") as path, path.open("wb") as file:
-        np.savez_compressed(file, time=times, residuals=residuals, columns=np.array(columns))
-    write_report(result, name, times, residuals, groups)
+    covariance = problem.covariance(linear)
+    result = dataclasses.replace(
+        _result(bound, covariance, at, linear, groups, errors, notes), seconds=time.perf_counter() - began,
+        substeps=predictor.substeps, folder=None if out is None else Path(out),
+    )  # fmt: skip
+    if result.folder is not None:
+        _write(result, name, bound, covariance, at, seed)
+        times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
+        write_report(result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
     return result
 
 

@@ -54,11 +54,9 @@ def test_fit_writes_a_folder_with_a_page(arm: tuple[Fit, dict[str, Any], Path]) 
     fit, _, folder = arm
     content = json.loads((folder / "fit.json").read_text())
     assert content["names"] == PARAMETERS and content["delays"].keys() == {"shoulder", "elbow"}
-    with np.load(folder / "residuals.npz") as file:
-        assert file["residuals"].shape[2] == 4 and len(file["columns"]) == 4
     page = (folder / "report.html").read_text()
     assert "kp.shoulder" in page and page.count("data:image/png") == 2
-    assert fit.table.count("\n") == len(PARAMETERS) - 1
+    assert all(name in fit.text for name in (*PARAMETERS, "in multiples of the noise"))
 
 
 def test_finished_fit_resumes_without_further_steps(arm: tuple[Fit, dict[str, Any], Path]) -> None:
