@@ -126,7 +126,9 @@ def fit(
     while at.iteration < iterations and at.move >= _CONVERGED:
         at = problem.iterate(at)
         if checkpoint is not None:
-            _save(checkpoint, problem, at)
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            with replaced(checkpoint) as path, path.open("wb") as file:
+                np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(kept, None)), predictor, {}) if kept < len(windows) else problem
@@ -195,8 +197,8 @@ def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], 
 
 def _noise(log: Log, model: mujoco.MjModel, given: Mapping[str, float]) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Group the columns by kind, and get each column's first noise."""
-    kinds = [_kind(column, model) for column in log.columns]
-    groups = {kind: np.array([i for i, k in enumerate(kinds) if k == kind]) for kind in dict.fromkeys(kinds)}
+    kinds = np.array([_kind(column, model) for column in log.columns])
+    groups = {str(kind): np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds)}
     for name, number in given.items():
         if name not in groups:
             raise ValueError(f"noise has {name!r}, which the log does not measure: {did_you_mean(name, groups)}")
@@ -271,12 +273,6 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
         np.savez_compressed(file, **draws)
     with replaced(folder / "fit.json") as path:
         path.write_text(json.dumps(content, indent=1))
-
-
-def _save(path: Path, problem: LeastSquares, at: Estimate) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, names=problem.parameters.names, begin=problem.windows.begin, **dataclasses.asdict(at))
 
 
 def _load(path: Path, problem: LeastSquares) -> Estimate:
