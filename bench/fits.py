@@ -43,7 +43,7 @@ from lyceum_warp.tasks.velocity import g1
 
 PARTS = ("hanging", "ground", "actuators", "wrong", "policies")
 CONTESTANTS = ("lyceum_warp", "mujoco.sysid")
-POLICIES = ("fit", "wide draws", "nominal")
+POLICIES = ("fit", "wide", "nominal")
 PLANTS = 4
 STEP = 0.02
 RANGES = {"factor": (np.log(0.7), np.log(1.3)), "delay": (0.002, 0.015)}
@@ -138,7 +138,7 @@ def cases(options: Options) -> list[Case]:
         for part, all_plants in (("actuators", ("ideal", "delayed")), ("wrong", ("logs",))) if part in parts
         for plant in all_plants
     ] + [
-        Case("policies", "go1", kind(seed) if policy == "fit" else "all", policy, seed, min(seconds, 30.0), training)
+        Case("policies", "go1", kind(seed) if policy == "fit" else "all", policy, seed, min(seconds, 15.0), training)
         for policy in POLICIES if "policies" in parts for seed in range(plants if policy == "fit" else 1)
     ]  # fmt: skip
     return [case for case in found if case.contestant in options.contestants or not options.contestants]
@@ -295,7 +295,7 @@ def policy(case: Case, options: Options, short: dict[str, Any]) -> dict[str, Any
     feet = task_spec(find_task("go1_velocity")).geom("FR_foot").friction
     same = dict(zip(("sliding_friction", "spinning_friction", "rolling_friction"), ([f, f] for f in feet), strict=True))
     known: dict[str, Any] = {"trunk_offset": [0.0, 0.0, 0.0]}
-    given: dict[str, Any] = {"fit": known, "wide draws": {}, "nominal": known | same | {"encoder_bias": 0.0}}
+    given: dict[str, Any] = {"fit": known, "wide": {}, "nominal": known | same | {"encoder_bias": 0.0}}
     began = time.perf_counter()
     if case.contestant == "fit":
         plant = Plant("go1", case.seed, ground=True, kind=case.plant)
