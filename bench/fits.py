@@ -254,10 +254,9 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     plant = Plant(case.robot, case.seed, ground=case.part == "ground", kind=case.plant)
     log = plant.log(case.seconds, case.seed)
     if case.part == "actuators":
-        given: dict[str, Any] = {"noise": {"qpos": 0.002, "qvel": 0.05}, "samples": 0} | short
-        fits = {name: lw.fit(plant.robot.task, log, wanted, hangs=True, **given)
+        fits = {name: lw.fit(plant.robot.task, log, wanted, hangs=True, **({"samples": 0} | short))
                 for name, wanted in (("ideal", plant.wanted[:-1]), ("delayed", plant.wanted))}  # fmt: skip
-        return {"held_out": {name: fit.held_out[1] for name, fit in fits.items()}}
+        return {"errors": {name: fit.errors["qpos"][1] for name, fit in fits.items()}}
     shared = {"names": plant.bound.names, "truth": plant.values.tolist(), "scale": plant.scale.tolist()}
     if case.contestant == "mujoco.sysid":
         return shared | {"settings": by_sysid(plant, log, case)}
@@ -367,9 +366,9 @@ def tables(rows: Sequence[Row]) -> list[Table]:
                   "below 2 %", "determined to 2 %", "of these below 2 %", "undetermined", "median half width",
                   "covered", "held out, nominal", "fitted"]  # fmt: skip
         found += [Table(title, header, [line(row.case, row.result) for row in chosen])] if chosen else []
-    lines = [[row.case["plant"], *(f"{row.result['held_out'][name]:.3f}" for name in ("ideal", "delayed"))]
+    lines = [[row.case["plant"], *(f"{1e3 * row.result['errors'][name]:.2f}" for name in ("ideal", "delayed"))]
              for row in rows if row.case["part"] == "actuators"]  # fmt: skip
-    title = "Errors of prediction in windows held back, in multiples of the noise: a log of an actuator in two models."
+    title = "Errors of joint positions in windows held back, in mrad (noise: 2): a log of an actuator in two models."
     found += [Table(title, ["log", "model without delay", "with delay"], lines)] if lines else []
     answers = [list(pair) for row in rows if row.case["part"] == "wrong" for pair in row.result["answers"].items()]
     found += [Table("Answers to wrong logs.", ["log", "answer"], answers)] if answers else []

@@ -22,7 +22,6 @@ from lyceum_warp.fitting.report import write_report
 from lyceum_warp.fitting.result import Fit
 from lyceum_warp.fitting.windows import Predictor, cut_windows
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number, positive_number, whole_number
 
 DRAWS = 1024
@@ -52,7 +51,6 @@ def fit(
     out: str | Path | None = None,
     window: float | None = None,
     held_out: float = 0.2,
-    noise: Mapping[str, float] | None = None,
     samples: int = 128,
     iterations: int = 30,
     seed: int = 0,
@@ -77,7 +75,6 @@ def fit(
         out: Folder for the results, as for ``lw.make(..., fitted=out)``.
         window: Seconds of a window; by default 0.25, or 0.1 if the robot's base moves, because contacts are chaotic.
         held_out: Share of the windows, at the end of the log, that is held back to measure errors of prediction.
-        noise: Standard deviations of measurements by kind, such as {"qpos": 0.002}. Others are estimated.
         samples: Hypotheses per round of the search; 0 starts at the nominal values.
         iterations: Most Gauss-Newton steps.
         seed: Seed of the search and of the draws from the posterior.
@@ -107,11 +104,10 @@ def fit(
     columns = [column.name for column in data.columns]
     wanted = [name for name in DEFAULT if _fits(name, compiled, columns)] if parameters is None else parameters
     bound = Parameters(wanted, compiled, columns)
-    groups, usual = _noise(data, compiled, noise or {})
+    groups, usual = _noise(data, compiled)
     windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
     kept = len(windows) - round(held_out * len(windows))
-    free = {label: group for label, group in groups.items() if label not in (noise or {})}
-    problem = LeastSquares(windows.chosen(slice(kept)), predictor, free)
+    problem = LeastSquares(windows.chosen(slice(kept)), predictor, groups)
     report = progress or (lambda stage, iteration, cost: None)
     checkpoint = None if out is None else Path(out) / "estimate.npz"
     if resume and checkpoint is not None and checkpoint.is_file():
@@ -195,17 +191,12 @@ def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], 
     return result
 
 
-def _noise(log: Log, model: mujoco.MjModel, given: Mapping[str, float]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _noise(log: Log, model: mujoco.MjModel) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Group the columns by kind, and get each column's first noise."""
     kinds = np.array([_kind(column, model) for column in log.columns])
     groups = {str(kind): np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds)}
-    for name, number in given.items():
-        if name not in groups:
-            raise ValueError(f"noise has {name!r}, which the log does not measure: {did_you_mean(name, groups)}")
-        positive_number(f"noise of {name!r}", number, "the column's units")
     spread = np.nanstd(np.concatenate([take.measured for take in log.takes]), axis=0)
-    usual = _USUAL | dict(given)
-    return groups, np.array([usual.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
+    return groups, np.array([_USUAL.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
 
 
 def _kind(column: Column, model: mujoco.MjModel) -> str:
