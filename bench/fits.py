@@ -263,7 +263,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     began = time.process_time()
     fit = lw.fit(plant.robot.task, log, plant.wanted, hangs=not plant.ground, **short)
     return shared | {
-        "cpu_seconds": time.process_time() - began, "wall_seconds": fit.seconds, "substeps": fit.substeps,
+        "cpu_seconds": time.process_time() - began, "wall_seconds": fit.seconds,
         "held_out": fit.held_out, "determined": fit.determined.tolist(),
         "fisher": plant.half_widths(log, 0.1 if plant.ground else 0.25).tolist(),
         **{name: getattr(fit, name).tolist() for name in ("value", "low", "high")},

@@ -131,10 +131,7 @@ def fit(
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
     covariance = problem.covariance(linear)
-    result = dataclasses.replace(
-        _result(bound, covariance, at, linear, groups, errors, notes), seconds=time.perf_counter() - began,
-        substeps=predictor.substeps, folder=None if out is None else Path(out),
-    )  # fmt: skip
+    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, out)
     if result.folder is not None:
         _write(result, name, bound, covariance, at, seed)
         times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
@@ -226,7 +223,7 @@ def _notes(groups: Mapping[str, np.ndarray], usual: np.ndarray, at: Estimate, *,
 
 def _result(
     bound: Parameters, covariance: np.ndarray, at: Estimate, linear: Linear, groups: Mapping[str, np.ndarray],
-    errors: Sequence[np.ndarray], notes: Sequence[str],
+    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, out: str | Path | None,
 ) -> Fit:  # fmt: skip
     deviation = np.sqrt(np.diag(covariance))
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
@@ -244,7 +241,8 @@ def _result(
         bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
         covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
         rms, (nominal, fitted), bound.fields(bound.model(at.x)),
-        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, 0.0, 0,
+        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds,
+        None if out is None else Path(out),
     )  # fmt: skip
 
 

@@ -38,7 +38,7 @@ def write_report(
         axes.set(ylim=(-6.0, 6.0), ylabel=label)
     all_axes[-1].set_xlabel("time (s)")
     finish_axes(all_axes)
-    parts = [f"<pre>{html.escape(fit.text)}</pre><p>{fit.substeps:,} substeps in {fit.seconds:.0f} s</p>"]
+    parts = [f"<pre>{html.escape(fit.text)}</pre><p>{fit.seconds:.0f} s</p>"]
     for title, file, figure in (
         ("Residuals over time, in multiples of the noise", "residuals.png", over_time),
         ("Correlations", "correlations.png", correlations),

@@ -46,8 +46,6 @@ class Fit:
     """What to know about the log and the fit."""
     seconds: float
     """Wall seconds of the fit."""
-    substeps: int
-    """Substeps that the fit simulated."""
     folder: Path | None = None
     """The folder, which ``lw.make(..., fitted=folder)`` reads."""
 

@@ -87,8 +87,6 @@ class Predictor:
         self._record = [_STATE, *(name for name in self.sources if name in ("sensordata", "actuator_force"))]
         self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
         self._data = mujoco.MjData(self.model)
-        self.substeps = 0
-        """Substeps of all worlds so far."""
 
     def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
@@ -138,7 +136,6 @@ class Predictor:
                     states[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
                 data.ctrl[:] = controls[k]
                 mujoco.mj_step(model, data)
-            self.substeps += steps
         return states
 
     def predict(self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
@@ -165,7 +162,6 @@ class Predictor:
             batch.bind(name)[...] = part
         controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
         controls = controls.reshape(-1, windows.steps, self.model.nu)
-        self.substeps += len(initial) * windows.steps
         bad = np.zeros(len(initial), bool)
         try:
             records = batch.rollout(windows.steps, controls, record=self._record)
