@@ -374,8 +374,9 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     found += [Table("Answers to wrong logs.", ["log", "answer"], answers)] if answers else []
     lines = policy_lines([row for row in rows if row.case["part"] == "policies"])
     title = (
-        "Policies on hidden Go1s, with noise and pushes: mean velocity error and falls in episodes of 20 s, and "
-        "differences from the policy that learned from draws around the fit, in the same episodes, with 95 % intervals."
+        "Policies on hidden Go1s, with noise and pushes. They learned from draws around the fit of the same Go1, from "
+        "the task's own wide draws, or from the nominal Go1. Mean velocity error, falls in episodes of 20 s, and "
+        "differences from the first policy in the same episodes, with 95 % intervals."
     )
     header = ["plant", "robot", "learned from", "velocity error, m/s", "difference", "falls", "difference",
               "training, s"]  # fmt: skip
