@@ -1,7 +1,7 @@
 """Fit hidden robots, compare the fitted with the hidden values, and train policies for the hidden robots.
 
-    lyceum-warp bench fits --parts hanging --tasks go1 g1
-    lyceum-warp bench fits --parts ground --contestants lyceum_warp mujoco.sysid
+    lyceum-warp bench fits --parts hanging ground --jobs 8 --threads 2
+    lyceum-warp bench fits --parts hanging --tasks go1 --contestants lyceum_warp
     lyceum-warp bench fits --parts actuators wrong
     lyceum-warp bench fits --parts policies --device cuda
 
@@ -17,6 +17,7 @@ draws, and from the nominal robot, each on the hidden Go1s, on the C engine. The
 
 import dataclasses
 import json
+import os
 import sys
 import tempfile
 import time
@@ -125,7 +126,10 @@ def kind(seed: int) -> str:
 
 
 def cases(options: Options) -> list[Case]:
-    parts, robots = choose(options.parts, PARTS, what="part"), choose(options.tasks, ROBOTS, what="robot")
+    parts, robots = (
+        choose(options.parts, PARTS, what="part"),
+        choose(options.tasks, ROBOTS, ("go1",) if options.short else (), what="robot"),
+    )
     seconds, count, plants = (3.0, 1, 1) if options.short else (options.seconds, options.robots, PLANTS)
     training = (2, 32, 4) if options.short else (options.iterations, options.nworld, options.episodes)
     found = [
@@ -246,22 +250,23 @@ def delayed(control: np.ndarray, substep: float, delay: float) -> np.ndarray:
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    short: dict[str, Any] = {"samples": 0, "iterations": 2} if options.short else {}
+    settings: dict[str, Any] = {"samples": 0, "iterations": 2} if options.short else {}
+    settings["nthread"] = len(os.sched_getaffinity(0))
     if case.part == "wrong":
         return {"answers": wrong_logs()}
     if case.part == "policies":
-        return policy(case, options, short)
+        return policy(case, options, settings)
     plant = Plant(case.robot, case.seed, ground=case.part == "ground", kind=case.plant)
     log = plant.log(case.seconds, case.seed)
     if case.part == "actuators":
-        fits = {name: lw.fit(plant.robot.task, log, wanted, hangs=True, **({"samples": 0} | short))
+        fits = {name: lw.fit(plant.robot.task, log, wanted, hangs=True, **({"samples": 0} | settings))
                 for name, wanted in (("ideal", plant.wanted[:-1]), ("delayed", plant.wanted))}  # fmt: skip
         return {"errors": {name: fit.errors["qpos"][1] for name, fit in fits.items()}}
     shared = {"names": plant.bound.names, "truth": plant.values.tolist(), "scale": plant.scale.tolist()}
     if case.contestant == "mujoco.sysid":
         return shared | {"settings": by_sysid(plant, log, case)}
     began = time.process_time()
-    fit = lw.fit(plant.robot.task, log, plant.wanted, hangs=not plant.ground, **short)
+    fit = lw.fit(plant.robot.task, log, plant.wanted, hangs=not plant.ground, **settings)
     return shared | {
         "cpu_seconds": time.process_time() - began, "wall_seconds": fit.seconds,
         "held_out": fit.held_out, "determined": fit.determined.tolist(),
@@ -288,7 +293,7 @@ def by_sysid(plant: Plant, log: dict[str, np.ndarray], case: Case) -> dict[str, 
 # policies
 
 
-def policy(case: Case, options: Options, short: dict[str, Any]) -> dict[str, Any]:
+def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, Any]:
     """Train a policy, and judge it on hidden robots."""
     iterations, nworld, _ = case.training
     feet = task_spec(find_task("go1_velocity")).geom("FR_foot").friction
@@ -299,7 +304,7 @@ def policy(case: Case, options: Options, short: dict[str, Any]) -> dict[str, Any
     if case.contestant == "fit":
         plant = Plant("go1", case.seed, ground=True, kind=case.plant)
         folder = options.fits / f"go1-{case.seed}"
-        lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **short)
+        lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **settings)
         given["fit"] = known | {"fitted": folder, "fitted_draws": True}
     fitted = time.perf_counter()
     env = lw.make(
@@ -434,6 +439,7 @@ EXPERIMENT = Experiment(
     summary="Hidden robots, fitted by logs of their joints: errors, intervals, wrong logs, and policies that learned "
     "from the fits.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
+    parallel=True,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -1,5 +1,8 @@
 """Fit parameters by ``mujoco.sysid``, for comparison."""
 
+import contextlib
+import io
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -38,6 +41,7 @@ def fit(
     sysid: Any = experiment.installed("mujoco.sysid", "mujoco[sysid]")
     if not hasattr(sysid, "optimize"):  # the package hides which of its requirements is missing
         raise Skipped("mujoco.sysid lacks packages: pip install mujoco[sysid]")
+    threads = len(os.sched_getaffinity(0))
     wall, cpu, model = time.perf_counter(), time.process_time(), bound.nominal
     series, times, starts = sysid.TimeSeries, model.opt.timestep * np.arange(steps + 1), []
     for begin in range(0, len(states) - steps, steps):
@@ -63,7 +67,8 @@ def fit(
 
     def residual(x: np.ndarray, params: Any) -> tuple[list[np.ndarray], None, None]:
         found, _, _ = sysid.model_residual(
-            x, params, lambda params: bound.model(params.as_vector()), starts, errors, rolled, resample_true=False
+            x, params, lambda params: bound.model(params.as_vector()), starts, errors, rolled, threads,
+            resample_true=False,
         )  # fmt: skip
         if x.ndim == 2:  # one column for each roll-out of each hypothesis
             found = found.reshape(-1, x.shape[1], len(starts)).transpose(2, 0, 1).reshape(-1, x.shape[1])
@@ -73,7 +78,8 @@ def fit(
     low, high = np.maximum(bound.low, -WIDEST), np.minimum(bound.high, WIDEST)
     params.add(sysid.Parameter("x", np.zeros(bound.size), low, high))
     params.move_off_bounds()
-    params, result = sysid.optimize(params, residual, verbose=False, x_scale="jac")
+    with contextlib.redirect_stdout(io.StringIO()):  # its steps
+        params, result = sysid.optimize(params, residual, verbose=False, x_scale="jac")
     x = params.as_vector()
     _, half = sysid.calculate_intervals(residual(x, params)[0], result.jac)
     used = {"cpu_seconds": time.process_time() - cpu, "wall_seconds": time.perf_counter() - wall}
