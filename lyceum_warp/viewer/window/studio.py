@@ -13,7 +13,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 from mujoco.studio.web import state_payload, web_server
 
-from lyceum_warp.viewer.window.server import PageServer, PrivateSocket
+from lyceum_warp.viewer.window.server import FRAMES, PageServer, PrivateSocket
 
 __all__ = [
     "MAX_GEOMS", "Gui", "Plugin", "Screen", "Started", "Update", "handler", "imgui", "implot",
@@ -61,6 +61,7 @@ class Screen:
         # studio would serve everyone: on every address, and on a loopback port that other users can use
         web_server.bind_public_socket = web_server.bind_loopback_socket = private
         web_server.serve = server.serve
+        web_server._STATE_MAX_IN_FLIGHT = FRAMES
         web_server.WebServer = _WebServer
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         viewer = _Viewer(config, self._viewer_end, plugins=[panel], server=server)

@@ -14,6 +14,7 @@ from lyceum_warp.viewer.commands import (
     set_paused,
     set_speed,
     set_video,
+    set_watched,
     set_world,
     step_by,
 )
@@ -52,7 +53,7 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
         ),
         points=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
-    assert bench.sent == [Opened(("viewer: http://here",))]
+    assert bench.sent == [Opened(("viewer: http://here",)), command(set_watched, False)]
     assert bench.draw() == bench.draw(frame) == []  # draw without a frame, then with the first frame
     bench.panel.actions.cameras.choose(studio.ux.FREE_CAMERA_IDX)
     assert bench.draw() == []

@@ -151,7 +151,7 @@ def test_silent_tab_is_reported_and_loses_control_to_another_tab(
 ) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.3)
     quiet: list[float] = []
-    studio.page.on_quiet = lambda: quiet.append(time.monotonic())
+    studio.page.on_look = lambda looks: None if looks else quiet.append(time.monotonic())
     with studio.tab("state?sid=a"), studio.tab("ui?sid=a") as tab:
         tab.send(HANDSHAKE)
         tab.recv(timeout=10)
