@@ -68,7 +68,7 @@ class Windows:
         if resized and width < NARROW:
             self._actions.windows -= {"curves"}
         self._update()
-        tall = min(len(self._plotted) * 168 + 60, height - 60)
+        tall = min(len(self._plotted) * 168 + 100, height - 50)
         imgui.SetNextWindowCollapsed(width < NARROW, cond)
         self._window(self._scene.title, (10, 10, SIDE, height - 50), cond, self._session)
         self._window("messages", (SIDE + 20, height - 150, width - 2 * SIDE - 40, 110), cond, self._messages)
@@ -96,7 +96,8 @@ class Windows:
         self._hint &= not (imgui.IsMouseDragging(0) or imgui.IsMouseDragging(1) or "keys" in self._actions.windows)
         room = width - 40 if width < NARROW else width - 2 * SIDE - 40
         if self._hint:
-            self._overlay("hint", (width / 2, 50.0 if width < NARROW else 10.0), (0.5, 0.0), room, [(None, HINT)])
+            top, text = (50.0, f"{HINT}   ×: the panel") if width < NARROW else (10.0, HINT)
+            self._overlay("hint", (width / 2, top), (0.5, 0.0), room, [(None, text)])
         toasts = list(self._actions.messages)[-TOASTS:]
         if "messages" not in self._actions.windows and time.monotonic() < self._actions.said + TOAST_SECONDS:
             lines: list[Line] = [(None, text) for text in toasts]
@@ -137,7 +138,7 @@ class Windows:
         if unfolded:
             content()
         if first and not still_open:  # studio adds a close button in every window
-            imgui.SetWindowCollapsed(True)
+            imgui.SetWindowCollapsed(unfolded)
         imgui.End()
         if not still_open:
             self._actions.windows.discard(title)
@@ -239,9 +240,9 @@ class Windows:
         if speeds is None or status.command is None:
             return
         imgui.SeparatorText("drive")
-        if imgui.Checkbox("with the keys W A S D, Q E (Enter)", status.driven)[0]:
+        if imgui.Checkbox("with W A S D, Q E or a gamepad (Enter)", status.driven)[0]:
             self._actions.toggle_driving()
-        names = ("forward", "left", "turn left")
+        names = ("forward, m/s", "left, m/s", "turn left, rad/s")
         sliders = [
             imgui.SliderFloat(name, value, -2 * speed, 2 * speed, "%.2f")
             for name, value, speed in zip(names, status.command, speeds, strict=True)

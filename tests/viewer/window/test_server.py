@@ -164,6 +164,16 @@ def test_silent_tab_is_reported_and_loses_control_to_another_tab(
                 tab.recv(timeout=10)
 
 
+def test_gamepad_is_reported_and_other_axes_are_ignored(studio: Studio) -> None:
+    axes: list[list[float]] = []
+    studio.page.on_gamepad = axes.append
+    with studio.tab("state?sid=a") as tab:
+        for text in ("nan,0,0", "2,0,0", "1,0", "x", "0.5,-1,0"):
+            tab.send(f"gamepad={text}")
+        wait_until(lambda: bool(axes))
+    assert axes == [[0.5, -1.0, 0.0]]
+
+
 # addresses and ports
 
 
