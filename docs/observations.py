@@ -1,7 +1,7 @@
 """Find the joints and units of observations by differences, and write them to observations.json.
 
-Run ``python docs/observations.py TASK ...`` after a change of tasks' observations; without names, it does all tasks. The
-file spares the site's build from compiling every task.
+Run ``python docs/observations.py TASK ...`` after a change of tasks' observations; without names, it does all tasks.
+The file spares the site's build from compiling every task.
 """
 
 import json
@@ -22,8 +22,8 @@ START, STEP = 0.3, 0.4
 sine is not taken for its angle."""
 
 Sources = dict[str, dict[str, list[str]]]
-"""For each group of observations, the joint and the unit of each index that depends on one joint only. The unit is empty
-if the observation is another function of the joint, such as its sine."""
+"""For each group of observations, the joint and the unit of each index that depends on one joint only. The unit is
+empty if the observation is another function of the joint, such as its sine."""
 
 
 def sources(name: str) -> Sources:
