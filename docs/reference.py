@@ -291,7 +291,9 @@ def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
         if name in ("dt", "substep_dt"):
             continue
         default = getattr(task.source.defaults, name)
-        meaning = meanings.get(name, "").replace("|", "\\|").replace("*", "\\*")
+        first = default[0] if isinstance(default, list) and default else default
+        index = f"index in `{first.field}`" if isinstance(first, Element) else ""
+        meaning = meanings.get(name, index).replace("|", "\\|").replace("*", "\\*")
         rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meaning))
     return rows
 
