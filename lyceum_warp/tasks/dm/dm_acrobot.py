@@ -65,9 +65,7 @@ class Params:
     lengths: wp.vec2 = lw.from_model(lengths)  # of the links, m
     inertia: wp.vec3 = lw.from_model(inertia)  # a, b and c of the mass matrix, kg m^2
     lift: wp.vec2 = lw.from_model(lift)  # e1 and e2 of the potential energy, J
-    balance_effort: wp.mat44 = lw.from_model(
-        balance_effort
-    )  # least effort of balancing as a quadratic form of the state
+    balance_effort: wp.mat44 = lw.from_model(balance_effort)  # P of the effort x^T P x, s
 
 
 @wp.func

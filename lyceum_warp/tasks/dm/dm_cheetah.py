@@ -19,9 +19,7 @@ class World:
 class Params(suite.RandomJoints):
     run_speed: float = 10.0  # m/s
     torso: int = lw.body("torso")
-    drawn_joints: wp.array[int] = lw.from_model(
-        lambda model, p: model.jnt_qposadr[model.jnt_limited == 1]
-    )  # indices in qpos of the joints that each episode draws
+    drawn_joints: wp.array[int] = lw.from_model(lambda model, p: model.jnt_qposadr[model.jnt_limited == 1])
 
 
 @wp.func

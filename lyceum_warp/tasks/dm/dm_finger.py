@@ -91,9 +91,7 @@ class TurnParams(Params):
     target: int = lw.mocap("target")
     target_size: float = lw.from_model(lambda model, p: model.site("target").size[0])  # radius, m
     hinge: wp.vec3 = lw.from_model(lambda model, p: model.body_pos[p.spinner])  # position of the spinner's hinge, m
-    radius: float = lw.from_model(
-        lambda model, p: model.geom("cap1").size.sum()
-    )  # from the spinner's hinge to its tip, m
+    radius: float = lw.from_model(lambda model, p: model.geom("cap1").size.sum())  # of the spinner, m
 
 
 @wp.func

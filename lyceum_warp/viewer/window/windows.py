@@ -65,8 +65,9 @@ class Windows:
         # panels stay where the user moved them until the browser window is resized
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
-        if resized and width < NARROW:
-            self._actions.windows -= {"curves"}
+        if resized and self._scene.curves:
+            windows = self._actions.windows
+            (windows.discard if width < NARROW else windows.add)("curves")
         self._update()
         tall = min(len(self._plotted) * 168 + 100, height - 50)
         imgui.SetNextWindowCollapsed(width < NARROW, cond)
