@@ -61,8 +61,7 @@ class Screen:
         # studio would serve everyone: on every address, and on a loopback port that other users can use
         web_server.bind_public_socket = web_server.bind_loopback_socket = private
         web_server.serve = server.serve
-        web_server._STATE_MAX_IN_FLIGHT = FRAMES
-        web_server.WebServer = _WebServer
+        web_server.WebServer = WebServer
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         viewer = _Viewer(config, self._viewer_end, plugins=[panel], server=server)
         if len(replaced) < 2:
@@ -71,9 +70,16 @@ class Screen:
         viewer_protocol.run_viewer_loop(viewer)
 
 
-class _WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
+class WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
+    """Sends a state only if it differs from the last one, and if fewer than FRAMES states wait to be drawn."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        web_server._STATE_MAX_IN_FLIGHT = FRAMES
+        super().__init__(*arguments, **options)
+
     def update_state(self, payload: bytes) -> None:
-        if payload != self._state_payload:  # the browser already has equal ones
+        """Replace the state that pages draw next."""
+        if payload != self._state_payload:
             super().update_state(payload)
 
 
