@@ -1,5 +1,6 @@
 """Build the windows of the panel with ImGui."""
 
+import textwrap
 import time
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -118,9 +119,9 @@ class Windows:
             if colour is not None:
                 imgui.ColorButton(f"##{text}", imgui.Vec4(*colour[:3], 1.0), 0, imgui.Vec2(14, 14))
                 imgui.SameLine()
-            imgui.PushTextWrapPos(room)
-            imgui.TextUnformatted(text)
-            imgui.PopTextWrapPos()
+            # ImGui would break lines within words
+            columns = int(len(text) * (room - 40) / max(imgui.CalcTextSize(text).x, 1.0))
+            imgui.TextUnformatted(textwrap.fill(text, max(columns, 20)))
         imgui.End()
 
     def _window(
