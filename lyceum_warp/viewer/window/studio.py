@@ -4,6 +4,7 @@ Studio renders a scene and a panel in a browser, and handles keys and the mouse.
 loading are not used, because the simulation is in another process.
 """
 
+import time
 from typing import Any
 
 import mujoco
@@ -22,6 +23,8 @@ __all__ = [
 
 IDLE = 0.1
 """Seconds between two looks at the session's messages while no page is visible."""
+REPEAT = 1.0
+"""Seconds after which an equal state is sent again. A page without new states soon reports that it is disconnected."""
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
 """Maximum number of geoms that a browser shows in addition to the model's."""
 
@@ -71,15 +74,17 @@ class Screen:
 
 
 class WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
-    """Sends a state only if it differs from the last one, and if fewer than FRAMES states wait to be drawn."""
+    """Sends a new state, or an equal one after REPEAT seconds, if fewer than FRAMES states wait to be drawn."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
-        web_server._STATE_MAX_IN_FLIGHT = FRAMES
+        vars(web_server).update(_STATE_MAX_IN_FLIGHT=FRAMES)  # studio has no option for this number
+        self._next = 0.0  # when an equal state is sent again
         super().__init__(*arguments, **options)
 
     def update_state(self, payload: bytes) -> None:
         """Replace the state that pages draw next."""
-        if payload != self._state_payload:
+        if payload != self._state_payload or time.monotonic() >= self._next:
+            self._next = time.monotonic() + REPEAT
             super().update_state(payload)
 
 
