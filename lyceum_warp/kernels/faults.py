@@ -105,8 +105,8 @@ def faults_of_fields(
 ):
     """Find faults of the Warp engine in the masked worlds, from states and overflow bits; launched over (nworld,).
 
-    Contacts of a geom whose position is NaN leave NaN in rows of the Jacobian. The solver multiplies unused rows by zero,
-    and NaN times zero is NaN. So the Jacobian of a world with NaN is cleared.
+    Contacts of a geom whose position is NaN leave NaN in rows of the Jacobian. The solver multiplies unused rows by
+    zero, and NaN times zero is NaN. So the Jacobian of a world with NaN is cleared.
     """
     w = wp.tid()
     if not mask_in[w]:

@@ -207,7 +207,7 @@ class Reorient(rotating.Rotate):
     metrics = ("success",)
     planning = lw.Planning(
         settings={"horizon": 12, "samples": 128, "temperature": 0.05, "noise": 0.3},
-        params={"goal_angle": [0.1, 0.1], "drop": -400.0},
+        params={"goal_angle": [0.1, 0.1], "drop": -2000.0, "centred": 2.0},
     )
     cleared = ("actuator_force",)
     training = lw.Training(
