@@ -4,10 +4,9 @@ import contextlib
 import dataclasses
 import json
 import math
-import time
 import tomllib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,28 +51,22 @@ class Sweep:
     def run(self) -> None:
         check_extra("a sweep", "sweep", "optuna")
         import optuna
+        from optuna.trial import TrialState
 
-        search = read_search(self.file)
-        out, beat = Path(search.out), search.heartbeat
-        direction: Any = search.direction or ("minimize" if search.objective == "gate" else "maximize")
-        out.mkdir(parents=True, exist_ok=True)
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # heartbeats are experimental
+        search = read_search(self.file)
+        out, done = Path(search.out), (TrialState.COMPLETE, TrialState.PRUNED)
         try:
-            study = optuna.create_study(
-                storage=optuna.storages.RDBStorage(
-                    search.storage or f"sqlite:///{out.resolve()}/sweep.db", heartbeat_interval=beat,
-                    grace_period=2 * beat,
-                    heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
-                ),
-                study_name=self.file.stem, load_if_exists=True,
-                direction=direction,
-                sampler=getattr(optuna.samplers, search.sampler)(), pruner=getattr(optuna.pruners, search.pruner)(),
-            )  # fmt: skip
-            _optimize(study, _objective(search), search)
+            objective = _objective(search)
+            check_search(search)
+            study = _study(search, self.file.stem)
+            if len(study.get_trials(deepcopy=False, states=done)) < search.trials:
+                enough = optuna.study.MaxTrialsCallback(search.trials, states=done)
+                study.optimize(objective, callbacks=[_say_trial, enough])
             best = study.best_trial
         except Exception as error:  # Optuna and databases raise many types of errors
-            raise ValueError(f"{self.file}: {viz.one_line(error)} (the logs of trials are in {out})") from error
+            raise ValueError(f"{self.file}: {viz.one_line(error)}") from error
         words = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
         say_entries(
             best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
@@ -111,23 +104,16 @@ def read_search(file: Path) -> Search:
         raise ValueError(f"{file}: {str(error).removeprefix('Search.__init__() ')}") from error
 
 
-def _optimize(study: Any, objective: Callable[[Any], float], search: Search) -> None:
-    """Run trials until the sweep has enough. Other workers may run trials of the same study."""
+def check_search(search: Search) -> None:
+    """Check the ranges, and the settings at their ends, before anything is written."""
     import optuna
 
-    while True:
-        optuna.storages.fail_stale_trials(study)
-        states = [trial.state.name for trial in study.get_trials(deepcopy=False)]
-        done = states.count("COMPLETE") + states.count("PRUNED")
-        if done >= search.trials:
-            return
-        if done + states.count("RUNNING") >= search.trials:
-            time.sleep(min(search.heartbeat, 5))  # another worker finishes the last trials, or has been killed
-            continue
-        study.optimize(objective, n_trials=1)
-        last = study.get_trials(deepcopy=False)[-1]
-        value = "" if last.value is None else f"{last.value:.6g}"
-        say(f"trial {last.number}: {last.state.name.lower()} {value} {last.params}")
+    trial_settings(search, optuna.create_study().ask())
+    ends = {name: list(_by_word(entry["choices"])) if "choices" in entry else [entry["low"], entry["high"]]
+            for name, entry in search.ranges.items()}  # fmt: skip
+    for k in range(max(map(len, ends.values()))):
+        trial = optuna.trial.FixedTrial({name: values[k % len(values)] for name, values in ends.items()})
+        _command(search, trial_settings(search, trial)).check()
 
 
 def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
@@ -136,8 +122,8 @@ def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
     for name, entry in search.ranges.items():
         first, _, part = name.partition(".")
         try:
-            if "choices" in entry:  # Optuna stores only single values
-                words = {json.dumps(x) if isinstance(x, list) else x: x for x in entry["choices"]}
+            if "choices" in entry:
+                words = _by_word(entry["choices"])
                 value = words[trial.suggest_categorical(name, list(words))]
             else:
                 whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
@@ -148,10 +134,42 @@ def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
     return settings
 
 
-def _objective(search: Search) -> Callable[[Any], float]:
+def _by_word(choices: Sequence[Any]) -> dict[Any, Any]:
+    """Map choices by what Optuna stores instead, which are single values."""
+    return {json.dumps(choice) if isinstance(choice, list) else choice: choice for choice in choices}
+
+
+def _command(search: Search, settings: Mapping[str, Any], *more: str) -> Any:
+    """Make the command that trains a trial."""
+    from lyceum_warp.cli.train import Train  # its imports take a second
+
+    return parse(Train, "lyceum-warp train", [search.task, *training.flag_words(settings), *more])
+
+
+def _study(search: Search, name: str) -> Any:
+    """Open the study of a sweep, or create it."""
     import optuna
 
-    from lyceum_warp.cli.train import Train
+    out = Path(search.out)
+    direction: Any = search.direction or ("minimize" if search.objective == "gate" else "maximize")
+    sampler, pruner = getattr(optuna.samplers, search.sampler)(), getattr(optuna.pruners, search.pruner)()
+    out.mkdir(parents=True, exist_ok=True)
+    storage = optuna.storages.RDBStorage(
+        search.storage or f"sqlite:///{out.resolve()}/sweep.db", heartbeat_interval=search.heartbeat,
+        heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
+    )  # fmt: skip
+    return optuna.create_study(
+        storage=storage, sampler=sampler, pruner=pruner, study_name=name, direction=direction, load_if_exists=True
+    )
+
+
+def _say_trial(study: Any, trial: Any) -> None:
+    value = "" if trial.value is None else f"{trial.value:.6g}"
+    say(f"trial {trial.number}: {trial.state.name.lower()} {value} {trial.params}")
+
+
+def _objective(search: Search) -> Callable[[Any], float]:
+    import optuna
 
     judge = {"return": _best_return, "gate": _gate_seconds}.get(search.objective)
     judge = judge or binding.object_in_file(search.objective)
@@ -171,8 +189,7 @@ def _objective(search: Search) -> Callable[[Any], float]:
                     raise optuna.TrialPruned
 
         by_return = search.objective == "return"
-        words = [search.task, *training.flag_words(settings), *["--evaluate"] * by_return, "--continue", "--out"]
-        command = parse(Train, "lyceum-warp train", [*words, str(folder)])
+        command = _command(search, settings, *["--evaluate"] * by_return, "--continue", "--out", str(folder))
         with folder.with_suffix(".log").open("a") as log, contextlib.redirect_stdout(log):
             try:
                 code = command.run([report] * by_return)

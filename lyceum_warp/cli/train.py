@@ -236,6 +236,12 @@ class Train:
                 return dataclasses.replace(self, resume=self.out, out=None, from_run=None)._run(source, team, callbacks)
             return self._run(source, team, callbacks)
 
+    def check(self) -> None:
+        """Check the settings of a new run, without its worlds and networks."""
+        self._check_flags()
+        source = None if self.from_run is None else training.Run.open(self.from_run)
+        self.configuration(source, algos.Team(0, 1))
+
     def _run_seeds(self) -> int:
         from lyceum_warp.cli.seeds import settings_of, train_and_show
 
@@ -244,6 +250,7 @@ class Train:
         if len(seeds) == 1:
             seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
         folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
+        self.check()
         settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on", "verbose"))
         return train_and_show(self.task, folder, seeds, self.jobs, settings)
 
@@ -293,6 +300,8 @@ class Train:
             )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
+        if self.network is not None and self.algorithm == "sac":
+            raise ValueError("--network is the network of npg, ppo and distill; sac has its own: omit one of them")
         if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
             raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:
