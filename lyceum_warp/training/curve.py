@@ -85,6 +85,19 @@ def curve_panels(run: Run) -> list[Panel]:
     return sorted(panels, key=lambda each: GROUPS.index(each.group))
 
 
+def draw_panel(axes: Any, panel: Panel) -> None:
+    """Draw the curves of a panel."""
+    from matplotlib.ticker import EngFormatter
+
+    for name, points in panel.curves.items():
+        x, y = zip(*points, strict=True)
+        style: Any = {"color": ACCENT, "marker": "o", "markersize": 2.5} if name == _MEAN else {"color": LINE}
+        if len(x) < 3:  # a line through a single point is invisible
+            style["marker"] = "."
+        axes.plot(x, y, label=name, linewidth=1.3, **style)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+
+
 def learning_curve(run: str | Path | Run) -> Path:
     """Plot a run's returns and metrics against the number of samples, as ``curve.png`` in the run's folder.
 
@@ -104,24 +117,16 @@ def learning_curve(run: str | Path | Run) -> Path:
     columns = min(4, max(1, len(others)))
     height = 1 + math.ceil(len(others) / columns) if others else 1
     figure = new_figure("a learning curve", 7.5 if columns < 4 else 10.0, 3.0 + 1.8 * (height - 1))
-    from matplotlib.ticker import EngFormatter
-
     grid = figure.add_gridspec(height, columns, height_ratios=[1.7, *[1.0] * (height - 1)])
     places = [grid[0, :], *(grid[1 + k // columns, k % columns] for k in range(len(others)))]
     all_axes: list[Any] = []
     for panel, place in zip((first, *others), places, strict=True):
         axes = figure.add_subplot(place)
-        for name, points in panel.curves.items():
-            x, y = zip(*points, strict=True)
-            style: Any = {"color": ACCENT, "marker": "o", "markersize": 2.5} if name == _MEAN else {"color": LINE}
-            if len(x) < 3:  # a line through a single point is invisible
-                style["marker"] = "."
-            axes.plot(x, y, label=name, linewidth=1.3, **style)
+        draw_panel(axes, panel)
         small: Any = {} if panel is first else {"fontsize": "small"}
         axes.set_title(panel.title if panel is not first else f"{run.task_name}, seed {run.config['seed']}",
                        loc="left", **small)  # fmt: skip
         axes.set_ylabel(f"{panel.title}, {panel.unit}" if panel is first else panel.unit.replace(", ", "\n"), **small)
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if panel is not first:
             axes.tick_params(labelsize="small")
         all_axes.append(axes)

@@ -2,12 +2,12 @@
 
 import contextlib
 import html
+import io
 import itertools
 import json
-import math
 import re
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ from lyceum_warp.controllers import episode_env, load_episodes, policy_episodes
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.files import replaced
 from lyceum_warp.training.comparison import flat_settings, read_curve
-from lyceum_warp.training.curve import RETURNS, Panel, curve_panels
+from lyceum_warp.training.curve import RETURNS, Panel, curve_panels, draw_panel
 from lyceum_warp.training.runs.configuration import Configuration
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum
 from lyceum_warp.training.runs.task_copy import run_env
-from lyceum_warp.viz import one_line, write_page
+from lyceum_warp.viz import ACCENT, GRID, LINE, finish_axes, new_figure, one_line, write_page
 
 _SETTINGS = (
     "task", "algorithm", "network", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from",
@@ -29,8 +29,10 @@ _SETTINGS = (
 )  # fmt: skip
 """Entries of config.json on the page. All others, such as those of callbacks, are left out."""
 
-_WIDTH, _HEIGHT, _LEFT, _BOTTOM = 320, 150, 50, 18
-_MOST_POINTS = 300
+_COLOURS = {LINE: "one", ACCENT: "two", GRID: "line", "#000000": "soft"}
+"""Maps colours of figures to the page's, which differ in the dark."""
+
+_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
 def write_report(folder: str | Path, out: str | Path | None = None, *, episode: bool = True) -> Path:
@@ -143,50 +145,20 @@ def _short(value: Any) -> str:
 
 
 def _figure(panel: Panel) -> str:
-    """Draw a panel as SVG. Its colours follow the page's."""
-    points = [point for curve in panel.curves.values() for point in curve]
-    (x_low, x_high), (y_low, y_high) = ((min(each), max(each)) for each in zip(*points, strict=True))
-    ticks = _ticks(y_low, y_high)
-    if y_low == y_high:  # put the line into the middle
-        y_low, y_high = y_low - 1.0, y_high + 1.0
-    x_scale, y_scale = (_WIDTH - _LEFT - 6) / (x_high - x_low or 1.0), (_HEIGHT - _BOTTOM - 8) / (y_high - y_low)
+    """Draw a panel as SVG, in the page's colours."""
+    figure, file = new_figure("a report", 3.2, 1.6), io.StringIO()
+    from matplotlib import rc_context
 
-    def place(x: float, y: float) -> str:
-        return f"{_LEFT + (x - x_low) * x_scale:.1f} {_HEIGHT - _BOTTOM - (y - y_low) * y_scale:.1f}"
-
-    parts = []
-    for tick in ticks:
-        x, y = place(x_low, tick).split()
-        parts.append(f'<line x1="{x}" x2="{_WIDTH - 6}" y1="{y}" y2="{y}"/>')
-        parts.append(f'<text x="{_LEFT - 5}" y="{float(y) + 4:.1f}" text-anchor="end">{_number(tick)}</text>')
-    parts.append(f'<text x="{_LEFT}" y="{_HEIGHT - 3}">{_number(x_low)}</text>')
-    parts.append(f'<text x="{_WIDTH - 6}" y="{_HEIGHT - 3}" text-anchor="end">{_number(x_high)}</text>')
-    for name, curve in panel.curves.items():
-        stride = max(1, len(curve) // _MOST_POINTS)
-        line = " L".join(place(*point) for point in [*curve[:-1:stride], curve[-1]])
-        dot = " h.1" if len(curve) == 1 else ""
-        kind = "two" if name == "mean policy" else "one"
-        parts.append(f'<path class="{kind}" stroke-linecap="round" d="M{line}{dot}"/>')
+    axes = figure.subplots()
+    draw_panel(axes, panel)
+    finish_axes([axes])
+    axes.locator_params(nbins=4)
+    with rc_context({"svg.fonttype": "none"}):
+        figure.savefig(file, format="svg", transparent=True, metadata=_NO_METADATA)
+    drawn = file.getvalue().partition("<svg")[2]
+    for colour, name in _COLOURS.items():
+        drawn = drawn.replace(colour, f"var(--{name})")
     unit = f" <span>{html.escape(panel.unit)}</span>" if panel.unit else ""
-    label = html.escape(f"{panel.title} over samples")
-    return (
-        f'<figure><figcaption>{html.escape(panel.title)}{unit}</figcaption><svg role="img" aria-label="{label}" '
-        f'viewBox="0 0 {_WIDTH} {_HEIGHT}">{"".join(parts)}</svg></figure>'
-    )
-
-
-def _ticks(low: float, high: float) -> Sequence[float]:
-    """Choose three to six round numbers in a range, or its only value."""
-    if low == high:
-        return [low]
-    power = 10.0 ** math.floor(math.log10(high - low))
-    steps = (power * factor for factor in (5, 2, 1, 0.5, 0.2))
-    grids = ([step * k for k in range(math.ceil(low / step), math.floor(high / step) + 1)] for step in steps)
-    return next(grid for grid in grids if len(grid) >= 3)
-
-
-def _number(value: float) -> str:
-    for unit, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(value) >= unit:
-            return f"{value / unit:.4g}{letter}"
-    return f"{value:.4g}"
+    title = html.escape(panel.title)
+    caption = f"<figcaption>{title}{unit}</figcaption>"
+    return f'<figure>{caption}<svg role="img" aria-label="{title} over samples"{drawn}</figure>'
