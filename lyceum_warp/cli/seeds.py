@@ -19,20 +19,12 @@ _NUMBERS = {"iteration": ",.0f", "samples": ",.0f", "return_mean": ".5g", "mean_
 
 def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, settings: Mapping[str, Any]) -> int:
     """Train several seeds, and print a summary. The exit code is 1 if a run has failed."""
-    states: dict[int, str] = {}
-
-    def note_changes(runs: Sequence[Any]) -> None:
-        for run in runs:
-            if states.get(run.seed, "waiting") != run.state:
-                say(f"seed {run.seed}: {run.state}{f', {run.error}' if run.error else ''} ({run.log})")
-            states[run.seed] = run.state
-
-    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}; if interrupted, the same command with --out {folder} "
-        "continues them")  # fmt: skip
-    with Live(console=console, refresh_per_second=2, transient=True) as live:
-        watch = (lambda runs: live.update(_progress(runs))) if console.is_terminal else note_changes
-        runs = training.train_seeds(task, folder, seeds, jobs=jobs, watch=watch, **settings)
-    console.print(_progress(runs))
+    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}, each with a log; if interrupted, the same command with "
+        f"--out {folder} continues them")  # fmt: skip
+    with Live(console=console, refresh_per_second=2) as live:
+        runs = training.train_seeds(
+            task, folder, seeds, jobs=jobs, watch=lambda runs: live.update(_progress(runs)), **settings
+        )
     groups = training.group_runs(training.read_curves([folder]))
     print_groups(groups)
     content = {

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,14 @@ class SeedRun:
     def log(self) -> Path:
         """The file with the output of the run's process."""
         return self.folder.with_suffix(".log")
+
+    @property
+    def begun(self) -> bool:
+        """Whether the run has been saved."""
+        return (self.folder / "checkpoint.pt").exists()
+
+
+_Job = tuple[SeedRun, subprocess.Popen[bytes]]
 
 
 def train_seeds(
@@ -74,26 +82,25 @@ def train_seeds(
     words = [str(task), *flag_words(settings)]
     places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
     Path(folder).mkdir(parents=True, exist_ok=True)
-    active: dict[int, tuple[SeedRun, subprocess.Popen[bytes]]] = {}
+    waiting, active = [*runs], dict[int, _Job]()
     with postponed() as signals:
         try:
-            while active or (not signals and any(run.state == "waiting" for run in runs)):
-                for slot, place in enumerate(places):
-                    run = next((run for run in runs if run.state == "waiting"), None)
-                    if slot not in active and run is not None and not signals:
-                        active[slot] = run, _start(run, words, *place)
-                        run.state = "training"
+            while active or (waiting and not signals):
                 if signals:
-                    _end(active, signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
+                    _end(active.values(), signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
+                # until a run has begun, it trains alone: what one run refuses, all others would refuse, too
+                elif waiting and len(active) < len(places) and (not active or any(run.begun for run in runs)):
+                    slot = min(set(range(len(places))) - active.keys())
+                    active[slot] = _start(waiting.pop(0), words, *places[slot])
                 time.sleep(_POLL)
                 for slot, (run, process) in list(active.items()):
                     if process.poll() is not None:
                         del active[slot]
-                        _conclude(run, process.returncode, stopped=bool(signals))
+                        _conclude(run, process.returncode)
                 if watch is not None:
                     watch(runs)
         finally:
-            _end(active, signal.SIGTERM)
+            _end(active.values(), signal.SIGTERM)
             for _, process in active.values():
                 process.wait()
     return runs
@@ -117,54 +124,55 @@ def flag_words(settings: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int] | None, str | None]]:
-    """Divide the CPU cores, and distribute the GPUs in turn: the cores and CUDA_VISIBLE_DEVICES of each job."""
+def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int], dict[str, str]]]:
+    """Divide the CPU cores, and distribute the GPUs in turn: the cores, if there are enough, and the environment."""
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    gpus: list[str] = []
+    gpus: Sequence[object] = ()
     if device == "cuda":
         import torch
 
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-        gpus = visible.split(",") if visible else list(map(str, range(torch.cuda.device_count())))
+        gpus = visible.split(",") if visible else range(torch.cuda.device_count())
     for slot in range(jobs):
-        share = set(cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs])
-        yield share if jobs <= len(cores) else None, gpus[slot % len(gpus)] if gpus else None
+        share = cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs]
+        yield set(share), {"CUDA_VISIBLE_DEVICES": str(gpus[slot % len(gpus)])} if gpus else {}
 
 
-def _start(run: SeedRun, words: Sequence[str], cores: set[int] | None, gpu: str | None) -> subprocess.Popen[bytes]:
+def _start(run: SeedRun, words: Sequence[str], cores: set[int], environment: Mapping[str, str]) -> _Job:
     command = [sys.executable, "-m", "lyceum_warp.cli", "train", *words, "--seed", str(run.seed)]
     libc = ctypes.CDLL(None)
 
     def prepare() -> None:
-        if cores is not None:
+        if cores:
             os.sched_setaffinity(0, cores)
         if hasattr(libc, "prctl"):
             libc.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: the run is saved if this process is killed
 
-    environment = os.environ | ({} if gpu is None else {"CUDA_VISIBLE_DEVICES": gpu})
+    run.state = "training"
     with run.log.open("ab") as log:
         # in a session of its own, because Ctrl-C must reach the run once
-        return subprocess.Popen(
+        process = subprocess.Popen(
             [*command, "--continue", "--out", str(run.folder)], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            env=environment, start_new_session=True, preexec_fn=prepare,
+            env={**os.environ, **environment}, start_new_session=True, preexec_fn=prepare,
         )  # fmt: skip
+    return run, process
 
 
-def _end(active: Mapping[int, tuple[SeedRun, subprocess.Popen[bytes]]], number: signal.Signals) -> None:
+def _end(jobs: Iterable[_Job], number: signal.Signals) -> None:
     """Send a signal to each run, once."""
-    for run, process in active.values():
+    for run, process in jobs:
         if run.state == "training" or number == signal.SIGKILL:
             process.send_signal(number)
             run.state = "stopped"
 
 
-def _conclude(run: SeedRun, code: int, *, stopped: bool) -> None:
+def _conclude(run: SeedRun, code: int) -> None:
     """Note how a run has ended."""
     if code == 0:
         run.state = "complete"
-    elif not stopped:
+    elif run.state == "training":
         run.state = "failed"
         lines = run.log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
-        if not (run.folder / "metrics.csv").exists():
+        if not run.begun:
             raise ValueError(f"{run.error} (seed {run.seed}; see {run.log})")
