@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say, say_entries, table
+from lyceum_warp.cli.display import console, say_entries, table
 
 _COLUMNS = 4
 """Maximum number of groups in the table of differences."""
@@ -46,31 +46,24 @@ class Plot:
 
 
 def print_groups(groups: "list[training.RunGroup]") -> None:
-    """Print the final returns of groups of runs, with their gates and their verdicts on transfer."""
+    """Print the final returns of groups of runs with the samples before them, gates, and verdicts on transfer."""
     rows = []
     for group in groups:
         summary = group.summary()
+        samples = sorted({run.samples[-1] for run in group.runs if len(run.returns)})
         tested = [run.gate for run in group.runs if run.gate]
         passed = sum(text.startswith("passed") for text in tested)
-        rows.append([
-            group.task, group.label, str(len(group.runs)), _interval(summary, "mean"),
-            _interval(summary, "interquartile_mean"), f"{passed} of {len(tested)} passed" if tested else "",
-            "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
-        ])  # fmt: skip
-    headings = (
-        "task", "settings", "runs", "final return\n[95 %, t]", "interquartile mean\n[95 %, bootstrap]", "gate",
-        "transfer",
-    )  # fmt: skip
-    columns = dict(zip(headings, zip(*rows, strict=True), strict=True))
+        rows.append({
+            "task": group.task, "settings": group.label, "runs": str(len(group.runs)),
+            "samples": " to ".join(f"{number:,.0f}" for number in (*samples[:1], *samples[1:][-1:])),
+            "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in group.runs})),
+            "final return\n[95 %, t]": _interval(summary, "mean"),
+            "interquartile mean\n[95 %, bootstrap]": _interval(summary, "interquartile_mean"),
+            "gate": f"{passed} of {len(tested)} passed" if tested else "",
+            "transfer": "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
+        })  # fmt: skip
+    columns = {name: [row[name] for row in rows] for name in rows[0]}
     console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
-    runs = [run for group in groups for run in group.runs if len(run.returns)]
-    if len({run.evaluated for run in runs}) > 1:
-        say("some returns are those of the mean policy, others those of sampled episodes: train with --mean-every")
-    for task in dict.fromkeys(group.task for group in groups):
-        samples = [max(run.samples[-1] for run in group.runs if len(run.returns)) for group in groups
-                   if group.task == task and any(len(run.returns) for run in group.runs)]  # fmt: skip
-        if samples and max(samples) > 1.1 * min(samples):
-            say(f"{task}: groups have {min(samples):,.0f} to {max(samples):,.0f} samples; a fair comparison has equal")
 
 
 def _interval(summary: dict[str, Any], name: str) -> str:
@@ -84,10 +77,9 @@ def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
     entries = [_entries(group.runs[0]) for group in groups]
     if names := training.differing(entries):
-        columns = {"difference": names}
-        for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1):
-            columns[f"{k}: {group.label}"] = [str(each.get(name, "")) for name in names]
-        console.print(table(columns))
+        cells = {f"{k}: {group.label}": [str(each.get(name, "")) for name in names]
+                 for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1)}  # fmt: skip
+        console.print(table({"difference": names, **cells}))
 
 
 def _entries(run: "training.RunCurve") -> dict[str, Any]:

@@ -50,23 +50,27 @@ def interquartile_mean(values: np.ndarray) -> np.ndarray:
 
 def bootstrap_interval(
     values: Sequence[float] | np.ndarray, statistic: Callable[[np.ndarray], np.ndarray], *, resamples: int = 10_000
-) -> tuple[float, float]:
-    """Compute the 95 % percentile bootstrap interval of a statistic; NaN for a single value.
+) -> np.ndarray:
+    """Compute the 95 % percentile bootstrap interval of a statistic of each row; NaN for rows of a single value.
 
-    The resamples have a fixed seed. The interval of few values is too narrow (Efron and Tibshirani 1993, "An
-    introduction to the bootstrap", chapter 13).
+    The resamples have a fixed seed, and are the same for all rows. The interval of few values is too narrow (Efron and
+    Tibshirani 1993, "An introduction to the bootstrap", chapter 13).
 
     Args:
-        values: The values.
-        statistic: Maps arrays (resamples, values) to (resamples,).
+        values: The values, (..., n).
+        statistic: Maps arrays (..., resamples, n) to (..., resamples).
         resamples: Number of resamples with replacement.
+
+    Returns:
+        The lower and the upper ends, (2, ...).
     """
     array = np.asarray(values, float)
-    if len(array) < 2:
-        return math.nan, math.nan
-    index = np.random.default_rng(0).integers(len(array), size=(resamples, len(array)))
-    low, high = np.percentile(statistic(array[index]), (2.5, 97.5))
-    return float(low), float(high)
+    n = array.shape[-1]
+    if n < 2:
+        return np.full((2, *array.shape[:-1]), math.nan)
+    index = np.random.default_rng(0).integers(n, size=(resamples, n))
+    ends: np.ndarray = np.percentile(statistic(array[..., index]), (2.5, 97.5), axis=-1)
+    return ends
 
 
 def clear_losses(first: np.ndarray, second: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:

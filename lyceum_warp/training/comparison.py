@@ -81,7 +81,7 @@ class RunGroup:
             result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(np.array(finals)))}
         if len(finals) > 1:
             result["mean_interval"] = [mean - half, mean + half]
-            result["interquartile_mean_interval"] = [*bootstrap_interval(finals, interquartile_mean)]
+            result["interquartile_mean_interval"] = bootstrap_interval(finals, interquartile_mean).tolist()
         return result
 
 
@@ -237,7 +237,7 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
 
 
 def mean_curve(runs: Sequence[RunCurve], over: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Compute the mean curve of runs, and the ends of its 95 % interval (percentile bootstrap over the runs).
+    """Compute the mean curve of runs, and the ends of its 95 % interval (percentile bootstrap over several runs).
 
     Args:
         runs: The runs, each with at least one return.
@@ -247,9 +247,6 @@ def mean_curve(runs: Sequence[RunCurve], over: str) -> tuple[np.ndarray, np.ndar
         The samples or seconds, the mean, and the lower and upper ends, each (points,).
     """
     xs = [getattr(run, over) for run in runs]
-    n = len(runs)
-    x = xs[0] if n == 1 else np.linspace(max(each[0] for each in xs), max(each[-1] for each in xs), _POINTS)
-    values = np.array([np.interp(x, each, run.returns) for each, run in zip(xs, runs, strict=True)])
-    index = np.random.default_rng(0).integers(n, size=(_RESAMPLES, n))
-    low, high = np.percentile(values[index].mean(axis=1), (2.5, 97.5), axis=0)
-    return x, values.mean(axis=0), low, high
+    x = xs[0] if len(xs) == 1 else np.linspace(max(each[0] for each in xs), max(each[-1] for each in xs), _POINTS)
+    values = np.stack([np.interp(x, each, run.returns) for each, run in zip(xs, runs, strict=True)], axis=-1)
+    return x, values.mean(-1), *bootstrap_interval(values, lambda rows: rows.mean(-1), resamples=_RESAMPLES)
