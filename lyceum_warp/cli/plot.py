@@ -8,6 +8,7 @@ import tyro
 
 from lyceum_warp import training
 from lyceum_warp.cli.display import console, say_entries, table
+from lyceum_warp.support.mappings import differing
 
 _COLUMNS = 4
 """Maximum number of groups in the table of differences."""
@@ -76,7 +77,7 @@ def _interval(summary: dict[str, Any], name: str) -> str:
 def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
     entries = [_entries(group.runs[0]) for group in groups]
-    if names := training.differing(entries):
+    if names := differing(entries):
         cells = {f"{k}: {group.label}": [str(each.get(name, "")) for name in names]
                  for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1)}  # fmt: skip
         console.print(table({"difference": names, **cells}))

@@ -19,8 +19,8 @@ _NUMBERS = {"iteration": ",.0f", "samples": ",.0f", "return_mean": ".5g", "mean_
 
 def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, settings: Mapping[str, Any]) -> int:
     """Train several seeds, and print a summary. The exit code is 1 if a run has failed."""
-    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}, each with a log; if interrupted, the same command with "
-        f"--out {folder} continues them")  # fmt: skip
+    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}, each with a log; if interrupted, the same command "
+        f"with --out {folder} continues them")  # fmt: skip
     with Live(console=console, refresh_per_second=2) as live:
         runs = training.train_seeds(
             task, folder, seeds, jobs=jobs, watch=lambda runs: live.update(_progress(runs)), **settings

@@ -204,7 +204,7 @@ def _objective(search: Search) -> Callable[[Any], float]:
 
 def _best_return(run: Any) -> float:
     """Return the mean return of the better policy in new episodes, which ``train --evaluate`` has stored."""
-    return max(float(score["mean"]) for score in json.loads(run.evaluation.read_text())["policies"].values())
+    return max(score.mean for score in training.stored_scores(run).values())
 
 
 def _gate_seconds(run: Any) -> float:

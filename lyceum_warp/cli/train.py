@@ -301,7 +301,9 @@ class Train:
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
         if self.network is not None and self.algorithm == "sac":
-            raise ValueError("--network is the network of npg, ppo and distill; sac has its own: omit one of them")
+            raise ValueError(
+                "--network has no effect on sac, whose networks are its own: omit it, or give another --algorithm"
+            )
         if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
             raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:

@@ -13,6 +13,7 @@ import torch
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
+from lyceum_warp.support.mappings import differing
 from lyceum_warp.support.validate import positive_number
 
 
@@ -175,7 +176,7 @@ def control_report(trajectories: Trajectory | Sequence[Trajectory], *, rate: flo
         if len(values := {getattr(episode, name) for episode in episodes}) > 1:
             raise ValueError(f"these trajectories differ in their {name} ({values}): make separate reports")
     for name in ("params", "controller"):
-        if names := _differing_names([getattr(episode, name) for episode in episodes]):
+        if names := differing([getattr(episode, name) for episode in episodes]):
             raise ValueError(f"these trajectories differ in their {name} ({', '.join(names)}): make separate reports")
     deadline = first.period if rate is None else 1 / positive_number("rate", rate, "plans per second")
     common = ("task", "engine", "mode", "params", "controller", "versions")
@@ -295,12 +296,6 @@ def _mean(values: np.ndarray) -> float | None:
 
 def _quantile(values: np.ndarray, q: float, least: int) -> float | None:
     return float(np.quantile(values, q)) if len(values) >= least else None
-
-
-def _differing_names(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
-    names = dict.fromkeys(name for mapping in mappings for name in mapping)
-    # compare texts, because NaN != NaN
-    return [name for name in names if len({json.dumps(mapping.get(name)) for mapping in mappings}) > 1]
 
 
 def _plans_per_second(episodes: Sequence[Trajectory]) -> float | None:

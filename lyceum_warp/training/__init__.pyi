@@ -7,7 +7,6 @@ from lyceum_warp.training.comparison import (
     RunCurve as RunCurve,
     RunGroup as RunGroup,
     comparison_figure as comparison_figure,
-    differing as differing,
     group_runs as group_runs,
     mean_curve as mean_curve,
     read_curve as read_curve,
@@ -27,6 +26,7 @@ from lyceum_warp.training.runs.choice import (
     EPISODES as EPISODES,
     Choice as Choice,
     choose_policy as choose_policy,
+    stored_scores as stored_scores,
 )
 from lyceum_warp.training.runs.configuration import (
     ALGORITHMS as ALGORITHMS,

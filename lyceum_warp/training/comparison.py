@@ -12,6 +12,7 @@ import numpy as np
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval
+from lyceum_warp.support.mappings import differing, flat_settings
 from lyceum_warp.training.runs.folder import CONFIG, Run
 from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_figure
 
@@ -135,14 +136,6 @@ def row_seconds(row: Mapping[str, float | None]) -> float:
     return sum(value or 0.0 for name, value in row.items() if name.startswith("time_") and name != "time_mean")
 
 
-def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Flatten nested settings to names such as "ppo.gamma"."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        flat |= flat_settings(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
-
-
 def _read_events(folder: Path) -> RunCurve:
     """Read a run of rsl_rl or Stable-Baselines3 from its files for TensorBoard."""
     check_extra(f"reading {folder}", "tensorboard")
@@ -188,12 +181,6 @@ def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
                 words.insert(0, str(values.get("algorithm", "")))
             groups.append(RunGroup(task, ", ".join(words), runs))
     return groups
-
-
-def differing(mappings: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the names whose values differ between mappings. A name that one of them lacks differs, too."""
-    names = dict.fromkeys(name for mapping in mappings for name in mapping)
-    return [name for name in names if len({json.dumps(m.get(name), default=str) for m in mappings}) > 1]
 
 
 def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:

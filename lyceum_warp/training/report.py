@@ -1,12 +1,10 @@
 """Write a page on a run: settings, curves, verdicts, faults, the machine and an episode."""
 
-import contextlib
 import html
 import io
 import itertools
 import json
 import re
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,13 @@ from lyceum_warp.algos import EXACT, evaluation_worlds
 from lyceum_warp.controllers import episode_env, load_episodes, policy_episodes
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.files import replaced
-from lyceum_warp.training.comparison import flat_settings, read_curve
+from lyceum_warp.support.mappings import flat_settings
+from lyceum_warp.training.comparison import read_curve
 from lyceum_warp.training.curve import RETURNS, Panel, curve_panels, draw_panel
 from lyceum_warp.training.runs.configuration import Configuration
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum
 from lyceum_warp.training.runs.task_copy import run_env
-from lyceum_warp.viz import ACCENT, GRID, LINE, finish_axes, new_figure, one_line, write_page
+from lyceum_warp.viz import ACCENT, GRID, LINE, finish_axes, new_figure, one_line, show
 
 _SETTINGS = (
     "task", "algorithm", "network", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from",
@@ -79,13 +78,8 @@ def _run_parts(run: Run) -> Iterator[str]:
     rows = run.rows()
     lines = [f"{rows[-1]['iteration']:,.0f} iterations, {rows[-1]['samples'] or 0:,.0f} samples, "
              f"last return {curve.final:.5g}"]  # fmt: skip
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        stored = json.loads(run.evaluation.read_text())
-        lines += [
-            f"the {which} policy (iteration {score['iteration']}) returns {score['mean']:.5g} ± {score['std']:.3g} in "
-            f"{stored['episodes']} new episodes on the {stored['simulation']}"
-            for which, score in stored["policies"].items()
-        ]
+    if run.evaluation.is_file():
+        lines.append(json.loads(run.evaluation.read_text()).get("line", ""))
     lines += [f"gate: {curve.gate}"] * bool(curve.gate) + [f"transfer: {curve.transfer}"] * bool(curve.transfer)
     faults = {name: round(sum(row.get(name) or 0.0 for row in rows)) for name in ("faults", "outliers")}
     lines.append(", ".join(f"{number:,d} {name}" for name, number in faults.items()))
@@ -116,8 +110,7 @@ def _episode(folder: Path, *, planned: bool) -> str:
             env = evaluation_worlds(run_env(run, options, saved.params), 1, autoreset=False)
             (played,) = policy_episodes(env, load(run), 1, seed=run.config["seed"] + 1, curriculum=load_curriculum(run))
             states = played.states
-        with tempfile.TemporaryDirectory() as temporary:
-            text = write_page(env, states, Path(temporary, "episode.html")).read_text()
+        text = show(env, states).content
     except Exception as error:  # a report without an episode is worth having
         reason = re.sub(r"/\S*/", "", one_line(error))  # without folders
         return f'<p class="soft">no episode: {html.escape(reason)}</p>'

@@ -10,8 +10,9 @@ from typing import Any
 from lyceum_warp.algos import Iteration, Learner
 from lyceum_warp.env import Env
 from lyceum_warp.support.extras import check_extra
+from lyceum_warp.support.mappings import flat_settings
 from lyceum_warp.training.callbacks import Callback
-from lyceum_warp.training.comparison import flat_settings, row_seconds
+from lyceum_warp.training.comparison import row_seconds
 from lyceum_warp.training.runs.folder import Run
 
 _GROUPS = {

@@ -10,7 +10,7 @@ from lyceum_warp.viz.ghosts import (
     reference_states as reference_states,
 )
 from lyceum_warp.viz.moments import draw_moments as draw_moments
-from lyceum_warp.viz.page import write_page as write_page, write_states as write_states
+from lyceum_warp.viz.page import show as show, write_page as write_page, write_states as write_states
 from lyceum_warp.viz.pictures import WorldPictures as WorldPictures
 from lyceum_warp.viz.policy_videos import (
     NamedProgress as NamedProgress,

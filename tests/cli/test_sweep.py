@@ -49,7 +49,10 @@ def test_sweep_with_a_wrong_key_or_range_prints_an_error(
         (text + "[x]", "sweep.toml: "),
         (text.replace('objective = "return"', 'sampler = "Guess"'), "sweep.toml: module 'optuna.samplers' has no"),
         (text.replace("low", "lo"), "the range gamma = "),
+        (text.replace("0.99 ", "1.5 "), "gamma must be"),
+        (text.replace("gamma", "gama"), "gama"),
     ]:
         Path("sweep.toml").write_text(wrong)
         assert cli.main(["sweep", "sweep.toml"]) == 2
         refused(capsys, words)
+        assert [path.name for path in tmp_path.iterdir()] == ["sweep.toml"]

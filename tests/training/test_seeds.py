@@ -53,13 +53,14 @@ def test_interrupted_seeds_continue_with_the_same_command(tmp_path: Path, monkey
 
 
 @pytest.mark.long
-def test_bad_options_end_all_seeds_with_the_error_of_the_first(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    argv = ["train", *WORDS, "--gamma", "7", "--seeds", "3", "--out", str(tmp_path / "x")]
-    assert cli.main(argv) == 2
-    refused(capsys, "gamma", "seed-0.log")
-    assert not list(tmp_path.glob("x/*/config.json"))
+def test_bad_options_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["train", *WORDS, "--seeds", "3", "--jobs", "2", "--out", str(tmp_path / "x")]
+    assert cli.main([*argv, "--gamma", "7"]) == 2
+    refused(capsys, "gamma must be")
+    assert not list(tmp_path.iterdir())
+    assert cli.main([*argv, "--param", "speed=1"]) == 2  # only the environment knows its parameters
+    refused(capsys, "'speed'", "seed-0.log")
+    assert [path.name for path in (tmp_path / "x").iterdir()] == ["seed-0.log"]
 
 
 def test_options_become_words_of_the_command_line() -> None:

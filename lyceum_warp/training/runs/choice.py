@@ -72,7 +72,7 @@ def choose_policy(
     iterations = {"last": read_checkpoint(run.policy_file(), parts=("iteration", "policy"))["iteration"]}
     if (best := run.best_score()) is not None and best[0] != iterations["last"]:
         iterations["best"] = best[0]
-    scores = _stored(run)
+    scores = stored_scores(run)
     if {which: score.iteration for which, score in scores.items()} != iterations:
         env = worlds()
         curriculum, scores = load_curriculum(run), {}
@@ -84,12 +84,18 @@ def choose_policy(
             scores[which] = Score(iteration, *(value.item() for value in values))
         entries = {which: dataclasses.asdict(score) for which, score in scores.items()}
         content = {"episodes": EPISODES, "seed": seed, "simulation": simulation(env), "policies": entries}
+        content["line"] = f"{_choice(scores).text}, on the {content['simulation']}"
         with contextlib.suppress(OSError), replaced(run.evaluation) as temporary:  # the folder may be read-only
             temporary.write_text(json.dumps(content, indent=2))
+    return _choice(scores)
+
+
+def _choice(scores: dict[str, Score]) -> Choice:
     return Choice(max(scores, key=lambda which: (scores[which].mean, which == "last")), scores)
 
 
-def _stored(run: Run) -> dict[str, Score]:
+def stored_scores(run: Run) -> dict[str, Score]:
+    """Read the scores in evaluation.json by "last" and "best". Without a valid file, the result is empty."""
     try:
         policies = json.loads(run.evaluation.read_text())["policies"]
         rows = {which: [score[field.name] for field in dataclasses.fields(Score)] for which, score in policies.items()}
