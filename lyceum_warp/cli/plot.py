@@ -76,14 +76,12 @@ def _interval(summary: dict[str, Any], name: str) -> str:
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
-    entries = [_entries(group.runs[0]) for group in groups]
+    entries = []
+    for settings, versions in ((group.runs[0].settings, group.runs[0].versions) for group in groups):
+        # without prefixes, a hyperparameter of two algorithms is in one row
+        own = f"{settings['algorithm']}."
+        entries.append({**{name.removeprefix(own): value for name, value in settings.items()}, **versions})
     if names := differing(entries):
-        cells = {f"{k}: {group.label}": [str(each.get(name, "")) for name in names]
-                 for k, (group, each) in enumerate(zip(groups, entries, strict=True), 1)}  # fmt: skip
-        console.print(table({"difference": names, **cells}))
-
-
-def _entries(run: "training.RunCurve") -> dict[str, Any]:
-    """Return settings and versions. Hyperparameters have no prefix, so that those of two algorithms are in one row."""
-    prefix = f"{run.settings['algorithm']}."
-    return {name.removeprefix(prefix): value for name, value in run.settings.items()} | {**run.versions}
+        cells = [[str(each.get(name, "")) for name in names] for each in entries]
+        headings = [f"{k}: {group.label}" for k, group in enumerate(groups, 1)]
+        console.print(table({"difference": names, **dict(zip(headings, cells, strict=True))}))

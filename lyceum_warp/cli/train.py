@@ -300,10 +300,6 @@ class Train:
             )
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
-        if self.network is not None and self.algorithm == "sac":
-            raise ValueError(
-                "--network has no effect on sac, whose networks are its own: omit it, or give another --algorithm"
-            )
         if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
             raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:
@@ -373,6 +369,8 @@ class Train:
                 "class, as in --algorithm path/to/file.py:Class, or begin a new run from its policy by --from and "
                 "--algorithm"
             )
+        if algorithm == "sac" and self.network is not None:
+            raise ValueError("sac takes no --network: omit it, or use --algorithm ppo or npg")
         flags = self._given("nworld", "seed") | given(self.env) | given(self.physics)
         if "solver" in flags:
             flags["solver"] = {**(base.options.physics.solver or {}), **flags["solver"]}

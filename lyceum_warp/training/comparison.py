@@ -1,6 +1,7 @@
 """Compare runs: curves over samples and seconds with intervals, final returns, and settings that differ."""
 
 import dataclasses
+import itertools
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -194,28 +195,25 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
         ImportError: matplotlib is not installed.
     """
     known = [dataclasses.replace(g, runs=[run for run in g.runs if len(run.returns)]) for g in groups]
-    known = [group for group in known if group.runs]
-    if not known:
+    tasks = list(dict.fromkeys(group.task for group in known if group.runs))
+    if not tasks:
         raise ValueError("no run has a return to plot: continue its training")
-    tasks = list(dict.fromkeys(group.task for group in known))
     figure = new_figure("a comparison", 9.0, 0.6 + 2.9 * len(tasks))
     from matplotlib.ticker import EngFormatter
 
-    for row, panels in zip(tasks, figure.subplots(len(tasks), 2, squeeze=False, sharey="row"), strict=True):
-        for k, group in enumerate(group for group in known if group.task == row):
-            colour, _, line = STYLES[k % len(STYLES)]
-            n = len(group.runs)
-            label = f"{group.label} ({n} run{'s' * (n > 1)})"
+    for task, panels in zip(tasks, figure.subplots(len(tasks), 2, squeeze=False, sharey="row"), strict=True):
+        shown = [group for group in known if group.task == task and group.runs]
+        for group, (colour, _, line) in zip(shown, itertools.cycle(STYLES)):
+            label = f"{group.label} ({len(group.runs)} run{'s' * (len(group.runs) > 1)})"
             for axes, name in zip(panels, ("samples", "seconds"), strict=True):
                 x, mean, low, high = mean_curve(group.runs, name)
                 axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="." if len(x) < 3 else "")
                 axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
-        panels[0].set_title(row, loc="left")
-        evaluated = {run.evaluated for group in known if group.task == row for run in group.runs}
-        panels[0].set_ylabel("return of the mean policy" if evaluated == {True} else "return")
-        panels[0].legend(
-            title="mean, 95 % interval", frameon=False, loc="best", fontsize="small", title_fontsize="small"
-        )
+        evaluated = all(run.evaluated for group in shown for run in group.runs)
+        panels[0].set_title(task, loc="left")
+        panels[0].set_ylabel("return of the mean policy" if evaluated else "return")
+        small = {"fontsize": "small", "title_fontsize": "small"}
+        panels[0].legend(title="mean, 95 % interval", frameon=False, loc="best", **small)
         panels[0].set_xlabel("samples")
         panels[1].set_xlabel("seconds of sampling and updates")
         panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))

@@ -123,13 +123,12 @@ def learning_curve(run: str | Path | Run) -> Path:
     for panel, place in zip((first, *others), places, strict=True):
         axes = figure.add_subplot(place)
         draw_panel(axes, panel)
-        small: Any = {} if panel is first else {"fontsize": "small"}
-        axes.set_title(panel.title if panel is not first else f"{run.task_name}, seed {run.config['seed']}",
-                       loc="left", **small)  # fmt: skip
-        axes.set_ylabel(f"{panel.title}, {panel.unit}" if panel is first else panel.unit.replace(", ", "\n"), **small)
-        if panel is not first:
-            axes.tick_params(labelsize="small")
+        axes.set_title(panel.title, loc="left", fontsize="small")
+        axes.set_ylabel(panel.unit.replace(", ", "\n"), fontsize="small")
+        axes.tick_params(labelsize="small")
         all_axes.append(axes)
+    all_axes[0].set_title(f"{run.task_name}, seed {run.config['seed']}", loc="left")
+    all_axes[0].set_ylabel(f"{first.title}, {first.unit}")
     all_axes[0].legend(frameon=False, loc="best")
     all_axes[0].set_xlabel("samples")
     finish_axes(all_axes)

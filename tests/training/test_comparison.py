@@ -155,6 +155,8 @@ def test_a_network_from_a_file_is_copied_into_the_run(tmp_path: Path, capsys: py
     capsys.readouterr()
     assert cli.main([*command, "--hidden", "8", "--out", str(tmp_path / "x")]) == 2
     refused(capsys, "--network replaces --from, --hidden")
+    assert cli.main(["train", "hopper", "--algorithm", "sac", "--network", f"{file}:Mine"]) == 2
+    refused(capsys, "sac takes no --network")
 
 
 def test_wandb_gets_settings_and_curves_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
