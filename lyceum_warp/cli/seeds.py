@@ -1,6 +1,5 @@
 """Show the runs of several seeds while they train, and summarise them: lyceum-warp train --seeds."""
 
-import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -47,15 +46,3 @@ def _progress(runs: Sequence[Any]) -> Table:
         rows.append([str(run.seed), run.state, *cells, run.error])
     headings = ("seed", "state", "iter", "samples", "return", "mean\npolicy", "error")
     return table(dict(zip(headings, zip(*rows, strict=True), strict=True)))
-
-
-def settings_of(command: Any, omit: Sequence[str]) -> dict[str, Any]:
-    """Return the given options of a command as settings of ``train_seeds``."""
-    settings: dict[str, Any] = {}
-    for field in dataclasses.fields(command):
-        value = getattr(command, field.name)
-        if dataclasses.is_dataclass(value):
-            settings |= settings_of(value, ())
-        elif field.name not in omit and value != field.default:
-            settings["from" if field.name == "from_run" else field.name] = value
-    return settings

@@ -237,13 +237,18 @@ class Train:
             return self._run(source, team, callbacks)
 
     def check(self) -> None:
-        """Check the settings of a new run, without its worlds and networks."""
+        """Check the settings of a new run with a TASK, without worlds and networks."""
         self._check_flags()
+        assert self.task is not None
         source = None if self.from_run is None else training.Run.open(self.from_run)
-        self.configuration(source, algos.Team(0, 1))
+        configuration, task = self.configuration(source, algos.Team()), binding.find_task(self.task)
+        options = configuration.options
+        physics = options.physics.resolved(task.physics)
+        with binding.errors_of(task):
+            binding.BoundTask(task, options.nworld, model=options.model, physics=physics, params=configuration.params)
 
     def _run_seeds(self) -> int:
-        from lyceum_warp.cli.seeds import settings_of, train_and_show
+        from lyceum_warp.cli.seeds import train_and_show
 
         assert self.task is not None
         seeds = self.seeds
@@ -251,7 +256,13 @@ class Train:
             seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
         folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
         self.check()
-        settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on", "verbose"))
+        own = {"task", "seeds", "jobs", "out", "go_on", "verbose", "env", "physics", "hyperparameters"}
+        settings = {
+            name.removesuffix("_run"): value
+            for part in (self, self.env, self.physics, self.hyperparameters)
+            for name, value in core.given_values(part).items()
+            if name not in own
+        }
         return train_and_show(self.task, folder, seeds, self.jobs, settings)
 
     def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:

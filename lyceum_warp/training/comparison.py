@@ -207,7 +207,7 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
             label = f"{group.label} ({len(group.runs)} run{'s' * (len(group.runs) > 1)})"
             for axes, name in zip(panels, ("samples", "seconds"), strict=True):
                 x, mean, low, high = mean_curve(group.runs, name)
-                axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="." if len(x) < 3 else "")
+                axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="" if len(set(x)) > 2 else ".")
                 axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
         evaluated = all(run.evaluated for group in shown for run in group.runs)
         panels[0].set_title(task, loc="left")

@@ -58,8 +58,12 @@ def test_bad_options_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixt
     assert cli.main([*argv, "--gamma", "7"]) == 2
     refused(capsys, "gamma must be")
     assert not list(tmp_path.iterdir())
-    assert cli.main([*argv, "--param", "speed=1"]) == 2  # only the environment knows its parameters
-    refused(capsys, "'speed'", "seed-0.log")
+    assert cli.main([*argv, "--param", "speed=1"]) == 2
+    refused(capsys, "no parameter 'speed'")
+    assert not list(tmp_path.iterdir())
+    ppo = ["--algorithm", "ppo", "--nworld", "2", "--num-steps", "4", "--minibatches", "100"]
+    assert cli.main(["train", "point_mass", *ppo, *argv[-6:]]) == 2  # only the learner refuses these
+    refused(capsys, "100 mini-batches", "seed-0.log")
     assert [path.name for path in (tmp_path / "x").iterdir()] == ["seed-0.log"]
 
 
