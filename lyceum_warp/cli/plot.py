@@ -50,14 +50,14 @@ def print_groups(groups: "list[training.RunGroup]") -> None:
     """Print the final returns of groups of runs with the samples before them, gates, and verdicts on transfer."""
     rows = []
     for group in groups:
-        summary = group.summary()
-        samples = sorted({run.samples[-1] for run in group.runs if len(run.returns)})
+        summary, known = group.summary(), [run for run in group.runs if len(run.returns)]
+        samples = sorted({run.samples[-1] for run in known})
         tested = [run.gate for run in group.runs if run.gate]
         passed = sum(text.startswith("passed") for text in tested)
         rows.append({
             "task": group.task, "settings": group.label, "runs": str(len(group.runs)),
             "samples": " to ".join(f"{number:,.0f}" for number in (*samples[:1], *samples[1:][-1:])),
-            "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in group.runs})),
+            "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in known})),
             "final return\n[95 %, t]": _interval(summary, "mean"),
             "interquartile mean\n[95 %, bootstrap]": _interval(summary, "interquartile_mean"),
             "gate": f"{passed} of {len(tested)} passed" if tested else "",
