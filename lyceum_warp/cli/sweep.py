@@ -111,7 +111,7 @@ def check_search(search: Search) -> None:
     trial_settings(search, optuna.create_study().ask())
     ends = {name: list(_by_word(entry["choices"])) if "choices" in entry else [entry["low"], entry["high"]]
             for name, entry in search.ranges.items()}  # fmt: skip
-    for k in range(max(map(len, ends.values()))):
+    for k in range(max(map(len, ends.values()), default=1)):
         trial = optuna.trial.FixedTrial({name: values[k % len(values)] for name, values in ends.items()})
         _command(search, trial_settings(search, trial)).check()
 

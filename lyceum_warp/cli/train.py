@@ -241,11 +241,9 @@ class Train:
         self._check_flags()
         assert self.task is not None
         source = None if self.from_run is None else training.Run.open(self.from_run)
-        configuration, task = self.configuration(source, algos.Team()), binding.find_task(self.task)
-        options = configuration.options
-        physics = options.physics.resolved(task.physics)
-        with binding.errors_of(task):
-            binding.BoundTask(task, options.nworld, model=options.model, physics=physics, params=configuration.params)
+        chosen, task = self.configuration(source, algos.Team()), binding.find_task(self.task)
+        model, physics = chosen.options.model, chosen.options.physics.resolved(task.physics)
+        binding.BoundTask(task, chosen.options.nworld, model=model, physics=physics, params=chosen.params)
 
     def _run_seeds(self) -> int:
         from lyceum_warp.cli.seeds import train_and_show
