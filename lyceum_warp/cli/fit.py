@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from lyceum_warp.cli.arguments import ParamWords, Physics, given, parameters
-from lyceum_warp.cli.display import note, say
+from lyceum_warp.cli.display import note, say, say_entries
 from lyceum_warp.fitting import Parameter, fit
 
 _Names = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="FIELD.ELEMENTS")]
@@ -67,4 +67,4 @@ class Fit:
             **given(self.physics_options), **parameters(self.param),
         )  # fmt: skip
         say(result.text)
-        say(f"report: {out / 'report.html'}")
+        say_entries(report=out / "report.html", next=f"lyceum-warp train TASK --fitted {out}")

@@ -133,6 +133,8 @@ def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int], dict[str,
 
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         gpus = visible.split(",") if visible else range(torch.cuda.device_count())
+    if jobs > len(cores):
+        cores = []
     for slot in range(jobs):
         share = cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs]
         yield set(share), {"CUDA_VISIBLE_DEVICES": str(gpus[slot % len(gpus)])} if gpus else {}
