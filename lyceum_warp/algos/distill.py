@@ -33,7 +33,6 @@ from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.env import Env, Player
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_group, check_kind
 
@@ -47,7 +46,6 @@ _BOUNDS: dict[str, Bound] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DistillConfig(PictureConfig):
     """Hyperparameters of ``Distill``.
@@ -95,7 +93,6 @@ class DistillConfig(PictureConfig):
             raise ValueError(f"gradient_length={self.gradient_length} must divide num_steps, which is {self.num_steps}")
 
 
-@document_attributes
 class Demonstrations(nn.Module):
     """Saved episodes of a policy or a planner as a teacher.
 
@@ -135,7 +132,6 @@ class Demonstrations(nn.Module):
         return Demonstrations([SimpleNamespace(obs=obs, actions=actions)])
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DistillIteration(SampledIteration):
     """Statistics of one iteration of ``Distill``.
@@ -149,7 +145,6 @@ class DistillIteration(SampledIteration):
     """Seconds for the update."""
 
 
-@document_attributes
 class Distill(Learner):
     """Infinite iterator of ``DistillIteration`` that learns a student policy from a teacher.
 

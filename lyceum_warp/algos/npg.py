@@ -26,7 +26,6 @@ from lyceum_warp.algos.common.value import BOUND, ValueFunction
 from lyceum_warp.algos.common.value_fit import ValueFit
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 
 log = logging.getLogger(__name__)
@@ -55,7 +54,6 @@ when an episode took 16 iterations (bench/README.md, "NPG's learning curves").""
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
     """Hyperparameters of NPG. The defaults follow Rajeswaran et al., 2017, except as noted.
@@ -148,7 +146,6 @@ def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> 
     return round(min(nworld, share * nworld * steps / horizon))
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGIteration(OnPolicyIteration):
     """Statistics of one iteration of NPG.
@@ -181,7 +178,6 @@ class NPGIteration(OnPolicyIteration):
     includes the overlapping time."""
 
 
-@document_attributes
 class NPG(OnPolicyLearner):
     """Infinite iterator of ``NPGIteration`` that learns a policy by NPG.
 

@@ -28,7 +28,6 @@ from lyceum_warp.algos.common.symmetry import apply_symmetry
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.env import Env, Player
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import whole_number
 
@@ -53,7 +52,6 @@ _BOUNDS: dict[str, Bound] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOConfig(PictureConfig):
     """Hyperparameters of PPO. Except for ``desired_kl``, the defaults are mjlab's settings for legged robots.
@@ -166,7 +164,6 @@ def _iterations(name: str, value: Any) -> tuple[int, int]:
     return pair
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
@@ -189,7 +186,6 @@ class PPOIteration(OnPolicyIteration):
     """Seconds for the update."""
 
 
-@document_attributes
 class PPO(OnPolicyLearner):
     """Infinite iterator of ``PPOIteration`` that learns a policy by PPO.
 

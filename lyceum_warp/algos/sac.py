@@ -36,7 +36,6 @@ from lyceum_warp.algos.common.timing import PhaseTimer
 from lyceum_warp.algos.common.twin_critic import TwinCritic, quantile_loss
 from lyceum_warp.algos.common.value import value_group
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_kind
 
@@ -66,7 +65,6 @@ _MANY: dict[str, Any] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACConfig:
     """Hyperparameters of SAC.
@@ -185,7 +183,6 @@ class SACConfig:
         return config
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACIteration(SampledIteration):
     """Statistics of one iteration of SAC.
@@ -210,7 +207,6 @@ class SACIteration(SampledIteration):
     """Seconds for the updates."""
 
 
-@document_attributes
 class SAC(Learner):
     """Infinite iterator of ``SACIteration`` that learns a policy by SAC.
 

@@ -10,11 +10,9 @@ from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.controllers.trajectory import Trajectory, provenance
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
     """Progress of an episode after a step: the argument of ``on_step``."""

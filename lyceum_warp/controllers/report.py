@@ -11,12 +11,10 @@ import numpy as np
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import positive_number
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.

@@ -12,7 +12,6 @@ import torch
 from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.core.done import Done
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.validate import first_sentence
 from lyceum_warp.support.versions import versions
@@ -37,7 +36,6 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
     """One episode of a controlled world, the plant. All tensors are on the CPU.

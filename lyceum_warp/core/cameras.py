@@ -7,7 +7,6 @@ from typing import Any, Literal, get_args
 import mujoco
 import numpy as np
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_kind, check_word, finite_number, whole_number
 
@@ -15,7 +14,6 @@ Kind = Literal["rgb", "depth", "segmentation"]
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """A camera whose pictures are a group of observations, ``env.obs_groups["camera"]``, (nworld, height, width, ...).

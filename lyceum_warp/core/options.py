@@ -13,7 +13,6 @@ import mujoco
 
 from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.model_files import ModelSource
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
 from lyceum_warp.support.validate import (
     check_flag,
@@ -66,7 +65,6 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
     """Options of the simulation. None means the setting of the task or the model.
@@ -144,7 +142,6 @@ class PhysicsOptions:
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
     """Options of an environment: number of worlds, device, engine, start and end of episodes.

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from lyceum_warp.algos import Iteration, Learner, evaluation_seed, transfer
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training.runs.folder import Run
@@ -16,7 +15,6 @@ from lyceum_warp.viz import CameraChoice, NamedProgress, check_video, find_camer
 log = logging.getLogger(__name__)
 
 
-@document_attributes
 class Callback:
     """Base class of callbacks for ``lw.train``. Every method is optional.
 

@@ -7,7 +7,6 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal, TypeAlias
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, check_word, finite_number, layer_sizes, whole_number
 
 Activation: TypeAlias = Literal["tanh", "relu", "leaky_relu", "elu", "selu", "gelu", "silu", "softplus"]
@@ -23,7 +22,6 @@ LEAST = -math.inf
 """Lower bound that admits every finite number."""
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PictureConfig:
     """Hyperparameters of policies that see cameras."""

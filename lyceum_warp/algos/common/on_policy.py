@@ -18,11 +18,9 @@ from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.value import ValueFunction, value_group
 from lyceum_warp.env.env import Env
 from lyceum_warp.kernels import returns
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind
 
 
-@document_attributes
 class OnPolicyLearner(Learner):
     """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout."""
 

@@ -15,14 +15,12 @@ from lyceum_warp.env.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
 from lyceum_warp.support.arrays import torch_view, words
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _Pair: TypeAlias = tuple[Any, wp.array]
 """An array of an environment, and the buffer that stores it for each step."""
 
 
-@document_attributes
 class Rollout:
     """Preallocated buffer that holds the samples from a fixed number of steps in every world.
 

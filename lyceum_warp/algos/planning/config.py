@@ -11,7 +11,6 @@ import torch
 from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.planning.updates import PlanUpdate
 from lyceum_warp.core.spaces import Space
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
 from lyceum_warp.support.validate import check_word
 
@@ -26,7 +25,6 @@ _BOUNDS: dict[str, Bound] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
     """Settings of the planners MPPI, CEM and predictive sampling. Arrays and tensors are converted to tuples of floats.

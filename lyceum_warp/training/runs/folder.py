@@ -15,7 +15,6 @@ from torch import nn
 from lyceum_warp.algos import GaussianPolicy
 from lyceum_warp.binding import file_name, made_in_file
 from lyceum_warp.env import Curriculum
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
@@ -54,7 +53,6 @@ _ENTRIES: dict[str, Any] = {
 log = logging.getLogger(__name__)
 
 
-@document_attributes
 class Run:
     """The folder of a training run."""
 
