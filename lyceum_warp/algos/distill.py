@@ -17,24 +17,19 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
-from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
-from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.minibatches import precision
 from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
-from lyceum_warp.algos.common.pictures import (
-    picture_settings,
-    policy_inputs,
-    shift_pictures,
-)
+from lyceum_warp.algos.common.pictures import policy_inputs, policy_settings, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_sizes
 from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
+from lyceum_warp.algos.common.sampling import SamplingLearner
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.env import Env, Player
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_group, check_kind
+from lyceum_warp.support.validate import check_group
 
 _EPS = 1e-2
 """Constant that is added to the normaliser's standard deviations, as in PPO."""
@@ -145,7 +140,7 @@ class DistillIteration(SampledIteration):
     """Seconds for the update."""
 
 
-class Distill(Learner):
+class Distill(SamplingLearner):
     """Infinite iterator of ``DistillIteration`` that learns a student policy from a teacher.
 
     Example:
@@ -169,7 +164,7 @@ class Distill(Learner):
         FloatingPointError: The loss, or a parameter, is not finite after an iteration.
     """
 
-    sees = True
+    config_type, sees = DistillConfig, True
     algorithm = "distill"
     """The name of the algorithm in a run's config.json."""
     config: DistillConfig
@@ -177,9 +172,6 @@ class Distill(Learner):
     policy: GaussianPolicy
     """The student."""
     teacher: nn.Module
-    generator: torch.Generator
-    rollout: Rollout
-    """The samples of the last iteration."""
     group: str
     """Group of the teacher's observations."""
 
@@ -193,9 +185,8 @@ class Distill(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("config of Distill", config, DistillConfig | None, "as lw.DistillConfig(recurrent=64)")
-        super().__init__(env, seed=seed, team=team)
-        config, team, device = config or DistillConfig(), self.team, env.obs.device
+        super().__init__(env, config, seed=seed, team=team)
+        config, team, device = self.config, self.team, env.obs.device
         self._clones = isinstance(teacher, Demonstrations)
         if not (self._clones or all(hasattr(teacher, name) for name in ("act", "nobs", "nact"))):
             raise ValueError(f"teacher must be a policy with act, nobs and nact, or lw.Demonstrations, not {teacher!r}")
@@ -213,15 +204,11 @@ class Distill(Learner):
         )  # fmt: skip
         if policy is None:
             initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
-        shape = self.policy.shape
-        fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
-        seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
-        fitted |= seen | ({} if "own" in shape else {"recurrent": shape.get("recurrent", 0)})
         if self._clones and self.policy.pictures:
             raise ValueError(
                 "demonstrations hold no pictures: use policy_groups=('policy',), or a policy as the teacher"
             )
-        self.config = config = dataclasses.replace(config, **fitted)
+        self.config = config = dataclasses.replace(config, **policy_settings(self.policy))
         self.teacher = teacher
         self.policy.to(device)
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
@@ -245,7 +232,6 @@ class Distill(Learner):
         self._epoch = Captured(self.learn, team, device)
         self._act = Captured(self._choose, team, device)
         self._observe = Captured(lambda: self.policy.observe(env.obs, team, eps=_EPS), team, device)
-        self._evaluate_mean = MeanPolicyEvaluation(env, config, team)
         self.rollout.restart()
         players = [self._player]
         if isinstance(teacher, Demonstrations):
@@ -272,7 +258,7 @@ class Distill(Learner):
             else:
                 self.sample()
                 self.env.update_shared(team.sum)
-            timer.mark()
+            timer.mark("sample")
 
             # 2. Run the epochs.
             self.update()
@@ -281,26 +267,13 @@ class Distill(Learner):
         finite = torch.stack([x.isfinite().all() for x in (self._loss, *self.policy.parameters())]).all()
         loss = self._loss[0] * config.gradient_length / (config.epochs * config.num_steps)
         statistics, (update, *_) = gathered(rollout, team, {"finite": finite, "loss": loss})
-        timer.mark()
-        if not update.pop("finite"):
-            raise FloatingPointError(
-                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the observations, "
-                f"smaller ({rollout.extremes()})"
-            )
+        timer.mark("update")
+        self._check_finite(update, "observations")
         if self._clones:
             statistics = {"faults": 0}
 
         # 3. Evaluate the student without noise.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_update, time_mean = timer.seconds()
-        return DistillIteration(
-            iteration=self.iteration, samples=self.samples, **statistics, **update, time_sample=time_sample,
-            time_update=time_update, time_mean=time_mean, samples_per_second=self.count / (time_sample + time_update),
-        )  # fmt: skip
+        return self._finished(DistillIteration, timer, statistics | update, rate_of=("sample", "update"))
 
     @torch.no_grad()
     def sample(self) -> None:
@@ -308,18 +281,11 @@ class Distill(Learner):
 
         After each step, the normaliser is updated with the step's observations.
         """
-        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.policy.observe_pictures(self.env.obs_groups, team)
+            self.policy.observe_pictures(self.env.obs_groups, self.team)
             self._state.copy_(self._player.state)
-            rollout.begin()
-            for _ in range(rollout.steps):
-                self._act()
-                rollout.store_inputs()
-                self.env.step()
-                rollout.store_outputs()
-                self._observe()
+            self.rollout.fill(self._act, self._observe)
 
     @torch.no_grad()
     def _choose(self) -> None:
@@ -374,7 +340,6 @@ class Distill(Learner):
         """Copy the complete state; see ``Learner``."""
         state = {
             "optimizer": self._step.optimizer.state_dict(),
-            "returns": self.team.gather(self.rollout.running_return),
             "memory": [self.team.gather(player.state) for player in self._remembering],
         }
         return super().state_dict() | copy.deepcopy(state)
@@ -384,6 +349,5 @@ class Distill(Learner):
         super().load_state_dict(state)
         self._step.optimizer.load_state_dict(state["optimizer"])
         self._epoch.forget()  # the graph contains the learning rate
-        self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for player, memory in zip(self._remembering, state["memory"], strict=True):
             player.state.copy_(memory[self.own_worlds])

@@ -265,7 +265,7 @@ class NPG(OnPolicyLearner):
         elif self._least_restarts:
             rollout.restart_some(self._least_restarts, self.generator, team)
         self.sample()
-        timer.mark()
+        timer.mark("sample")
 
         # 2. Update the policy's normaliser.
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
@@ -278,7 +278,7 @@ class NPG(OnPolicyLearner):
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
         gradient = team.sum(score_gradient(self._dense, obs, action, weight))
-        timer.mark()
+        timer.mark("gradient")
 
         # 5. Compute the natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
@@ -291,7 +291,7 @@ class NPG(OnPolicyLearner):
             direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
             step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
             finite, fraction, kl = self.move(step, obs, old_mean)
-            timer.mark()
+            timer.mark("solve")
             fitted = fit_result()
 
         # copy all numbers to the host at once
@@ -304,26 +304,10 @@ class NPG(OnPolicyLearner):
         statistics |= {name: processes[0][name] for name in update} | value_statistics(processes, len(obs))
         statistics["outliers"] = round(sum(process["outliers"] for process in processes))
         statistics["skipped_updates"] = self._check_updates(processes[0])
-        timer.mark()
+        timer.mark("value")
 
         # 7. Evaluate the mean policy.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
-        return NPGIteration(
-            iteration=self.iteration,
-            samples=self.samples,
-            **statistics,
-            time_sample=time_sample,
-            time_gradient=time_gradient,
-            time_solve=time_solve,
-            time_value=time_value,
-            time_mean=time_mean,
-            samples_per_second=self.count / time_sample,
-        )
+        return self._finished(NPGIteration, timer, statistics, rate_of=("sample",))
 
     def _check_updates(self, update: Mapping[str, float]) -> int:
         parts = {"the step of the policy": update["finite"], "the fit of the value function": update["fitted"]}

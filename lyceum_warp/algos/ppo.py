@@ -308,7 +308,7 @@ class PPO(OnPolicyLearner):
 
             # 2. Compute values and advantages.
             samples = self.evaluated_samples()
-            timer.mark()
+            timer.mark("sample")
 
             # 3. Run the epochs.
             self.update(samples)
@@ -322,31 +322,12 @@ class PPO(OnPolicyLearner):
             "learning_rate": self.rate, "value_loss": losses[0], "surrogate_loss": losses[1], "entropy": losses[2],
         })  # fmt: skip
         self._recent.extend(self._returns()[-RECENT:])
-        timer.mark()
-        if not update.pop("finite"):
-            raise FloatingPointError(
-                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards and "
-                f"observations, smaller ({rollout.extremes()})"
-            )
+        update["return_recent"] = sum(self._recent) / len(self._recent) if self._recent else math.nan
+        timer.mark("update")
+        self._check_finite(update)
 
         # 4. Evaluate the mean policy.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_update, time_mean = timer.seconds()
-        return PPOIteration(
-            iteration=self.iteration,
-            samples=self.samples,
-            **statistics,
-            **update,
-            return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
-            time_sample=time_sample,
-            time_update=time_update,
-            time_mean=time_mean,
-            samples_per_second=self.count / time_sample,
-        )
+        return self._finished(PPOIteration, timer, statistics | update, rate_of=("sample",))
 
     @torch.no_grad()
     def sample(self) -> None:
@@ -354,18 +335,11 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.policy.observe_pictures(self.env.obs_groups, team)
-            rollout.begin()
+            self.policy.observe_pictures(self.env.obs_groups, self.team)
             self._first.copy_(self._player.state)
-            for _ in range(rollout.steps):
-                self._act()
-                rollout.store_inputs()
-                self.env.step()
-                rollout.store_outputs()
-                self._observe()
+            self.rollout.fill(self._act, self._observe)
 
     @torch.no_grad()
     def _choose(self) -> None:

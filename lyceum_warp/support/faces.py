@@ -41,7 +41,7 @@ def _document(modules: Iterable[str]) -> None:
     """Let ``help()`` list the attributes of the modules' classes, also of those that no public name refers to."""
     for name in modules:
         _documented.add(name)
-        for value in vars(sys.modules[name]).values():
+        for value in list(vars(sys.modules[name]).values()):
             if isinstance(value, type) and value.__module__ == name:
                 document_attributes(value)
 
