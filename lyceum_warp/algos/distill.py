@@ -17,7 +17,7 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
-from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, PICTURE_RULES, Activation, PictureConfig
 from lyceum_warp.algos.common.minibatches import precision
 from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
 from lyceum_warp.algos.common.pictures import policy_inputs, policy_settings, shift_pictures
@@ -29,14 +29,15 @@ from lyceum_warp.algos.common.sampling import SamplingLearner
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.env import Env, Player
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_group
+from lyceum_warp.support.validate import Rule, check_fields, check_group
 
 _EPS = 1e-2
 """Constant that is added to the normaliser's standard deviations, as in PPO."""
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "epochs": 1, "gradient_length": 1, "learning_rate": 0.0, "max_grad_norm": 0.0,
-    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1, **PICTURE_BOUNDS,
+    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1, "teacher_group": GROUP,
+    **PICTURE_RULES,
 }  # fmt: skip
 
 
@@ -83,7 +84,7 @@ class DistillConfig(PictureConfig):
     """Number of episodes in an evaluation of the student."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.num_steps % self.gradient_length:
             raise ValueError(f"gradient_length={self.gradient_length} must divide num_steps, which is {self.num_steps}")
 

@@ -16,7 +16,7 @@ import torch
 
 from lyceum_warp.algos.common.dense import dense_policy, predict
 from lyceum_warp.algos.common.distributed import Team, unflatten
-from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, LEAST, Activation
 from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence
@@ -27,6 +27,7 @@ from lyceum_warp.algos.common.value_fit import ValueFit
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.suggestions import suggest_arguments
+from lyceum_warp.support.validate import Rule, check_fields
 
 log = logging.getLogger(__name__)
 
@@ -40,11 +41,11 @@ _DRIFT = 0.2
 """Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
 
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
     "mean_episodes": 1, "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": 0.0, "damping": 0.0,
     "fisher_fraction": (0.0, 1.0), "kl_limit": 1.0, "log_std": LEAST, "min_log_std": LEAST, "value_rate": 0.0,
-    "min_restarts": 0.0,
+    "min_restarts": 0.0, "value_group": GROUP,
 }  # fmt: skip
 
 _LONG_EPISODE = 20
@@ -124,7 +125,7 @@ class NPGConfig:
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:

@@ -17,7 +17,7 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
-from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, PICTURE_RULES, Activation, PictureConfig
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
@@ -29,7 +29,7 @@ from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.env import Env, Player
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import Rule, check_fields, whole_number
 
 log = logging.getLogger(__name__)
 
@@ -43,11 +43,11 @@ _SMALLEST_STD = 1e-6
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 """Limits of the adaptive learning rate, and the factor by which the rate changes."""
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0, "state_coef": 0.0, **PICTURE_BOUNDS,
+    "recurrent": 0, "state_coef": 0.0, "value_group": GROUP, **PICTURE_RULES,
 }  # fmt: skip
 
 
@@ -141,7 +141,7 @@ class PPOConfig(PictureConfig):
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:

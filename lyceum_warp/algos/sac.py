@@ -21,7 +21,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
-from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, LEAST, Activation
 from lyceum_warp.algos.common.minibatches import precision, room
 from lyceum_warp.algos.common.networks import trainable
 from lyceum_warp.algos.common.policy_check import check_sizes
@@ -36,16 +36,17 @@ from lyceum_warp.algos.common.twin_critic import TwinCritic, quantile_loss
 from lyceum_warp.algos.common.value import value_group
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_kind
+from lyceum_warp.support.validate import Rule, check_fields, check_kind
 
 _EPS = 1e-2
 """Constant that is added to the normalisers' standard deviations."""
 
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "quantiles": 1,
     "dropped_quantiles": 0, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0),
     "learning_rate": 0.0, "temperature": 1e-6, "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
+    "value_group": GROUP,
 }  # fmt: skip
 
 MANY_WORLDS = 256
@@ -155,7 +156,7 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.dropped_quantiles >= self.quantiles > 1:
             raise ValueError(
                 f"dropped_quantiles={self.dropped_quantiles} must be less than quantiles, which is {self.quantiles}"
