@@ -8,6 +8,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from lyceum_warp.support.settings import temporarily
+
 Result = TypeVar("Result")
 
 
@@ -45,18 +47,12 @@ class PhaseTimer:
         return seconds
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread() -> contextlib.AbstractContextManager[None]:
     """Limit torch to one CPU thread, for operations too small to parallelise.
 
     On a busy machine, torch's threads would spend more time waiting for each other than computing.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    return temporarily(torch.set_num_threads, 1, torch.get_num_threads())
 
 
 @contextlib.contextmanager
