@@ -25,7 +25,7 @@ from lyceum_warp.core import (
     read_spec,
 )
 from lyceum_warp.models import Legs
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 
 _SOURCES: dict[str, Callable[[str], ModelFile]] = {
     "menagerie": menagerie_model,
@@ -96,8 +96,7 @@ class New:
                 text = (tracking_text if tracks else velocity_text)(legs, **names)
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
-        with replaced(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        replace_text(path, text)
         task = find_task(path)
         if self.template == "plain":
             step_ms = 1000 * task.frame_skip * model.opt.timestep

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.support.validate import positive_number
 
 
@@ -113,8 +113,7 @@ class ControlReport:
         """Write the report as JSON, atomically, and return the file's path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(path) as temporary:
-            temporary.write_text(self.to_json() + "\n")
+        replace_text(path, self.to_json() + "\n")
         return path
 
     def rows(self) -> list[tuple[str, str]]:
