@@ -15,7 +15,7 @@ from typing import Any
 
 from docutils import nodes
 from jupyter_client.manager import KernelManager
-from sphinx.addnodes import pending_xref
+from sphinx.addnodes import desc, desc_content, pending_xref
 
 sys.path.insert(0, str(Path(__file__).parent))
 import gallery
@@ -53,6 +53,8 @@ KernelManager.transport_encryption.default_value = "auto"  # with any other valu
 add_module_names, python_use_unqualified_type_names, python_maximum_signature_line_length = True, True, 100
 autodoc_member_order, autodoc_typehints = "bysource", "description"
 autodoc_typehints_description_target = "documented"
+
+MANY_MEMBERS = 8
 
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
@@ -112,6 +114,16 @@ def link_names(app: Any, doctree: nodes.document) -> None:
             link += literal
 
 
+def fold_members(app: Any, doctree: nodes.document, docname: str) -> None:
+    """Fold the members of classes that have many. site.js unfolds those of a link's target."""
+    for content in list(doctree.findall(desc_content)):
+        members = [child for child in content if isinstance(child, desc)]
+        if len(members) >= MANY_MEMBERS:
+            fold = f'<details class="members"><summary>{len(members)} members</summary>'
+            content.insert(content.index(members[0]), nodes.raw("", fold, format="html"))
+            content.insert(content.index(members[-1]) + 1, nodes.raw("", "</details>", format="html"))
+
+
 def load_late(app: Any, doctree: nodes.document) -> None:
     """Let pictures load when they are near, and animations stand still until site.js replaces the still picture."""
     up = "../" * (app.env.docname.count("/") - 1)
@@ -152,5 +164,6 @@ def setup(app: Any) -> None:
     app.connect("autodoc-process-signature", reference.short_signature)
     app.connect("doctree-read", link_names)
     app.connect("doctree-read", load_late)
+    app.connect("doctree-resolved", fold_members)
     app.connect("html-page-context", describe)
     app.connect("build-finished", write_files)

@@ -5,6 +5,7 @@ tests/test_docs.py checks that every public name and every task appears exactly 
 
 import dataclasses
 import inspect
+import json
 import re
 import sys
 import types
@@ -36,6 +37,9 @@ ALIASES = {
 TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.vec3", "vec4f": "lw.quat",
          "mat33f": "wp.mat33", "spatial_vectorf": "wp.spatial_vector", "Any": "Any"}  # fmt: skip
 """Maps Warp's name of a type to its name in task files."""
+
+OBSERVATIONS = json.loads((DOCS / "observations.json").read_text())
+"""For each task and group of observations, the joint and the unit of indices; see observations.py."""
 
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
@@ -167,9 +171,7 @@ def task_section(name: str) -> str:
         lines += [f"![{name}](../{picture})", ""]
     lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
-        title = "observation" if group == "policy" else f"`{group}` observation"
-        parts = zip(indices(list(layout.values())), (f"`{part}`" for part in layout), strict=True)
-        lines += table(("index", f"{title}, {count(sum(layout.values()), 'number')}"), list(parts))
+        lines += observations(group, layout, OBSERVATIONS.get(name, {}).get(group, {}))
     lines += actions(task)
     lines += metrics(task)
     rows = parameters(task)
@@ -182,6 +184,23 @@ def task_section(name: str) -> str:
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
     return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def observations(group: str, layout: dict[str, int], sources: dict[str, list[str]]) -> list[str]:
+    """Return a table of a group's observations. A part has one row, or a row per number if joints are known."""
+    title = "observation" if group == "policy" else f"`{group}` observation"
+    rows: list[tuple[str, ...]] = []
+    end = 0
+    for part, size in layout.items():
+        end, start = end + size, end
+        if any(str(i) in sources for i in range(start, end)):
+            rows += [(f"{i}", f"`{part}`", *sources.get(str(i), ("", ""))) for i in range(start, end)]
+        else:
+            rows.append((f"{start} to {end - 1}" if size > 1 else f"{start}", f"`{part}`", "", ""))
+    head = f"{title}, {count(end, 'number')}"
+    lines = table(("index", head, "joint", "unit"), rows) if sources else table(
+        ("index", head), [row[:2] for row in rows])  # fmt: skip
+    return lines if len(rows) <= 12 else folded(head, lines)
 
 
 def frame(name: str, up: str) -> str:
@@ -272,7 +291,9 @@ def parameters(task: BoundTask) -> list[tuple[Any, ...]]:
         if name in ("dt", "substep_dt"):
             continue
         default = getattr(task.source.defaults, name)
-        meaning = meanings.get(name, "").replace("|", "\\|").replace("*", "\\*")
+        first = default[0] if isinstance(default, list) and default else default
+        index = f"index in `{first.field}`" if isinstance(first, Element) else ""
+        meaning = meanings.get(name, index).replace("|", "\\|").replace("*", "\\*")
         rows.append((f"`{name}`", spelled(default, task.parameters.values[name]), meaning))
     return rows
 

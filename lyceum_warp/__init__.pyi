@@ -155,6 +155,7 @@ from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
 from lyceum_warp.training.weights_and_biases import WandB as WandB
 from lyceum_warp.tuning.search import Tuning as Tuning, tune as tune
 from lyceum_warp.viewer.show import view as view
+from lyceum_warp.viz.page import show as show
 
 from . import terms as terms
 from .models import walkers as walkers

@@ -93,6 +93,8 @@ class Bench:
         self.given: Frame | None = None
         self.models: list[mujoco.MjModel] = []
         self.send, self.offer = self.sent.append, lambda file: None
+        self.told: list[str] = []
+        self.tell, self.inputs = self.told.append, 0
         self.panel = Panel(scene, model, self, self, self)
         here, _ = launch_thread.make_thread_endpoints()
         config = viewer_protocol.ViewerConfig()

@@ -223,10 +223,25 @@ def test_task_pages_have_every_task_of_the_package_once() -> None:
     assert sorted(generated("tasks", "tasks")) == sorted(package_task_names())
 
 
-def test_notebooks_are_stored_without_output() -> None:
+def test_notebooks_install_the_package_and_are_stored_with_outputs() -> None:
     for path in sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
         cells = [cell for cell in json.loads(path.read_text())["cells"] if cell["cell_type"] == "code"]
-        assert cells and not any(cell["outputs"] or cell["execution_count"] for cell in cells), path.name
+        run = [cell for cell in cells if "skip-execution" not in cell["metadata"].get("tags", ())]
+        assert "".join(cells[0]["source"]).startswith("%pip install") and cells[0] not in run, path.name
+        assert [cell["execution_count"] for cell in run] == list(range(1, len(run) + 1)), f"run {path.name} again"
+        outputs = [output for cell in run for output in cell["outputs"]]
+        assert not any(output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs)
+        kinds = {kind for output in outputs for kind in output.get("data", ())}
+        assert kinds & {"image/png", "image/gif", "text/html"}, f"{path.name} shows nothing"
+
+
+def test_joints_and_units_of_observations_are_up_to_date() -> None:
+    observations = runpy.run_path(str(ROOT / "docs" / "observations.py"))
+    stored = json.loads(observations["FILE"].read_text())
+    assert set(stored) == set(package_task_names())
+    for name in ("hopper", "reacher", "go1_velocity"):
+        assert observations["sources"](name) == stored[name], f"run docs/observations.py {name}"
+    assert stored["hopper"]["policy"]["0"] == ["rootz", "m"] and stored["reacher"]["policy"]["2"] == ["joint0", ""]
 
 
 def test_table_of_terms_is_up_to_date() -> None:

@@ -33,3 +33,12 @@ for (const frame of document.querySelectorAll("iframe")) {
   frame.addEventListener("load", () => prepare(frame));
   if (frame.contentDocument?.readyState === "complete") prepare(frame);
 }
+
+// Folds around a link's target open.
+const unfold = () => {
+  const target = document.getElementById(decodeURIComponent(location.hash.slice(1)));
+  for (let fold = target?.closest("details"); fold; fold = fold.parentElement.closest("details")) fold.open = true;
+  target?.scrollIntoView();
+};
+addEventListener("hashchange", unfold);
+if (location.hash) unfold();

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from lyceum_warp.algos import Iteration, Learner, simulation
-from lyceum_warp.cli.display import COUNTED, counted, known_values, say
+from lyceum_warp.cli.display import COUNTED, counted, known_values, say, table
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Callback, Run
 
@@ -28,8 +28,8 @@ class _Bar(Progress):
 class Display(Callback):
     """Shows the progress of training: a live bar on a terminal, otherwise one line per iteration."""
 
-    def __init__(self, console: Console) -> None:
-        self.console = console
+    def __init__(self, console: Console, *, verbose: bool = False) -> None:
+        self.console, self.verbose = console, verbose
         self.total = 0
         self.mean = math.nan
         self.long_work: LongWork | None = None
@@ -86,6 +86,14 @@ class Display(Callback):
         else:
             self.console.print(f"iteration {it.iteration:4d}/{self.total}  {text}", soft_wrap=True)
             sys.stdout.flush()
+        if self.verbose and it.mean_return is not None:
+            # no episode may have ended yet
+            what, values = (
+                ("sum of an episode", sums) if (sums := known_values(it.metrics)) else ("mean", it.step_metrics)
+            )
+            if values:
+                cells = [f"{value:.4g}" for value in values.values()]
+                self.console.print(table({f"iteration {it.iteration}": [*values], what: cells}))
 
     def work(self, text: str, unit: str, done: int, total: int) -> None:
         """Show the progress of work between two iterations, such as rendering a video."""

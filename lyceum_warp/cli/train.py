@@ -210,6 +210,9 @@ class Train:
     evaluate: bool = False
     """Whether to evaluate the last and the best policy in 32 new episodes at the end, under exact physics on the C
     engine. --video and --require-return do so, too."""
+    verbose: bool = False
+    """Whether to print the terms of the reward and the other metrics, as in metrics.csv, whenever the mean policy is
+    evaluated."""
     plot: bool = True
     """Whether to plot the learning curve at the end."""
     require_return: float | None = None
@@ -241,7 +244,7 @@ class Train:
         if len(seeds) == 1:
             seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
         folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
-        settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on"))
+        settings = settings_of(self, omit=("task", "seeds", "jobs", "out", "go_on", "verbose"))
         return train_and_show(self.task, folder, seeds, self.jobs, settings)
 
     def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:
@@ -331,7 +334,7 @@ class Train:
     def _callbacks(self, settings: Mapping[str, Any]) -> "list[training.Callback]":
         from lyceum_warp.cli.progress import Display  # its base class comes with torch
 
-        display = Display(console)
+        display = Display(console, verbose=self.verbose)
         callbacks: list[training.Callback] = [display]
         if settings["target_return"] is not None:
             callbacks.insert(0, training.TargetReturn(settings["target_return"]))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Concatenate, Literal, NamedTuple, ParamSp
 
 import numpy as np
 
-from lyceum_warp.viewer.protocol import Ghosts, Mode, Velocity
+from lyceum_warp.viewer.protocol import Ghosts, Mode, Owner, Velocity
 
 if TYPE_CHECKING:
     from lyceum_warp.viewer.session.stage import Stage
@@ -143,9 +143,15 @@ def drive(stage: Stage, velocity: Velocity | None) -> None:
     stage.driving.apply(stage.live)
 
 
-def set_number(stage: Stage, owner: Literal["planner", "task"], name: str, value: float) -> None:
-    """Change a setting of the planner in use, or a parameter of the task."""
+def set_number(stage: Stage, owner: Owner, name: str, value: float) -> None:
+    """Change a setting of the planner in use, a parameter of the task, or a model field of the displayed world."""
     stage.set_number(owner, name, value)
+
+
+def set_watched(stage: Stage, watched: bool) -> None:
+    """Stop all worlds while no page is visible. A video in progress goes on."""
+    stage.watched = watched
+    stage.progress.clear()
 
 
 def set_video(stage: Stage, camera: dict[str, Any] | None) -> None:

@@ -10,6 +10,9 @@ import numpy as np
 
 Mode: TypeAlias = Literal["passive", "controller", "playback"]
 
+Owner: TypeAlias = Literal["planner", "task", "physics"]
+"""The owner of a number that the user can change."""
+
 Velocity: TypeAlias = tuple[float, float, float]
 """Forward velocity (m/s), lateral velocity (m/s) and yaw rate (rad/s)."""
 
@@ -54,6 +57,8 @@ class Ghost:
     """Red, green, blue and opacity, from 0 to 1, or None for the model's own colours."""
     shift: tuple[float, float] = (0.0, 0.0)
     """Shift in x and y, in metres."""
+    what: str = ""
+    """The ghost's line in the legend. Ghosts that the user need not tell apart have one line."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +69,8 @@ class Arrow:
     """(3,), in metres."""
     end: np.ndarray
     colour: tuple[float, float, float, float]
+    what: str = ""
+    """The arrow's line in the legend."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +115,8 @@ class Status:
     """Whether the command comes from the user instead of the task."""
     planner: tuple[tuple[str, float], ...] = ()
     params: tuple[tuple[str, float], ...] = ()
+    physics: tuple[tuple[str, float], ...] = ()
+    """Model fields of the displayed world, as multiples of the nominal model's."""
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
@@ -130,6 +139,8 @@ class Frame:
     points: np.ndarray | None = None
     """The points of all curves, (points, 2 + curves): the simulated time in seconds, whether an episode ended (0 or 1),
     and a value for each curve."""
+    predicted: np.ndarray | None = None
+    """The rewards that the plan predicts, (horizon + 1, 2): simulated seconds from now on, and rewards."""
     messages: tuple[str, ...] = ()
     """Messages about ended episodes, faults and refused commands."""
     files: tuple[str, ...] = ()

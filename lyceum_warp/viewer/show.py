@@ -31,10 +31,10 @@ def view(
     controller, all actions are 0. With the panel and its keys, the user chooses the mode, the world, the speed, ghosts
     and the camera.
 
-    The viewer steps the worlds of ``env``, and leaves them in their last state. A policy acts in all worlds. Any other
-    controller acts in a single world, a copy of the displayed world. The copy runs in real time, as in
-    ``lw.control_async``, and all other worlds wait. Afterwards, the displayed world gets the copy's state. If ``env``
-    is one world on the CPU without automatic resets, it is not copied.
+    The viewer steps the worlds of ``env`` while its page is visible, and leaves them in their last state. A policy acts
+    in all worlds. Any other controller acts in a single world, a copy of the displayed world. The copy runs in real
+    time, as in ``lw.control_async``, and all other worlds wait. Afterwards, the displayed world gets the copy's state.
+    If ``env`` is one world on the CPU without automatic resets, it is not copied.
 
     Args:
         env: The worlds, on any engine and device.

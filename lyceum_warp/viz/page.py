@@ -7,6 +7,7 @@ in ``page.html`` draws them with WebGL. The floor's squares are the only texture
 import base64
 import html
 import json
+import tempfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -46,6 +47,43 @@ def write_page(env: Env, states: torch.Tensor, out: str | Path, *, camera: Camer
     rows = states[::stride, : env.engine.integration_size].double().cpu().numpy()
     view = camera_values(env.model, camera)
     return write_states(env.model, rows, out, dt=stride * env.timestep, title=env.task.name, camera=view)
+
+
+class ShownPage:
+    """A page of ``write_page`` as the output of a notebook's cell, in any browser and without a server.
+
+    Args:
+        content: The page's HTML.
+        height: The height of the output, in pixels.
+    """
+
+    def __init__(self, content: str, height: int) -> None:
+        self.content, self.height = content, height
+
+    def _repr_html_(self) -> str:
+        style = f"width: 100%; height: {self.height}px; border: 0"
+        return f'<iframe srcdoc="{html.escape(self.content)}" style="{style}" loading="lazy"></iframe>'
+
+
+def show(env: Env, states: torch.Tensor, *, camera: CameraChoice = None, height: int = 360) -> ShownPage:
+    """Show states of one world in a notebook. Drag the robot to turn the view.
+
+    ``lw.view`` shows running worlds instead, but only while the notebook's kernel runs.
+
+    Args:
+        env: The environment of the states.
+        states: The states of one world, one row per step, (steps, state_space.size), such as a trajectory's.
+        camera: The initial camera, as in ``write_video``.
+        height: The height of the output, in pixels.
+
+    Returns:
+        The output of the cell.
+
+    Raises:
+        ValueError: The states do not have the environment's shape, or the model has no such camera.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        return ShownPage(write_page(env, states, Path(folder, "page.html"), camera=camera).read_text(), height)
 
 
 def write_states(

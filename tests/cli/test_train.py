@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 import signal
 from pathlib import Path
@@ -302,6 +303,20 @@ def test_run_resumed_after_every_iteration_equals_an_uninterrupted_run(flags: li
     one, other = (torch.load(tmp_path / name / "checkpoint.pt")["state"] for name in ("parts", "whole"))
     for part in ("env", "policy", "value", "generator"):
         torch.testing.assert_close(one[part], other[part], rtol=0.0, atol=0.0)
+
+
+def test_verbose_prints_the_metrics_whenever_the_mean_policy_is_evaluated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = str(Path(__file__).parents[1] / "metered_task.py")
+    flags = ["--algorithm", "ppo", "--nworld", "4", "--num-steps", "8", "--minibatches", "2", "--hidden", "8"]
+    flags += ["--value-hidden", "8", "--horizon", "6", "--mean-every", "2", "--mean-episodes", "2", "--iterations", "2"]
+    assert cli.main(["train", task, "--out", str(tmp_path / "run"), "--verbose", *flags, *QUIET]) == 0
+    (row,) = metrics(tmp_path / "run")[1:]
+    text = capsys.readouterr().out
+    assert "iteration 1 " not in text.replace("iteration    1", "")
+    for name in ("forward", "effort"):
+        assert re.search(rf"\b{name} +{re.escape(format(float(row[f'metrics/{name}']), '.4g'))}\b", text)
 
 
 def test_second_interrupt_ends_a_run_immediately(

@@ -1,5 +1,7 @@
 """Compare the LEAP hand's tasks with MuJoCo Playground's formulas, computed anew from MuJoCo's own quantities."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -8,6 +10,8 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.hands.leap import LeapReorient
+from lyceum_warp.testing import check_task
+from lyceum_warp.testing.fault_rules import check_bad_state
 
 QUIET = {
     "joint_position_noise": 0.0, "object_position_noise": 0.0, "object_rotation_noise": 0.0, "goal_angle": [0.1, 0.1],
@@ -125,7 +129,7 @@ def test_goal_turns_after_a_success_and_then_comes_to_rest(shared_env: SharedEnv
     for _ in range(12):
         goals.append(step())
         assert env.metrics["success"].item() == 0.0
-    steps = np.array([angle(b, a) for a, b in zip(goals, goals[1:], strict=False)])
+    steps = np.array([angle(b, a) for a, b in itertools.pairwise(goals)])
     assert np.isclose(0.1 * np.linalg.norm(spin), steps[0], rtol=1e-3)
     assert np.allclose(steps[1:] / steps[:-1], 0.8, atol=0.01)
 
@@ -172,3 +176,7 @@ def test_hand_holds_other_objects(shared_env: SharedEnv) -> None:
     for _ in range(10):
         env.step(torch.zeros_like(env.action))
     assert not env.terminated.any() and sum(env.fault_counts.values()) == 0
+
+
+def test_world_recovers_from_nan_among_many_contacts() -> None:
+    check_task("leap_rotate", engine="warp", steps=50, checks=(check_bad_state,))

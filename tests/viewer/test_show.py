@@ -8,6 +8,7 @@ import pytest
 import torch
 from conftest import SharedEnv
 from training_runs import train
+from websockets.sync.client import connect
 
 import lyceum_warp as lw
 from lyceum_warp.training import Run
@@ -23,9 +24,12 @@ def test_show_displays_the_page_and_a_link_in_a_notebook_while_the_worlds_run(
     env = shared_env("point_mass", nworld=2)
     shown = lw.view(env, seed=0)
     assert shown is not None
-    end = time.monotonic() + 60
-    while env.episode_step[0] == 0 and time.monotonic() < end:
-        time.sleep(0.01)
+    address = shown.address.replace("http", "ws", 1)
+    with connect(f"{address}state?sid=a"), connect(f"{address}ui?sid=a") as page:
+        page.send(b"x")  # the worlds run while a page is visible; a whole handshake would need its version
+        end = time.monotonic() + 60
+        while env.episode_step[0] == 0 and time.monotonic() < end:
+            time.sleep(0.01)
     assert shown.is_open and env.episode_step[0] > 0
     link = r'<a id="([\w-]+)" href="http://127\.0\.0\.1:\d+/[\w-]{43}/" target="_blank">.*getElementById\("\1"\)'
     assert re.search(link, shown._repr_html_(), re.DOTALL) and 'createElement("iframe")' in shown._repr_html_()

@@ -1,4 +1,5 @@
 import base64
+import html
 import json
 import re
 import zlib
@@ -11,6 +12,7 @@ import pytest
 from conftest import SharedEnv
 from headless_screen import state_of
 
+import lyceum_warp as lw
 from lyceum_warp.viz import write_states
 from lyceum_warp.viz.cameras import camera_values
 from lyceum_warp.viz.page import write_page
@@ -73,3 +75,14 @@ def test_surfaces_have_the_sizes_of_their_geoms(tmp_path: Path) -> None:
         normals = corners["f1"][:, :3] / 127
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=0.02)
         assert ((normals * corners["f0"]).sum(1) > 0).all() and (corners["f2"] == [255, 0, 0, 255]).all()
+
+
+def test_show_embeds_the_page_of_an_episode(shared_env: SharedEnv, tmp_path: Path) -> None:
+    env = shared_env("point_mass")
+    states = env.get_state()[:1].repeat(3, 1)
+    shown = lw.show(env, states, height=200)._repr_html_()
+    frame = re.fullmatch(r'<iframe srcdoc="([^"]*)" style=".* height: 200px; .*"></iframe>', shown, re.DOTALL)
+    assert frame is not None
+    assert html.unescape(frame[1]) == write_page(env, states, tmp_path / "page.html").read_text()
+    with pytest.raises(ValueError, match="states"):
+        lw.show(env, states[:, :-1])

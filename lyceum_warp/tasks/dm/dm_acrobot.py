@@ -61,11 +61,11 @@ class Params:
     balance_margin: float = 0.3  # s; the effort of the largest torque, applied for 0.3 s
     tip: int = lw.site("tip")
     target: int = lw.site("target")
-    target_size: float = lw.from_model(lambda model, p: model.site_size[p.target, 0])
-    lengths: wp.vec2 = lw.from_model(lengths)
-    inertia: wp.vec3 = lw.from_model(inertia)
-    lift: wp.vec2 = lw.from_model(lift)
-    balance_effort: wp.mat44 = lw.from_model(balance_effort)
+    target_size: float = lw.from_model(lambda model, p: model.site_size[p.target, 0])  # radius, m
+    lengths: wp.vec2 = lw.from_model(lengths)  # of the links, m
+    inertia: wp.vec3 = lw.from_model(inertia)  # a, b and c of the mass matrix, kg m^2
+    lift: wp.vec2 = lw.from_model(lift)  # e1 and e2 of the potential energy, J
+    balance_effort: wp.mat44 = lw.from_model(balance_effort)  # P of the effort x^T P x, s
 
 
 @wp.func

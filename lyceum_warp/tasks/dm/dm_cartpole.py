@@ -15,8 +15,8 @@ class World:
 
 @wp.struct
 class Params:
-    swing_up: bool = False
-    sparse: bool = False
+    swing_up: bool = False  # whether the pole starts hanging
+    sparse: bool = False  # whether only upright states near the centre are rewarded
 
 
 @wp.func

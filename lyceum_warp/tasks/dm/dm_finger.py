@@ -89,9 +89,9 @@ class TurnWorld(World):
 @wp.struct
 class TurnParams(Params):
     target: int = lw.mocap("target")
-    target_size: float = lw.from_model(lambda model, p: model.site("target").size[0])
-    hinge: wp.vec3 = lw.from_model(lambda model, p: model.body_pos[p.spinner])
-    radius: float = lw.from_model(lambda model, p: model.geom("cap1").size.sum())
+    target_size: float = lw.from_model(lambda model, p: model.site("target").size[0])  # radius, m
+    hinge: wp.vec3 = lw.from_model(lambda model, p: model.body_pos[p.spinner])  # position of the spinner's hinge, m
+    radius: float = lw.from_model(lambda model, p: model.geom("cap1").size.sum())  # of the spinner, m
 
 
 @wp.func

@@ -69,7 +69,7 @@ class SwimWorld(World):
 class SwimParams(Params):
     mouth: int = lw.geom("mouth")
     target: int = lw.mocap("target")
-    radii: float = lw.from_model(lambda model, p: model.geom("target").size[0] + model.geom_size[p.mouth, 0])
+    radii: float = lw.from_model(lambda model, p: model.geom("target").size[0] + model.geom_size[p.mouth, 0])  # m
 
 
 @wp.func

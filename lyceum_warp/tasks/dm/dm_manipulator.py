@@ -34,9 +34,9 @@ class Params:
         lambda model, p: [
             joint.range if model.jnt_limited[joint.id] else (-wp.pi, wp.pi) for joint in map(model.joint, ARM)
         ]
-    )
+    )  # of the arm's joints, rad
     links: wp.vec4 = wp.vec4(0.18, 0.15, 0.12, 0.065)  # lengths of the links, m
-    root: wp.vec3 = lw.from_model(lambda model, p: model.body("upper_arm").pos)
+    root: wp.vec3 = lw.from_model(lambda model, p: model.body("upper_arm").pos)  # of the arm, m
     ball_qpos: wp.array[int] = lw.qposes(*BALL)
     ball_dof: wp.array[int] = lw.dofs(*BALL)
     touch: wp.array[int] = lw.sensors(*TOUCH)

@@ -18,7 +18,7 @@ class World:
 class Params(suite.RandomJoints):
     mass: int = lw.geom("pointmass")
     target: int = lw.geom("target")
-    target_size: float = lw.from_model(lambda model, p: model.geom_size[p.target, 0])
+    target_size: float = lw.from_model(lambda model, p: model.geom_size[p.target, 0])  # radius, m
     margin: float = lw.from_model(lambda model, p: p.target_size)  # m
 
 

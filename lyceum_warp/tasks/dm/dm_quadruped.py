@@ -62,10 +62,10 @@ class Params:
     torso: int = lw.body("torso")
     imu: int = lw.sensor("imu_accel")  # and the gyroscope
     forces: int = lw.sensor("force_toe_front_left")  # 4 forces, then 4 torques
-    geoms: wp.array[int] = lw.from_model(solid)
-    geom_center: wp.array[wp.vec3] = lw.from_model(centers)
-    geom_axes: wp.array[wp.mat33] = lw.from_model(axes)
-    geom_radii: wp.array[wp.vec4] = lw.from_model(radii)
+    geoms: wp.array[int] = lw.from_model(solid)  # geoms of the robot
+    geom_center: wp.array[wp.vec3] = lw.from_model(centers)  # centres relative to the torso, m
+    geom_axes: wp.array[wp.mat33] = lw.from_model(axes)  # rotation matrices relative to the torso
+    geom_radii: wp.array[wp.vec4] = lw.from_model(radii)  # three radii and the half length of each geom, m
 
 
 @wp.func

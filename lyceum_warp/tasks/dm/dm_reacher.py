@@ -20,7 +20,7 @@ class World:
 class Params(suite.RandomJoints):
     finger: int = lw.geom("finger")
     target: int = lw.mocap("target")
-    radii: float = lw.from_model(lambda model, p: model.geom("target").size[0] + model.geom_size[p.finger, 0])
+    radii: float = lw.from_model(lambda model, p: model.geom("target").size[0] + model.geom_size[p.finger, 0])  # m
 
 
 @wp.func

@@ -24,7 +24,7 @@ class Params(suite.RandomJoints):
     nose: int = lw.geom("nose")
     head_velocity: int = lw.sensor("head_vel")
     target: int = lw.mocap("target")
-    target_size: float = lw.from_model(lambda model, p: model.geom("target").size[0])
+    target_size: float = lw.from_model(lambda model, p: model.geom("target").size[0])  # radius, m
 
 
 @wp.func

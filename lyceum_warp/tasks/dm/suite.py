@@ -47,8 +47,8 @@ def random_range(model: mujoco.MjModel, p: Any) -> np.ndarray:
 class RandomJoints:
     """The parameters of ``draw_joints``."""
 
-    drawn_joints: wp.array[int] = lw.from_model(random_joints)
-    drawn_range: wp.array[wp.vec2] = lw.from_model(random_range)
+    drawn_joints: wp.array[int] = lw.from_model(random_joints)  # indices in qpos of the joints that each episode draws
+    drawn_range: wp.array[wp.vec2] = lw.from_model(random_range)  # their ranges, m or rad
 
 
 @wp.func

@@ -27,6 +27,8 @@ _CHECK = 0.5
 """Seconds between two calls of the watchers."""
 _POLL = 0.005
 """Maximum seconds between two polls of the window's commands."""
+_SLEEP = 0.1
+"""Seconds between two polls while no page is visible."""
 _SWITCH_INTERVAL = 0.0005
 """Seconds until Python lets another thread run. The default of 5 ms would delay the steps while a controller plans."""
 
@@ -95,7 +97,7 @@ class Session:
     @property
     def _halted(self) -> bool:
         """Whether no step is due. A waiting command waits for the end of a call, so no further call may begin."""
-        return self.stage.paused or bool(self._waiting)
+        return self.stage.paused or self.stage.asleep or bool(self._waiting)
 
     def _advance(self) -> None:
         """Make the steps that are due, at most until the next frame is due."""
@@ -122,7 +124,8 @@ class Session:
 
     def _rest(self) -> None:
         """Wait until the next step, but not longer than until the next poll."""
-        seconds = _POLL if self._halted else min(self._next_step - time.perf_counter(), _POLL)
+        until_step = self._next_step - time.perf_counter()
+        seconds = _SLEEP if self.stage.asleep else _POLL if self._halted else min(until_step, _POLL)
         if seconds > 0:
             self.stage.rest(seconds)
 

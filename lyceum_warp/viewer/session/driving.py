@@ -18,6 +18,7 @@ _NEVER = 1e9  # seconds until the task chooses a new command
 # arrows start _HEIGHT metres above the base; the length of an arrow is its velocity times _SECONDS
 _HEIGHT, _SECONDS = 0.25, 0.4
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
+_SCALE = f"{_SECONDS:g} m per m/s; up: turn left, {_SECONDS:g} m per rad/s"
 
 
 class Driving:
@@ -66,7 +67,8 @@ class Driving:
             (command[0] * forward + command[1] * left, _COMMANDED), (qvel[:3] * [1.0, 1.0, 0.0], _MEASURED),
             (command[2] * up, _COMMANDED), (qvel[5] * up, _MEASURED),
         )  # fmt: skip
-        return tuple(Arrow(start, start + _SECONDS * way, colour) for way, colour in ways)
+        names = {_COMMANDED: f"commanded velocity, {_SCALE}", _MEASURED: "measured velocity"}
+        return tuple(Arrow(start, start + _SECONDS * way, colour, names[colour]) for way, colour in ways)
 
 
 def _yaw(qpos: np.ndarray) -> float:

@@ -14,6 +14,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import MAX_MESSAGES, MAX_POINTS, Frame, Ghost, Ghosts, Status
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows
+from lyceum_warp.viewer.session.live_settings import nominal_fields
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
 from lyceum_warp.viz import REFERENCE, reference_states
@@ -32,6 +33,7 @@ class FrameMaker:
     def __init__(self, env: Env, curves: int, driving: Driving) -> None:
         self.ghosts = Ghosts()
         self._env, self._curves, self._driving = env, curves, driving
+        self._nominal = nominal_fields(env)
         self._messages: deque[str] = deque(maxlen=MAX_MESSAGES)
         self._points: deque[Sequence[float]] = deque(maxlen=MAX_POINTS)
 
@@ -72,23 +74,29 @@ class FrameMaker:
         neighbours = rows.states[1:]
         if live is not main and worlds:  # the other worlds do not move
             neighbours = main.rows(worlds).states[1:]
-        ghosts = [] if traces is None else [Ghost(self._physics(traces.final), (*_PLAN, _OPACITY))]
+        text, ghosts, predicted = [("return", f"{rows.episode_return:.6g}")], [], None
+        if traces is not None:
+            ghosts.append(Ghost(self._physics(traces.final), (*_PLAN, _OPACITY), what="end of the plan"))
+            seconds = live.env.timestep * np.arange(len(traces.rewards))
+            predicted = np.stack([seconds, traces.rewards], axis=1)
+            text.append(("plan's return", f"{traces.rewards.sum():.6g} in {len(seconds) * live.env.timestep:.2g} s"))
         ghosts += self._beside(neighbours) if self.ghosts.grid else self._coloured(neighbours)
-        ghosts += self._burst(rows.back, _PAST)
+        ghosts += self._burst(rows.back, _PAST, "past")
         step, past = int(state[parts["step"]][0]), live.past
         complete = status(
             world=main.world, step=step, steps=live.env.horizon, time=float(state[parts["time"]][0]),
-            text=(("return", f"{rows.episode_return:.6g}"),), command=self._driving.command(state),
+            text=tuple(text), command=self._driving.command(state),
             seekable=(max(0, step - past.behind), step + past.ahead),
+            physics=tuple((name, float(state[parts[name]].sum() / n.sum())) for name, n in self._nominal.items()),
         )  # fmt: skip
-        return self._frame(state, complete, ghosts, None if traces is None else traces.paths)
+        return self._frame(state, complete, ghosts, None if traces is None else traces.paths, predicted)
 
     def of_playback(self, playback: Playback, status: Callable[..., Status]) -> Frame:
         """Make a frame of a playback; for ``status``, see ``of_worlds``."""
         episode, state = playback.episode, playback.state
         around = playback.around(self.ghosts.burst)
-        ghosts = self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST)
-        ghosts += self._burst((episode.states[s] for s in around if s > playback.step), _FUTURE)
+        ghosts = self._burst((episode.states[s] for s in reversed(around) if s < playback.step), _PAST, "past")
+        ghosts += self._burst((episode.states[s] for s in around if s > playback.step), _FUTURE, "future")
         text = [("episode", episode.name)]
         if episode.end:
             text.append(("end", episode.end))
@@ -101,12 +109,15 @@ class FrameMaker:
         return self._frame(state, complete, ghosts)
 
     def _frame(
-        self, state: np.ndarray, status: Status, ghosts: Sequence[Ghost], paths: np.ndarray | None = None
-    ) -> Frame:
+        self, state: np.ndarray, status: Status, ghosts: Sequence[Ghost], paths: np.ndarray | None = None,
+        predicted: np.ndarray | None = None,
+    ) -> Frame:  # fmt: skip
         parts = self._env.state_space.parts
         fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics if field.in_model}
-        ghosts = [*(Ghost(pose, REFERENCE) for pose in reference_states(self._env, state)), *ghosts]
-        return Frame(self._physics(state), fields, status, tuple(ghosts), paths, self._driving.arrows(state))
+        references = reference_states(self._env, state)
+        ghosts = [*(Ghost(pose, REFERENCE, what="reference of the clip") for pose in references), *ghosts]
+        arrows = self._driving.arrows(state)
+        return Frame(self._physics(state), fields, status, tuple(ghosts), paths, arrows, predicted=predicted)
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
         """Report faults and the end of an episode. ``plant_of`` is the world that a plant copies."""
@@ -120,7 +131,9 @@ class FrameMaker:
             self.say(f"fault in world {where}: {reasons(int(bits))} ({count:.0f} so far)")
 
     def _coloured(self, states: Iterable[np.ndarray]) -> list[Ghost]:
-        return [Ghost(self._physics(row), (*_COLOURS[i % len(_COLOURS)], _OPACITY)) for i, row in enumerate(states)]
+        colours = itertools.cycle(_COLOURS)
+        rows = zip(states, colours, strict=False)
+        return [Ghost(self._physics(row), (*colour, _OPACITY), what="other worlds") for row, colour in rows]
 
     def _beside(self, states: Iterable[np.ndarray]) -> list[Ghost]:
         cells = sorted(itertools.product(range(-3, 4), repeat=2), key=lambda cell: (max(map(abs, cell)), cell))[1:]
@@ -137,9 +150,11 @@ class FrameMaker:
         far = np.linalg.norm(data.geom_xpos - data.subtree_com[0], axis=1) + model.geom_rbound
         return 2.2 * float(far[moving].max(initial=0.1))
 
-    def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float]) -> list[Ghost]:
+    def _burst(self, states: Iterable[np.ndarray], colour: tuple[float, float, float], what: str) -> list[Ghost]:
         """Make ghosts along a trajectory. The first states are the most opaque."""
-        return [Ghost(self._physics(row), (*colour, _OPACITY * _FADE ** (i + 1))) for i, row in enumerate(states)]
+        opacities = (_OPACITY * _FADE**i for i in itertools.count(1))
+        rows = zip(states, opacities, strict=False)
+        return [Ghost(self._physics(row), (*colour, opacity), what=what) for row, opacity in rows]
 
     def _physics(self, state: np.ndarray) -> np.ndarray:
         return state[: self._env.engine.integration_size]

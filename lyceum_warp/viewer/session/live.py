@@ -17,7 +17,7 @@ HISTORY_BYTES = 240 * 2**20
 PLANT_HISTORY_BYTES = 16 * 2**20
 """Memory for the history of a plant (see ``stage.py``), in bytes."""
 HISTORY_STEPS = 2000
-"""Maximum number of steps in the history."""
+"""Maximum number of steps in the history, if no episode is longer."""
 
 _CURVE_ROWS = 4096  # maximum number of curve points per frame; further points overwrite the oldest
 
@@ -30,7 +30,7 @@ class Past:
 
     def __init__(self, env: Env, limit: int) -> None:
         n, size, device = env.nworld, env.state_space.size, env.obs.device
-        length = min(HISTORY_STEPS, limit // (n * 8 * (size + 1)))
+        length = min(max(HISTORY_STEPS, env.horizon + 1), limit // (n * 8 * (size + 1)))
         self.length = length if length > 1 else 0
         self.states = torch.empty(self.length, n, size, dtype=torch.float64, device=device)
         self.returns = torch.empty(self.length, n, dtype=torch.float64, device=device)

@@ -7,6 +7,7 @@ import numpy as np
 
 from lyceum_warp.algos import Planner
 from lyceum_warp.env import Env
+from lyceum_warp.viz import owner_of
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
 STARTS = ("start_clip", "start_frame")
@@ -29,6 +30,16 @@ def task_numbers(env: Env) -> Numbers:
     """Return the task's float parameters, including the weights of reward terms, and the start of a clip."""
     params = [(n, v) for n, v in env.task.params.items() if isinstance(v, float) or (n in STARTS and np.ndim(v) == 0)]
     return tuple((n, float(v)) for n, v in params if n not in ("dt", "substep_dt"))
+
+
+def nominal_fields(env: Env) -> dict[str, np.ndarray]:
+    """Return the nominal values of the fields that a task draws and that cannot be negative, such as masses.
+
+    Fields whose nominal values depend on a world's object are left out.
+    """
+    model, drawn = env.task.model, [field.name for field in env.task.dynamics if field.rows is None]
+    values = {name: np.ravel(getattr(owner_of(model, name), name)) for name in drawn}
+    return {name: value for name, value in values.items() if (value >= 0).all() and value.any()}
 
 
 def rebuilt_planner(planner: Planner, name: str, value: float) -> Planner:

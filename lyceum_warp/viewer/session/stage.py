@@ -14,12 +14,18 @@ from lyceum_warp.algos import Planner
 from lyceum_warp.engines import options_for_plant
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
-from lyceum_warp.viewer.protocol import Frame, Mode, Scene, Status
+from lyceum_warp.viewer.protocol import Frame, Mode, Owner, Scene, Status
 from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
-from lyceum_warp.viewer.session.live_settings import STARTS, planner_numbers, rebuilt_planner, task_numbers
+from lyceum_warp.viewer.session.live_settings import (
+    STARTS,
+    nominal_fields,
+    planner_numbers,
+    rebuilt_planner,
+    task_numbers,
+)
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
@@ -55,7 +61,7 @@ class Stage:
         self.mode: Mode = "passive"
         self.controller: str | None = None
         self.paused, self.speed = bool(paused), 1.0
-        self.closed = False
+        self.closed, self.watched = False, True
         self.driving = Driving(env)
         modes: list[Mode] = ["playback"] if self.playback.episodes else []
         modes += ["controller"] if self.controllers else []
@@ -185,9 +191,23 @@ class Stage:
         if isinstance(current, WorldControl) and current.plans and current.name not in self._threads:
             self._threads[current.name] = TraceThread(TraceRollouts(current.controller, self.live.env))
 
-    def set_number(self, owner: str, name: str, value: float) -> None:
-        """Change a setting of the planner in use, or a task parameter in all worlds."""
+    @property
+    def asleep(self) -> bool:
+        """Whether no page is visible and no video is in progress."""
+        return not self.watched and self.videos.name is None
+
+    def set_number(self, owner: Owner, name: str, value: float) -> None:
+        """Change a number.
+
+        Args:
+            owner: The planner in use, the task (in all worlds), or the physics of the displayed world.
+            name: A setting, a parameter, or a model field.
+            value: The new value. That of a model field is a multiple of the nominal model's.
+        """
         planners = self.world_controls
+        if owner == "physics":
+            self.live.write(**{name: value * nominal_fields(self.env)[name]})
+            return
         if owner == "planner":
             if not isinstance(current := self.control, WorldControl):  # the mode may have changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")

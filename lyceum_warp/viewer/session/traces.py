@@ -75,6 +75,8 @@ class Traces:
     """The paths, (samples + 1, points, 3), in metres: first the best sample's, and last the plan's."""
     final: np.ndarray
     """The state at the end of the plan."""
+    rewards: np.ndarray
+    """The rewards of the plan's steps, (horizon,)."""
     time: float
     """The time of the rollout on the clock ``time.perf_counter``."""
 
@@ -112,13 +114,14 @@ class TraceRollouts:
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)
         env.set_state(self._states, check=False)
-        path = [self._positions[:, self._index].clone()]
+        path, rewards = [self._positions[:, self._index].clone()], []
         for action in actions:
             self._step(action)
             path.append(self._positions[:, self._index].clone())
+            rewards.append(env.reward[MOST_SAMPLES].clone())
         paths = torch.stack(path, dim=1)[[*range(count), MOST_SAMPLES]].cpu().numpy()
         final = env.get_state(out=self._states)[MOST_SAMPLES].cpu().numpy().copy()
-        return Traces(paths, final, time.perf_counter())
+        return Traces(paths, final, torch.stack(rewards).cpu().numpy(), time.perf_counter())
 
     def _step(self, action: torch.Tensor) -> None:
         """Make a step without events, as planners do."""

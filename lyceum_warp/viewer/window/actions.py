@@ -1,13 +1,17 @@
 """List the user's actions with their keys, and send the corresponding commands."""
 
 import dataclasses
+import math
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec
 
+import mujoco
+
 from lyceum_warp.viewer import commands
 from lyceum_warp.viewer.commands import Command
-from lyceum_warp.viewer.protocol import MOST_BURST, Frame, Scene, Status
+from lyceum_warp.viewer.protocol import MOST_BURST, MOST_GHOSTS, Frame, Scene, Status
 from lyceum_warp.viewer.window.scene import ViewCameras
 from lyceum_warp.viewer.window.studio import imgui, inputs, ux
 
@@ -29,9 +33,11 @@ class Actions:
         self.frame: Frame | None = None
         self.viewer: Any
         self.cameras: ViewCameras
-        self.windows = {"messages", *(["curves"] if scene.curves else [])}
+        self.tell: Callable[[str], object]
+        self.windows = {"curves"} if scene.curves else set()
         self.messages: deque[str] = deque(maxlen=200)
         self.scroll_down = False
+        self.said = self.acted = -math.inf  # times of the last message and of the last command
         self._steering = (0.0, 0.0, 0.0)  # the last command that the keys gave
 
     @property
@@ -42,12 +48,13 @@ class Actions:
 
     def do(self, function: Callable[Concatenate[Any, P], None], *arguments: P.args, **options: P.kwargs) -> None:
         """Send a command: a function of ``commands.py`` with its arguments."""
+        self.acted = time.monotonic()
         self._send(Command(function, arguments, options))
 
     def say(self, *messages: str) -> None:
         """Add lines to the messages."""
         self.messages.extend(messages)
-        self.scroll_down = True
+        self.said, self.scroll_down = time.monotonic(), True
 
     def press_keys(self) -> None:
         """Handle pressed keys."""
@@ -114,6 +121,26 @@ class Actions:
         """Change settings of the ghosts."""
         self.do(commands.set_ghosts, dataclasses.replace(self.status.ghosts, **changes))
 
+    def toggle_contacts(self) -> None:
+        """Show or hide contact points and forces."""
+        flags = self.viewer.vis_options.flags
+        shown = not flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE]
+        flags[mujoco.mjtVisFlag.mjVIS_CONTACTPOINT] = flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE] = shown
+
+    def toggles(self) -> dict[str, tuple[bool, Callable[[], object]]]:
+        """What can be shown or hidden: whether it is shown, and a function that changes this."""
+        ghosts, flags = self.status.ghosts, self.viewer.vis_options.flags
+        most = min(self.scene.nworld - 1, MOST_GHOSTS)
+        toggles: dict[str, tuple[bool, Callable[[], object]]] = {
+            "contacts": (bool(flags[mujoco.mjtVisFlag.mjVIS_CONTACTFORCE]), self.toggle_contacts),
+            "past": (ghosts.burst > 0, lambda: self.set_ghosts(burst=0 if ghosts.burst else MOST_BURST // 2)),
+        }
+        if most:
+            toggles["ghosts"] = ghosts.worlds > 0, lambda: self.set_ghosts(worlds=0 if ghosts.worlds else most)
+        if self.status.planner:
+            toggles["plan"] = ghosts.plan, lambda: self.set_ghosts(plan=not ghosts.plan)
+        return toggles
+
     def toggle_video(self) -> None:
         """Start a video from the view's camera, or end the video."""
         self.do(commands.set_video, self.cameras.view() if self.status.video is None else None)
@@ -153,9 +180,7 @@ ACTIONS = {
     "Shift+Up": Action("double the speed", lambda a: a.change_speed(1)),
     "Shift+Down": Action("halve the speed", lambda a: a.change_speed(-1)),
     "Ctrl+R": Action("reverse the playback", lambda a: a.do(commands.set_backwards, not a.status.backwards)),
-    "Ctrl+B": Action(
-        "burst: many states at once", lambda a: a.set_ghosts(burst=0 if a.status.ghosts.burst else MOST_BURST // 2)
-    ),
+    "Ctrl+B": Action("many states of the episode at once", lambda a: a.toggles()["past"][1]()),
     "Enter": Action("drive a walking robot: W A S D move it, Q E turn it", lambda a: a.toggle_driving()),
     "Ctrl+V": Action("start or end a video and a page that plays it", lambda a: a.toggle_video(), "\uf03d  video"),
     "Ctrl+P": Action("take a picture", lambda a: a.do(commands.take_picture, a.cameras.view()), "\uf030  picture"),

@@ -18,6 +18,9 @@ from lyceum_warp.viewer.window.connection import SessionConnection
 from lyceum_warp.viewer.window.panel import Panel
 from lyceum_warp.viewer.window.server import PageServer
 
+FLOOR_REPEATS = 1.0
+"""Repetitions of a floor's texture per metre. Finer textures, such as Gymnasium's, look as if the robot stood still."""
+
 
 def main(descriptor: int) -> None:
     """Show frames until the session or the user closes the window. ``descriptor`` is the connection to the session."""
@@ -43,9 +46,10 @@ def run(session: SessionConnection, scene: Scene, host: str, port: int | None) -
     model = mujoco.MjModel.from_binary_path("model.mjb", {"model.mjb": scene.model})
     planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     model.geom_size[planes, :2] = 0.0  # studio shows planes of size 0 as infinite
+    floors = model.geom_matid[planes & (model.geom_matid >= 0)]
+    model.mat_texuniform[floors], model.mat_texrepeat[floors] = True, FLOOR_REPEATS
     screen = studio.Screen()
     panel = Panel(scene, model, session, screen, server)
-    server.on_quiet = panel.mouse.let_go
 
     def follow() -> None:
         session.receive()

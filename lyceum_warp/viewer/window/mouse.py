@@ -33,7 +33,7 @@ class Mouse:
                 self._send(command(perturb, **push))
 
     def let_go(self) -> None:
-        """End a push after the browser has disconnected. Any thread may call this method."""
+        """End a push after the page was closed or hidden. Any thread may call this method."""
         with self._lock:
             self._tab_lost = True  # without a browser, studio does not notice the release of the button
             self._end()

@@ -1,5 +1,5 @@
-// Adapts studio's page: adds the secret path to its absolute paths, gives control to the visible tab, and shows links
-// to new files.
+// Adapts studio's page: adds the secret path to its absolute paths, gives control to the visible tab, shows links to new
+// files, and sends a gamepad's axes.
 {
   const path = location.pathname;
   const below = (address) => {
@@ -26,24 +26,35 @@
       this.addEventListener("message", (event) => {
         if (typeof event.data !== "string") return;
         if (visible() && event.data.includes("role=spectator;queue_pos=0")) say("request_control");
-        if (event.data.startsWith("saved=")) {
-          event.stopImmediatePropagation();
-          offer(event.data.slice(6));
-        }
+        const [kind, text] = event.data.split(/=(.*)/s);
+        if (kind !== "saved" && kind !== "copy") return;
+        event.stopImmediatePropagation();
+        if (kind === "saved") offer("\u2b07 " + text, {href: "saved/" + text, download: text});
+        else offer("copy: " + text, {href: "#", onclick: () => navigator.clipboard.writeText(text) && false});
       });
     }
   };
 
-  const offer = (name) => {
+  const offer = (text, properties) => {
     const box = document.getElementById("saved") ?? document.body.appendChild(document.createElement("div"));
     box.id = "saved";
-    box.style = "position:fixed;right:12px;bottom:44px;padding:8px;background:#fffd;font:14px sans-serif";
-    const link = document.createElement("a");
-    Object.assign(link, {href: "saved/" + name, download: name, textContent: "\u2b07 " + name});
+    box.style = "position:fixed;right:12px;bottom:44px;max-width:60%;padding:8px;background:#fffd;font:14px sans-serif";
+    const link = Object.assign(document.createElement("a"), {textContent: text, ...properties});
     link.style = "display:block;color:#06c";
     box.append(link);
     while (box.children.length > 4) box.firstChild.remove();
   };
+
+  // a gamepad's left stick moves a walking robot, and its right stick turns it
+  let axes = "0,0,0";
+  const steer = () => {
+    const pad = visible() && navigator.getGamepads().find(Boolean);
+    if (!pad) return;
+    const [x, y, turn] = pad.axes.map((axis) => (Math.abs(axis) < 0.15 ? 0 : -axis.toFixed(1)));
+    const now = [y, x, turn].join();
+    if (now !== axes) say("gamepad=" + (axes = now));
+  };
+  window.addEventListener("gamepadconnected", () => setInterval(steer, 50), {once: true});
 
   // studio would replace the title
   Object.defineProperty(document, "title", {get: () => document.querySelector("title").text, set: () => {}});

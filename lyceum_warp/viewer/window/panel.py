@@ -5,6 +5,7 @@ import time
 import mujoco
 import numpy as np
 
+from lyceum_warp.viewer.commands import command, drive, set_watched
 from lyceum_warp.viewer.protocol import Frame, Opened, Scene
 from lyceum_warp.viewer.window import studio
 from lyceum_warp.viewer.window.actions import Actions
@@ -17,6 +18,10 @@ from lyceum_warp.viewer.window.windows import Windows
 
 SWAP_TIME = 0.5
 """Minimum seconds between two models that are sent to the browser."""
+RATE_TIME, LEAST_PICTURES = 3.0, 5
+"""The page's pictures are counted for this many seconds, and longer while a page that loads draws fewer."""
+SLOW = 15.0
+"""If the page draws fewer pictures per second, shadows and reflections are turned off, once."""
 
 
 class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
@@ -33,6 +38,11 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self._geoms = ExtraGeoms(model, studio.MAX_GEOMS)
         self._swapped = -SWAP_TIME
         self._model_due = False
+        self._looked: bool | None = None
+        self._counted = (0.0, 0)  # when pictures were counted for the last time, and how many there were
+        self._may_simplify = True
+        server.on_look, server.on_gamepad = self.look, self.steer
+        self.actions.tell = server.tell
 
     # messages of studio
 
@@ -43,6 +53,40 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
         self.actions.viewer, self.actions.cameras = self.viewer, ViewCameras(self.viewer, self.values)
         self.actions.cameras.reset()
         self._session.send(Opened(tuple(self._server.instructions)))
+        self.look(False)
+
+    # events of the page, in the server's thread
+
+    def look(self, looks: bool) -> None:
+        """Let the worlds run only while a page is visible."""
+        if looks != self._looked:
+            self._looked, self._counted = looks, (time.monotonic(), self._server.inputs)
+            self._session.send(command(set_watched, looks))
+        if not looks:
+            self.mouse.let_go()
+
+    def steer(self, axes: list[float]) -> None:
+        """Drive a walking robot by a gamepad's axes: forwards, to the left, and turn to the left."""
+        if self.actions.scene.speeds is not None:
+            forward, left, turn = (axis * speed for axis, speed in zip(axes, self.actions.scene.speeds, strict=True))
+            self.actions.do(drive, (forward, left, turn))
+
+    def _count_pictures(self) -> None:
+        since, before = self._counted
+        seconds, pictures = time.monotonic() - since, self._server.inputs - before
+        if seconds < RATE_TIME or pictures < LEAST_PICTURES:
+            return
+        rate = self.windows.page_rate = pictures / seconds
+        self._counted = time.monotonic(), self._server.inputs
+        if rate < SLOW and self._may_simplify:
+            self._may_simplify = False
+            flags = list(self.viewer.render_flags.flags)
+            for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+                flags[flag] = 0
+            self.viewer.render_flags.flags = flags
+            self.actions.say(
+                f"the page draws {rate:.1f} pictures/s, so shadows and reflections are off (view, rendering)"
+            )
 
     @studio.handler
     def on_update(self, event: studio.Update) -> None:
@@ -51,6 +95,7 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self.take(frame)
         if self.actions.frame is None:
             return
+        self._count_pictures()
         viewer = self.viewer
         inputs.handle_mouse_events(
             viewer.model, viewer.data, viewer.camera, viewer.vis_options, viewer.perturb, self.actions.cameras.state,

@@ -33,15 +33,15 @@ from websockets.http11 import Request, Response
 
 FIRST_PORT, PORTS = 8080, 20
 """By default, these ports are tried before any free port."""
-HEAD_SECONDS = 10.0
-"""Timeout in seconds for a request's headers."""
+RESPONSE_SECONDS = 300.0
+"""Timeout in seconds for a request and its response. Models with many meshes have tens of megabytes."""
 PING_SECONDS = 30.0
 """Seconds between pings, which detect a lost browser."""
 MESSAGE_BYTES = 2**20
 """Maximum size of a WebSocket message from a browser, in bytes."""
 FRAMES = 2
 """Number of frames after each input of a page. The first frame may not contain the effects of the input yet."""
-QUIET_SECONDS = 2.0
+QUIET_SECONDS = 5.0
 """A page without input for this many seconds counts as hidden. An open page sends input with every frame."""
 SCRIPT = Path(__file__).with_name("page.js")
 
@@ -53,16 +53,22 @@ _HEADERS = {
     "Document-Isolation-Policy": "isolate-and-require-corp",  # Chromium requires this in notebooks
 }
 _CONTROL_TAKEN = 4001  # studio's WebSocket close code
+_GAMEPAD = "gamepad="  # begins a message of page.js
 
 
 class Tab(ServerConnection):
-    """A WebSocket that calls ``heard`` at each message."""
+    """A WebSocket that calls ``heard`` at each message, and ``driven`` instead of returning a gamepad's message."""
 
     heard: Callable[[], object] | None = None
+    driven: Callable[[list[float]], object]
 
     async def recv(self, *arguments: Any, **options: Any) -> Any:
         """Receive a message."""
-        message = await super().recv(*arguments, **options)
+        while isinstance(message := await super().recv(*arguments, **options), str) and message.startswith(_GAMEPAD):
+            with contextlib.suppress(ValueError):
+                axes = [float(axis) for axis in message.removeprefix(_GAMEPAD).split(",")]
+                if len(axes) == 3 and all(abs(axis) <= 1 for axis in axes):
+                    self.driven(axes)
         if self.heard is not None:
             self.heard()
         return message
@@ -84,8 +90,13 @@ class PageServer:
         self._sockets = public_sockets(host, port)
         self._secret = secrets.token_urlsafe(32)
         self._title = title
-        self.on_quiet: Callable[[], object] = lambda: None
-        """Called in the server's thread after the page that had control was closed or hidden."""
+        self.on_look: Callable[[bool], object] = lambda looks: None
+        """Called in the server's thread with True at each input of the page that has control, and with False after this
+        page was closed or hidden."""
+        self.on_gamepad: Callable[[list[float]], object] = lambda axes: None
+        """Called in the server's thread with a gamepad's axes, from -1 to 1."""
+        self.inputs = 0
+        """The number of inputs of the page that has control: one for each picture that the page has drawn."""
         self._loop: asyncio.AbstractEventLoop
         self._tabs: set[ServerConnection] = set()
         self._files: dict[str, Path] = {}  # offered for download, by name
@@ -121,7 +132,11 @@ class PageServer:
         """Offer a file as a download on all open pages. Any thread may call this method."""
         path = Path(file)
         self._files[path.name] = path
-        self._loop.call_soon_threadsafe(broadcast, self._tabs, f"saved={path.name}")
+        self.tell(f"saved={path.name}")
+
+    def tell(self, message: str) -> None:
+        """Send a message to the script of all open pages. Any thread may call this method."""
+        self._loop.call_soon_threadsafe(broadcast, self._tabs, message)
 
     def take_frame(self, seconds: float) -> bool:
         """Wait at most ``seconds`` until the page that has control can show a frame, and return whether it can.
@@ -163,18 +178,21 @@ class PageServer:
                 self._request(math.inf)
             else:
                 self._tabs.add(tab)
+                tab.driven = self.on_gamepad
             try:
                 await handler(tab)
             finally:
                 self._tabs.discard(tab)
                 if tab.heard is not None:
                     self._request(0)
+                    self.on_look(False)
 
         options |= {
             "sock": self._sockets[0], "create_connection": Tab, "process_request": answer,
-            "process_response": self._completed, "max_size": MESSAGE_BYTES, "open_timeout": HEAD_SECONDS,
-            "close_timeout": HEAD_SECONDS, "ping_interval": PING_SECONDS, "ping_timeout": PING_SECONDS,
+            "process_response": self._completed, "max_size": MESSAGE_BYTES, "open_timeout": RESPONSE_SECONDS,
+            "close_timeout": RESPONSE_SECONDS, "ping_interval": PING_SECONDS, "ping_timeout": PING_SECONDS,
             "logger": logging.Logger("viewer", logging.CRITICAL),  # do not log malformed requests
+            "compression": "deflate",  # windows with changed numbers shrink to a sixth
         }  # fmt: skip
         return serve(handle, **options)  # type: ignore[arg-type]  # every connection is a Tab
 
@@ -199,13 +217,15 @@ class PageServer:
             response.body = page.replace("<head>", f'<head><script src="{SCRIPT.name}"></script>', 1).encode()
         if response.body:
             if "gzip" in request.headers.get("Accept-Encoding", ""):
-                response.body = await asyncio.to_thread(gzip.compress, response.body, 4)
+                response.body = await asyncio.to_thread(gzip.compress, response.body, 1)
                 headers["Content-Encoding"] = "gzip"
             headers.pop("Content-Length", None)
             headers["Content-Length"] = str(len(response.body))
         return response
 
     def _hear(self, tab: ServerConnection) -> None:
+        self.inputs += 1
+        self.on_look(True)
         self._request(FRAMES)
         if self._silence is not None:
             self._silence.cancel()
@@ -213,7 +233,7 @@ class PageServer:
 
     def _end_control(self, tab: ServerConnection) -> None:
         """Give control to another tab, because frames are made only for the tab that has control."""
-        self.on_quiet()
+        self.on_look(False)
         if len(self._tabs) > 1:
             self._end = self._loop.create_task(tab.close(_CONTROL_TAKEN, "hidden"))
 

@@ -4,6 +4,7 @@ Studio renders a scene and a panel in a browser, and handles keys and the mouse.
 loading are not used, because the simulation is in another process.
 """
 
+import time
 from typing import Any
 
 import mujoco
@@ -13,7 +14,7 @@ from mujoco.studio.dear_imgui import dear_imgui as imgui
 from mujoco.studio.implot import implot
 from mujoco.studio.web import state_payload, web_server
 
-from lyceum_warp.viewer.window.server import PageServer, PrivateSocket
+from lyceum_warp.viewer.window.server import FRAMES, PageServer, PrivateSocket
 
 __all__ = [
     "MAX_GEOMS", "Gui", "Plugin", "Screen", "Started", "Update", "handler", "imgui", "implot",
@@ -22,6 +23,8 @@ __all__ = [
 
 IDLE = 0.1
 """Seconds between two looks at the session's messages while no page is visible."""
+REPEAT = 1.0
+"""Seconds after which an equal state is sent again. A page without new states soon reports that it is disconnected."""
 MAX_GEOMS: int = state_payload.MAX_EXTRA_GEOMS
 """Maximum number of geoms that a browser shows in addition to the model's."""
 
@@ -61,7 +64,7 @@ class Screen:
         # studio would serve everyone: on every address, and on a loopback port that other users can use
         web_server.bind_public_socket = web_server.bind_loopback_socket = private
         web_server.serve = server.serve
-        web_server.WebServer = _WebServer
+        web_server.WebServer = WebServer
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", open_browser=False)
         viewer = _Viewer(config, self._viewer_end, plugins=[panel], server=server)
         if len(replaced) < 2:
@@ -70,9 +73,18 @@ class Screen:
         viewer_protocol.run_viewer_loop(viewer)
 
 
-class _WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
+class WebServer(web_server.WebServer):  # type: ignore[misc]  # studio has no types
+    """Sends a new state, or an equal one after REPEAT seconds, if fewer than FRAMES states wait to be drawn."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        vars(web_server).update(_STATE_MAX_IN_FLIGHT=FRAMES)  # studio has no option for this number
+        self._next = 0.0  # when an equal state is sent again
+        super().__init__(*arguments, **options)
+
     def update_state(self, payload: bytes) -> None:
-        if payload != self._state_payload:  # the browser already has equal ones
+        """Replace the state that pages draw next."""
+        if payload != self._state_payload or time.monotonic() >= self._next:
+            self._next = time.monotonic() + REPEAT
             super().update_state(payload)
 
 

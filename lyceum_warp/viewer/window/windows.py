@@ -1,25 +1,43 @@
 """Build the windows of the panel with ImGui."""
 
+import textwrap
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from lyceum_warp.viewer import commands
-from lyceum_warp.viewer.protocol import MAX_POINTS, MOST_BURST, MOST_GHOSTS
+from lyceum_warp.viewer.protocol import BEST_COLOUR, MAX_POINTS, MOST_BURST, MOST_GHOSTS, TRACE_COLOUR, Frame, Owner
 from lyceum_warp.viewer.window.actions import ACTIONS, OTHER_KEYS, SPEEDS, Actions
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
-PLOT_POINTS, PLOT_SECONDS = 200, 20.0
-"""A plotted curve covers PLOT_SECONDS seconds with at most PLOT_POINTS points."""
-PLOT_PERIOD = 0.2
-"""Seconds between two updates of the plots. Each update sends all points to the browser."""
+PLOT_POINTS = 120
+"""Maximum number of points of a plotted curve."""
+SPANS = {"20 s": 20.0, "100 s": 100.0, "all": np.inf}
+"""How much of the curves can be shown, in simulated seconds."""
+UPDATE_PERIOD = 0.2
+"""Seconds between two updates of plots and numbers, because each update is sent to the browser."""
+FRESH = 0.5
+"""For this many seconds after a command, all numbers are up to date."""
+TOAST_SECONDS, TOASTS = 6.0, 3
+"""The newest messages are shown for TOAST_SECONDS seconds below the scene."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
+SIDE = 330
+"""Width of the windows on both sides, in pixels. They have one width, so that the scene's free part is centred."""
+HINT = "drag: turn   right drag: move   wheel: zoom   double-click, then Ctrl + right drag: push   F1: keys"
+_LEGEND_PLACE = int(implot.Location.North)
+_OVERLAY = (
+    int(imgui.WindowFlags.NoDecoration) | int(imgui.WindowFlags.NoInputs) | int(imgui.WindowFlags.AlwaysAutoResize)
+)
+_OVERLAY |= int(imgui.WindowFlags.NoSavedSettings) | int(imgui.WindowFlags.NoFocusOnAppearing)
 FEW_CURVES = 2
 """The reward and the evaluation, which the viewer plots when it starts."""
 WINDOWS = ("messages", "curves", "view", "keys")
+
+Line: TypeAlias = tuple[tuple[float, ...] | None, str]
+"""A colour (red, green, blue, opacity) with its meaning."""
 
 
 class Windows:
@@ -28,10 +46,17 @@ class Windows:
     def __init__(self, actions: Actions) -> None:
         self.curves = Curves(len(actions.scene.curves))
         self._actions, self._scene = actions, actions.scene
-        self._edited: dict[tuple[str, str], float] = {}
+        self._edited: dict[tuple[Owner, str], float] = {}
         self._plotted = set(self._scene.curves[:FEW_CURVES])
-        self._plot = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
-        self._next_plot = 0.0
+        self.page_rate = np.nan
+        """Pictures per second that the page draws."""
+        self._span = "20 s"
+        self._plot = self.curves.thinned(PLOT_POINTS, SPANS[self._span])
+        self._next_update = 0.0
+        self._last_values: list[tuple[str, str]] = []
+        self._frame: Frame | None = None  # the frame whose numbers are shown
+        self._hint = True
+        self._first: dict[tuple[Owner, str], float] = {}  # the numbers before the user's changes
         self._size = (0.0, 0.0)
 
     def build(self) -> None:
@@ -41,14 +66,63 @@ class Windows:
         # panels stay where the user moved them until the browser window is resized
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
-        if resized and width < NARROW:
-            self._actions.windows -= {"messages", "curves"}
-        tall = min(len(self._plotted) * 138 + 60, height - 50)
-        self._window(self._scene.title, (10, 10, 320, height - 20), cond, self._session)
-        self._window("messages", (340, height - 110, width - 710, 100), cond, self._messages)
-        self._window("curves", (width - 360, 40, 350, tall), cond, self._curves)
-        self._window("view", (width - 360, 40, 350, height - 50), cond, self._view)
-        self._window("keys", (400, 60, 480, height - 200), cond, self._help)
+        if resized and self._scene.curves:
+            windows = self._actions.windows
+            (windows.discard if width < NARROW else windows.add)("curves")
+        self._update()
+        tall = min(len(self._plotted) * 168 + 100, height - 50)
+        imgui.SetNextWindowCollapsed(width < NARROW, cond)
+        self._window(self._scene.title, (10, 10, SIDE, height - 50), cond, self._session)
+        self._window("messages", (SIDE + 20, height - 150, width - 2 * SIDE - 40, 110), cond, self._messages)
+        self._window("curves", (width - SIDE - 10, 10, SIDE, tall), cond, self._curves)
+        self._window("view", (width - SIDE - 10, 10, SIDE, height - 50), cond, self._view)
+        self._window("keys", (SIDE + 20, 60, 480, height - 200), cond, self._help)
+        self._overlays(width, height)
+
+    def _update(self) -> None:
+        """Choose the frame whose numbers are shown, and the points of the plots."""
+        frame, now = self._actions.frame, time.monotonic()
+        due = now >= self._next_update
+        if due:
+            self._next_update = now + UPDATE_PERIOD
+            self._plot = self.curves.thinned(PLOT_POINTS, SPANS[self._span])
+            rows = self.curves.rows[-1:, 2:]
+            self._last_values = [
+                (name, f"{value:.4g}") for row in rows for name, value in zip(self._scene.curves, row, strict=True)
+            ]
+        if due or now < self._actions.acted + FRESH or (frame is not None and frame.status.paused):
+            self._frame = frame
+
+    def _overlays(self, width: float, height: float) -> None:
+        """Show a first hint, the newest messages and the legend in the scene."""
+        self._hint &= not (imgui.IsMouseDragging(0) or imgui.IsMouseDragging(1) or "keys" in self._actions.windows)
+        room = width - 40 if width < NARROW else width - 2 * SIDE - 40
+        if self._hint:
+            top, text = (50.0, f"{HINT}   ×: the panel") if width < NARROW else (10.0, HINT)
+            self._overlay("hint", (width / 2, top), (0.5, 0.0), room, [(None, text)])
+        toasts = list(self._actions.messages)[-TOASTS:]
+        if "messages" not in self._actions.windows and time.monotonic() < self._actions.said + TOAST_SECONDS:
+            lines: list[Line] = [(None, text) for text in toasts]
+            self._overlay("newest messages", (width / 2, height - 40), (0.5, 1.0), room, lines)
+        if self._frame is not None and (lines := legend(self._frame)):
+            left = 10.0 if width < NARROW else SIDE + 20.0
+            self._overlay("legend", (left, height - 40 - 32 * TOASTS), (0.0, 1.0), room, lines)
+
+    def _overlay(
+        self, title: str, place: tuple[float, float], pivot: tuple[float, float], room: float, lines: list[Line]
+    ) -> None:
+        """Show lines that the mouse does not notice. ``place`` is the position of the point ``pivot`` of the window."""
+        imgui.SetNextWindowPos(imgui.Vec2(*place), int(imgui.Cond.Always), imgui.Vec2(*pivot))
+        imgui.SetNextWindowBgAlpha(0.6)
+        imgui.Begin(title, None, _OVERLAY)
+        for colour, text in lines:
+            if colour is not None:
+                imgui.ColorButton(f"##{text}", imgui.Vec4(*colour[:3], 1.0), 0, imgui.Vec2(14, 14))
+                imgui.SameLine()
+            # ImGui would break lines within words
+            columns = int(len(text) * (room - 40) / max(imgui.CalcTextSize(text).x, 1.0))
+            imgui.TextUnformatted(textwrap.fill(text, max(columns, 20)))
+        imgui.End()
 
     def _window(
         self, title: str, place: tuple[float, float, float, float], cond: int, content: Callable[[], None]
@@ -58,19 +132,21 @@ class Windows:
         first = title == self._scene.title
         if not first and title not in self._actions.windows:
             return
-        imgui.SetNextWindowPos(imgui.Vec2(max(left, 0), max(top, 0)), cond)
-        imgui.SetNextWindowSize(imgui.Vec2(max(width, 200), max(height, 80)), cond)
+        page = self._size[0] - 20
+        width = min(max(width, 200), page)
+        imgui.SetNextWindowPos(imgui.Vec2(max(min(left, page + 10 - width), 0), max(top, 0)), cond)
+        imgui.SetNextWindowSize(imgui.Vec2(width, max(height, 80)), cond)
         unfolded, still_open = imgui.Begin(title, True)
         if unfolded:
             content()
         if first and not still_open:  # studio adds a close button in every window
-            imgui.SetWindowCollapsed(True)
+            imgui.SetWindowCollapsed(unfolded)
         imgui.End()
         if not still_open:
             self._actions.windows.discard(title)
 
     def _session(self) -> None:
-        if self._actions.frame is None:
+        if self._frame is None:
             imgui.TextDisabled("waiting for the session")
             return
         self._modes()
@@ -131,10 +207,12 @@ class Windows:
         speed = combo("speed", [speed_name(speed) for speed in SPEEDS], SPEEDS.index(status.speed))
         if speed is not None:
             self._actions.do(commands.set_speed, SPEEDS[speed])
-        first, last = status.seekable
+        assert self._frame is not None
+        first, last = self._frame.status.seekable
         if first < last:
             imgui.SetNextItemWidth(-1)
-            changed, step = imgui.SliderInt("##scrub", min(max(status.step, first), last), first, last, "step %d")
+            step = min(max(self._frame.status.step, first), last)
+            changed, step = imgui.SliderInt("##scrub", step, first, last, "step %d")
             if changed:
                 self._actions.do(commands.seek, step)
 
@@ -146,23 +224,27 @@ class Windows:
         imgui.SetItemTooltip(f"{action.what} ({key})")
 
     def _status(self) -> None:
-        status = self._actions.status
+        assert self._frame is not None
+        status = self._frame.status
         of = f" of {status.steps:,}" if status.steps else ""
         rows = [("step", f"{status.step:,}{of}"), ("time", f"{status.time:.3f} s")]
         if np.isfinite(status.measured_speed):
             rows.append(("speed", f"{status.measured_speed:.2f} of {speed_name(status.speed)}"))
         if np.isfinite(status.plan_ms):
             rows.append(("control", f"{status.plan_ms:.1f} ms"))
-        two_columns("##status", [*rows, *self._last_values()[:FEW_CURVES], *status.text])
+        if np.isfinite(self.page_rate):
+            rows.append(("pictures", f"{self.page_rate:.1f} per s"))
+        two_columns("##status", [*rows, *self._last_values[:FEW_CURVES], *status.text])
 
     def _drive(self) -> None:
-        status, speeds = self._actions.status, self._scene.speeds
+        assert self._frame is not None
+        status, speeds = self._frame.status, self._scene.speeds
         if speeds is None or status.command is None:
             return
         imgui.SeparatorText("drive")
-        if imgui.Checkbox("with the keys W A S D, Q E (Enter)", status.driven)[0]:
+        if imgui.Checkbox("with W A S D, Q E or a gamepad (Enter)", status.driven)[0]:
             self._actions.toggle_driving()
-        names = ("forward", "left", "turn left")
+        names = ("forward, m/s", "left, m/s", "turn left, rad/s")
         sliders = [
             imgui.SliderFloat(name, value, -2 * speed, 2 * speed, "%.2f")
             for name, value, speed in zip(names, status.command, speeds, strict=True)
@@ -172,45 +254,52 @@ class Windows:
             self._actions.do(commands.drive, (forward, left, turn))
 
     def _numbers(self) -> None:
-        """Let the user change the planner's settings and the task's parameters.
+        """Let the user change the planner's settings, the task's parameters and the world's physics.
 
         A value is sent when the user has finished editing it.
         """
-        numbers = {"planner": self._actions.status.planner, "task": self._actions.status.params}
-        owners: tuple[Literal["planner", "task"], ...] = ("planner", "task")
-        for owner in owners:
-            if not numbers[owner] or not imgui.CollapsingHeader(f"{owner} settings"):
-                continue
-            imgui.PushItemWidth(110)
-            for name, number in numbers[owner]:
-                value = self._edited.get((owner, name), number)
-                if isinstance(number, int):
-                    changed, value = imgui.DragInt(name, int(value), max(0.01 * number, 0.1), 1, 100_000)
-                else:
-                    changed, value = imgui.DragFloat(name, value, max(abs(number) / 100, 1e-3), 0, 0, "%.4g")
-                if changed:
-                    self._edited[owner, name] = value
-                if imgui.IsItemDeactivatedAfterEdit():
-                    self._actions.do(commands.set_number, owner, name, self._edited.pop((owner, name), value))
-            imgui.PopItemWidth()
+        status = self._actions.status
+        flags: list[str] = []
+        groups: tuple[tuple[Owner, str, tuple[tuple[str, float], ...]], ...] = (
+            ("planner", "planner settings", status.planner), ("task", "task settings", status.params),
+            ("physics", "physics, in multiples of the model", status.physics),
+        )  # fmt: skip
+        for owner, title, numbers in groups:
+            if numbers and imgui.CollapsingHeader(title):
+                imgui.PushItemWidth(110)
+                for name, number in numbers:
+                    self._number(owner, name, number)
+                imgui.PopItemWidth()
+            for name, number in numbers:
+                if number != self._first.setdefault((owner, name), number) and owner != "physics":
+                    flags.append(f"--param {name}={number:g}" if owner == "task" else f"--{name} {number:g}")
+        if flags and imgui.Button("copy changed numbers as flags"):
+            self._actions.tell(f"copy={' '.join(flags)}")
+
+    def _number(self, owner: Owner, name: str, number: float) -> None:
+        """Build a slider from 0 to four times the first value. Ctrl+click lets the user type any value."""
+        far = 4 * self._first.setdefault((owner, name), number) or 1.0
+        value = self._edited.get((owner, name), number)
+        if isinstance(number, int):
+            changed, value = imgui.SliderInt(name, int(value), 1, int(far))
+        else:
+            changed, value = imgui.SliderFloat(name, value, min(far, 0.0), max(far, 0.0), "%.4g")
+        if changed:
+            self._edited[owner, name] = value
+        if imgui.IsItemDeactivatedAfterEdit():
+            self._actions.do(commands.set_number, owner, name, self._edited.pop((owner, name), value))
 
     def _push(self) -> None:
         viewer = self._actions.viewer
-        body = viewer.perturb.select
-        imgui.SeparatorText(f"push {viewer.model.body(body).name if body > 0 else 'a body'}")
-        imgui.TextWrapped("double-click it, then Ctrl + drag with the right button")
+        if (body := viewer.perturb.select) > 0:
+            imgui.TextDisabled(f"Ctrl + right drag pushes {viewer.model.body(body).name or f'body {body}'}")
 
     def _metrics(self) -> None:
-        if (values := self._last_values()[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
+        if (values := self._last_values[FEW_CURVES:]) and imgui.CollapsingHeader("metrics"):
             two_columns("##metrics", values)
 
-    def _last_values(self) -> list[tuple[str, str]]:
-        rows = self.curves.rows
-        values = rows[-1, 2:].tolist() if len(rows) else []
-        return [(name, f"{value:.4g}") for name, value in zip(self._scene.curves, values, strict=False)]
-
     def _ghosts(self) -> None:
-        if not imgui.CollapsingHeader("ghosts"):
+        if not imgui.CollapsingHeader("numbers of ghosts"):
             return
         ghosts = self._actions.status.ghosts
         imgui.PushItemWidth(150)
@@ -227,9 +316,6 @@ class Windows:
             changed, grid = imgui.Checkbox("grid: worlds beside each other", ghosts.grid)
             if changed:  # limit the worlds to the number that a browser can render
                 self._actions.set_ghosts(grid=grid, worlds=ghosts.worlds or min(self._scene.nworld - 1, MOST_GHOSTS))
-        changed, plan = imgui.Checkbox("plan", ghosts.plan)
-        if changed:
-            self._actions.set_ghosts(plan=plan)
         imgui.PopItemWidth()
 
     def _camera(self) -> None:
@@ -257,6 +343,12 @@ class Windows:
                 imgui.SameLine()
             if highlighted_button(title, title in self._actions.windows):
                 self._actions.windows ^= {title}
+        imgui.SeparatorText("show")
+        for i, (title, (shown, change)) in enumerate(self._actions.toggles().items()):
+            if i:
+                imgui.SameLine()
+            if highlighted_button(title, shown):
+                change()
         if self._actions.status.video is not None:
             imgui.TextWrapped(self._actions.status.video)
 
@@ -269,30 +361,51 @@ class Windows:
 
     def _curves(self) -> None:
         names = self._scene.curves
+        imgui.SetNextItemWidth(90)
+        if (span := combo("shown", SPANS, list(SPANS).index(self._span))) is not None:
+            self._span = list(SPANS)[span]
         if len(names) > 2 and imgui.CollapsingHeader("choose"):
             for name in names:
                 if imgui.Checkbox(name, name in self._plotted)[0]:
                     self._plotted ^= {name}
-        now = time.monotonic()
-        if now >= self._next_plot:
-            self._next_plot = now + PLOT_PERIOD
-            self._plot = self.curves.thinned(PLOT_POINTS, PLOT_SECONDS)
-        low, mean, high = self._plot
-        times, ends = mean[:, 0], high[high[:, 1] > 0, 0]
-        flags = int(implot.Flags.NoLegend) | int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect)
-        flags |= int(implot.Flags.NoTitle)
-        fit, skip = int(implot.AxisFlags.AutoFit), int(implot.LineFlags.SkipNaN)
+        params = dict(self._actions.status.params) if self._frame else {}
         for i, name in enumerate(names, 2):
-            if name in self._plotted and implot.BeginPlot(name, imgui.Vec2(-1, 130), flags):
-                implot.SetupAxes("simulated seconds", name, fit, fit)
-                bounds = np.array([low[:, i], high[:, i]])
-                if np.isfinite(bounds).any():  # the order of the curves determines their colours
-                    implot.PlotShaded("range", times, *bounds)
-                    implot.PlotLine("mean", times, mean[:, i], skip)
-                    for end in ends:
-                        implot.PlotLine("end", [end, end], [np.nanmin(bounds), np.nanmax(bounds)])
-                implot.EndPlot()
-        imgui.TextDisabled("vertical lines: ends of episodes")
+            if name not in self._plotted:
+                continue
+            self._curve(name, i)
+            if name in params:  # the weight of a term has the term's name
+                imgui.PushID("weight")
+                self._number("task", name, params[name])
+                imgui.PopID()
+
+    def _curve(self, name: str, column: int) -> None:
+        low, mean, high = self._plot
+        flags = int(implot.Flags.NoMenus) | int(implot.Flags.NoBoxSelect) | int(implot.Flags.NoTitle)
+        if not implot.BeginPlot(name, imgui.Vec2(-1, 160), flags):
+            return
+        times, ends, bounds = mean[:, 0], high[high[:, 1] > 0, 0], np.array([low[:, column], high[:, column]])
+        ahead = self._ahead(times) if name == "reward" else np.empty((0, 2))
+        implot.SetupAxes("simulated time (s)", f"{name} per step" if name == "reward" else name)
+        implot.SetupLegend(_LEGEND_PLACE, int(implot.LegendFlags.Outside) | int(implot.LegendFlags.Horizontal))
+        if np.isfinite(bounds).any():  # the order of the curves determines their colours
+            values = np.append(bounds, ahead[:, 1])
+            least, most = np.nanmin(values), np.nanmax(values)
+            until, margin = max(ahead[:, 0], default=times[-1]), 0.05 * (most - least) + 1e-6
+            # limits that the plot fits itself would be sent to the browser twice
+            implot.SetupAxesLimits(times[0], until + 1e-6, least - margin, most + margin, int(implot.Cond.Always))
+            implot.PlotShaded("range", times, *bounds)
+            implot.PlotLine("mean", times, mean[:, column], int(implot.LineFlags.SkipNaN))
+            for end in ends:
+                implot.PlotLine("end of episode", [end, end], [least, most])
+            if len(ahead):
+                implot.PlotLine("predicted", ahead[:, 0], ahead[:, 1])
+        implot.EndPlot()
+
+    def _ahead(self, times: np.ndarray) -> np.ndarray:
+        """Return the times and the rewards that the plan predicts, (points, 2)."""
+        if self._frame is None or self._frame.predicted is None or not len(times):
+            return np.empty((0, 2))
+        return np.add(self._frame.predicted, [times[-1], 0.0])
 
     def _view(self) -> None:
         viewer = self._actions.viewer
@@ -331,6 +444,14 @@ class Windows:
 
 
 # helpers
+
+
+def legend(frame: Frame) -> list[Line]:
+    """Return a line for each kind of ghost, path and arrow in a frame."""
+    lines = {each.what: each.colour for each in frame.ghosts} | {each.what: each.colour for each in frame.arrows}
+    if frame.traces is not None:
+        lines |= {"path of the best sample": BEST_COLOUR, "paths of other samples": TRACE_COLOUR}
+    return [(colour, what) for what, colour in lines.items() if what]
 
 
 def highlighted_button(label: str, on: bool) -> bool:

@@ -7,6 +7,8 @@ from conftest import SharedEnv
 from memory_window import run
 
 import lyceum_warp as lw
+from lyceum_warp.viewer.commands import command, set_ghosts, set_watched
+from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
 
@@ -23,6 +25,17 @@ def test_session_calls_watchers_and_shows_their_messages(shared_env: SharedEnv) 
     session = Session(shared_env("point_mass"), watchers=[lambda: ["news"]])
     window = run(session, lambda frame: "news" in frame.messages)
     assert window.messages == ["news"]
+
+
+def test_worlds_sleep_while_no_page_is_visible(shared_env: SharedEnv) -> None:
+    session = Session(shared_env("point_mass"))
+    steps: list[int] = []
+    window = run(
+        session, [command(set_watched, False)], lambda frame: not session.stage.watched,
+        [command(set_ghosts, Ghosts())], lambda frame: bool(steps.append(session.stage.steps)) or len(steps) == 5,
+        [command(set_watched, True)], lambda frame: session.stage.steps > steps[-1],
+    )  # fmt: skip
+    assert len(set(steps)) == 1 and window.closed == 1
 
 
 def test_invalid_session_arguments_raise_an_error(shared_env: SharedEnv) -> None:

@@ -1,6 +1,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import pytest
 import torch
 from conftest import SharedEnv
 from memory_window import pushing
@@ -123,3 +124,15 @@ def test_changed_reward_weight_applies_to_all_worlds() -> None:
     env.set_state(state)
     env.step(torch.ones(2, 3))
     torch.testing.assert_close(env.reward, before - 3.0)
+
+
+def test_changed_physics_applies_to_the_displayed_world() -> None:
+    env = lw.make("go1_velocity", nworld=2)
+    session = Session(env, seed=0, paused=True)
+    part = env.state_space.parts["geom_friction"]
+    nominal, other = env.task.model.geom_friction.ravel(), env.get_state()[1, part].clone()
+    session.obey(command(set_number, "physics", "geom_friction", 0.5))
+    state = env.get_state()
+    np.testing.assert_allclose(state[0, part], 0.5 * nominal, rtol=1e-6)
+    assert torch.equal(state[1, part], other)
+    assert dict(session.stage.frame().status.physics) == {"geom_friction": pytest.approx(0.5)}

@@ -46,6 +46,7 @@ def test_the_history_is_bounded_and_its_end_is_reported(shared_env: SharedEnv) -
     assert "the history ends here" in session.stage.frame().messages[0]
     session.obey(command(reset, random=False))
     assert past.ahead == 0
+    assert Session(lw.make("hopper", horizon=3000)).stage.live.past.length == 3001  # a whole episode
     worlds = shared_env("point_mass", nworld=3)
     plant = Session(worlds, controllers={"own": towards}).stage.live
     assert plant.env is not worlds and plant.past.states.nbytes <= PLANT_HISTORY_BYTES

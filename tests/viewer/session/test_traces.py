@@ -53,6 +53,7 @@ def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
     assert torch.equal(view.samples[:, 0], mppi.sampled[:, best])
     traces = TraceRollouts(mppi, plant)(view)
     assert traces.paths.shape == (7, 6, 3)
+    rewards = []
     for path, actions in zip(
         traces.paths[[0, 3, 6]], (view.samples[:, 0], view.samples[:, 3], view.actions), strict=True
     ):
@@ -62,8 +63,10 @@ def test_traces_equal_the_paths_of_the_samples(shared_env: SharedEnv) -> None:
         for point, action in zip(path[1:], actions, strict=True):
             plant.step(action[None])
             np.testing.assert_allclose(point, site, atol=1e-6)
+            rewards.append(plant.reward.item())
     qpos = plant.get_state()[0, plant.state_space.parts["qpos"]]
     np.testing.assert_allclose(traces.final[plant.state_space.parts["qpos"]], qpos, atol=1e-6)
+    np.testing.assert_allclose(traces.rewards, rewards[-5:], rtol=1e-5)  # the plan is the last path
     assert control.look() is None  # unchanged
 
 

@@ -7,6 +7,7 @@ from headless_screen import Bench, frame_of, robot, scene_of, state_of, status_o
 
 from lyceum_warp.viewer.commands import (
     command,
+    drive,
     reset,
     set_backwards,
     set_ghosts,
@@ -14,14 +15,15 @@ from lyceum_warp.viewer.commands import (
     set_paused,
     set_speed,
     set_video,
+    set_watched,
     set_world,
     step_by,
 )
-from lyceum_warp.viewer.protocol import Ghost, Ghosts, Opened
-from lyceum_warp.viewer.window import studio
+from lyceum_warp.viewer.protocol import Arrow, Frame, Ghost, Ghosts, Opened
+from lyceum_warp.viewer.window import panel, studio
 from lyceum_warp.viewer.window.actions import ACTIONS
 from lyceum_warp.viewer.window.studio import imgui
-from lyceum_warp.viewer.window.windows import WINDOWS
+from lyceum_warp.viewer.window.windows import WINDOWS, legend
 
 
 @pytest.fixture
@@ -52,7 +54,7 @@ def test_panel_draws_every_mode_with_all_windows_open(mode: str, monkeypatch: py
         ),
         points=np.array([[0.0, 0.0, 1.0, np.nan], [0.1, 1.0, 2.0, 3.0]]), messages=("world 3: terminated",),
     )  # fmt: skip
-    assert bench.sent == [Opened(("viewer: http://here",))]
+    assert bench.sent == [Opened(("viewer: http://here",)), command(set_watched, False)]
     assert bench.draw() == bench.draw(frame) == []  # draw without a frame, then with the first frame
     bench.panel.actions.cameras.choose(studio.ux.FREE_CAMERA_IDX)
     assert bench.draw() == []
@@ -133,3 +135,71 @@ def test_world_with_other_geom_sizes_gets_a_separate_model(bench: Bench, monkeyp
         sizes = factor * np.array(bench.model.geom_size).ravel()
         bench.draw(frame_of(bench.model, bench.data, model_fields={"geom_size": sizes}))
         assert bench.models.pop().geom("ball").size[0] == pytest.approx(0.1 * factor)
+
+
+# the page
+
+
+@pytest.mark.parametrize("size", [(390, 844), (800, 600), (1440, 900)])
+def test_windows_are_inside_the_page(size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench(model := robot(), scene_of(model))
+    bench.panel.actions.windows |= set(WINDOWS)
+    imgui.GetIO().DisplaySize = imgui.Vec2(*size)
+    left, edges = [0.0], []
+    move, resize = imgui.SetNextWindowPos, imgui.SetNextWindowSize
+    monkeypatch.setattr(imgui, "SetNextWindowPos", lambda at, *more: (left.append(at.x), move(at, *more)))
+    monkeypatch.setattr(
+        imgui, "SetNextWindowSize", lambda to, *more: (edges.append(left[-1] + to.x), resize(to, *more))
+    )
+    bench.show(status_of())
+    assert len(edges) >= 4 and min(left) >= 0 and max(edges) <= size[0]
+
+
+def test_slow_page_turns_shadows_off_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    shadow = mujoco.mjtRndFlag.mjRND_SHADOW
+    monkeypatch.setattr(panel, "RATE_TIME", 0.0)
+    bench.panel.look(True)
+    bench.show(status_of())
+    assert bench.viewer.render_flags.flags[shadow]  # nothing has been drawn yet
+    monkeypatch.setattr(panel, "SLOW", np.inf)
+    bench.inputs = 100
+    bench.show(status_of())
+    assert not bench.viewer.render_flags.flags[shadow] and "shadows" in bench.panel.actions.messages[-1]
+    bench.viewer.render_flags.flags = [1] * 12  # the user turns them on again
+    bench.inputs = 200
+    bench.show(status_of())
+    assert bench.viewer.render_flags.flags[shadow]
+
+
+def test_worlds_run_only_while_a_page_is_visible(bench: Bench) -> None:
+    bench.sent.clear()
+    for looks in (True, True, False):
+        bench.panel.look(looks)
+    assert bench.sent == [command(set_watched, True), command(set_watched, False)]
+
+
+def test_gamepad_drives_a_robot_that_can_be_driven(bench: Bench) -> None:
+    driven = Bench(bench.model, scene_of(bench.model, speeds=(2.0, 1.0, 0.5)))
+    driven.sent.clear()
+    driven.panel.steer([0.5, -1.0, 1.0])
+    assert driven.sent == [command(drive, (1.0, -1.0, 0.5))]
+    bench.sent.clear()
+    bench.panel.steer([1.0, 0.0, 0.0])
+    assert bench.sent == []
+
+
+def test_changed_numbers_are_copied_as_flags(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    bench.show(status_of(params=(("weight", 0.5),), planner=(("samples", 8),)))
+    monkeypatch.setattr(imgui, "Button", lambda label: "flags" in label)
+    bench.show(status_of(params=(("weight", 0.5),), planner=(("samples", 8),)))
+    assert bench.told == []  # nothing has changed
+    bench.show(status_of(params=(("weight", 0.25),), planner=(("samples", 16),), paused=True))
+    assert bench.told == ["copy=--samples 16 --param weight=0.25"]
+
+
+def test_legend_names_ghosts_paths_and_arrows_once() -> None:
+    state, red, blue = np.zeros(3), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, 1.0, 1.0)
+    ghosts = (Ghost(state, red, what="past"), Ghost(state, red, what="past"), Ghost(state, None))
+    frame = Frame(state, {}, status_of(), ghosts, np.zeros((2, 2, 3)), (Arrow(state, state, blue, "command"),))
+    names = {name: colour for colour, name in legend(frame)}
+    assert names["past"] == red and names["command"] == blue and len(names) == 4

@@ -151,7 +151,7 @@ def test_silent_tab_is_reported_and_loses_control_to_another_tab(
 ) -> None:
     monkeypatch.setattr(module, "QUIET_SECONDS", 0.3)
     quiet: list[float] = []
-    studio.page.on_quiet = lambda: quiet.append(time.monotonic())
+    studio.page.on_look = lambda looks: None if looks else quiet.append(time.monotonic())
     with studio.tab("state?sid=a"), studio.tab("ui?sid=a") as tab:
         tab.send(HANDSHAKE)
         tab.recv(timeout=10)
@@ -162,6 +162,16 @@ def test_silent_tab_is_reported_and_loses_control_to_another_tab(
             tab.send(b"input")  # the last input may be older than QUIET_SECONDS
             while True:
                 tab.recv(timeout=10)
+
+
+def test_gamepad_is_reported_and_other_axes_are_ignored(studio: Studio) -> None:
+    axes: list[list[float]] = []
+    studio.page.on_gamepad = axes.append
+    with studio.tab("state?sid=a") as tab:
+        for text in ("nan,0,0", "2,0,0", "1,0", "x", "0.5,-1,0"):
+            tab.send(f"gamepad={text}")
+        wait_until(lambda: bool(axes))
+    assert axes == [[0.5, -1.0, 0.0]]
 
 
 # addresses and ports
