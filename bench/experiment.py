@@ -36,7 +36,7 @@ FOLDER = Path(__file__).resolve().parent
 RESULTS = FOLDER / "results"
 NAMES = (
     "throughput", "learning", "records", "gate", "mppi", "latency", "humanoid", "fidelity", "agreement", "equivalence",
-    "policies", "integrators", "students", "tracking", "fits", "pictures", "soak",
+    "policies", "integrators", "students", "tracking", "fits", "pictures", "objects", "soak",
 )  # fmt: skip
 
 HARDWARE = ("cpu", "cores", "gpu", "driver", "power_limit")

@@ -58,8 +58,8 @@ MANY_MEMBERS = 8
 
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
-    "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/control tasks/arms tasks/balance "
-    "tasks/velocity velocity terrain tasks/tracking tracking dm_suite",
+    "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/hands tasks/control tasks/arms tasks/balance "
+    "tasks/velocity velocity terrain objects tasks/tracking tracking dm_suite",
     "Learning": "runs many_runs clusters ppo sac memory pixels policies learners deployment fitting adapters "
     "notebooks/own_robot notebooks/deploy",
     "Planning": "planning notebooks/live_planner",

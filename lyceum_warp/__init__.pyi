@@ -48,6 +48,12 @@ from lyceum_warp.core.model_files import (
     package_model as package_model,
     playground_model as playground_model,
 )
+from lyceum_warp.core.objects import (
+    Objects as Objects,
+    mesh as mesh,
+    myosuite_objects as myosuite_objects,
+    shape as shape,
+)
 from lyceum_warp.core.options import EnvOptions as EnvOptions, PhysicsOptions as PhysicsOptions
 from lyceum_warp.core.task import (
     Planning as Planning,

@@ -82,6 +82,8 @@ def _wrong_names(task: Any, source: TaskSource) -> Iterator[str]:
         for name in getattr(task, attribute):
             if name not in source.world.vars:
                 yield f"{attribute} has {name!r}: make it a field of World, too"
+    if writers := [name for name, fields in source.writes.items() if "object" in fields]:
+        yield f"{writers[0]} writes object, which the environment chooses: read it only"
     twice = source.drawn_between_steps & source.writes["startup"]
     if both := [name for name in source.types if is_model_field(name) and name in twice]:
         yield f"the model field {both[0]!r} is written by startup and by resets or events: write it in one of them"

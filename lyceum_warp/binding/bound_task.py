@@ -7,6 +7,8 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
 import warp as wp
 
 from lyceum_warp.binding import models
@@ -19,10 +21,11 @@ from lyceum_warp.binding.registry import task_name
 from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.fields import Field, describe, is_data_field, vec10
 from lyceum_warp.core.fitted import Fitted
-from lyceum_warp.core.model_fields import describe_model_field
+from lyceum_warp.core.model_fields import MOVED_INERTIA, describe_model_field
 from lyceum_warp.core.model_files import ModelSource, read_task_spec
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.core.task import MEMORIES, Task
+from lyceum_warp.models.objects import ObjectModels
 
 _SPELLED = {
     "float32": "float", "int32": "int", "vec3f": "wp.vec3", "vec4f": "lw.quat", "mat33f": "wp.mat33",
@@ -40,6 +43,7 @@ class BoundTask:
         fitted: Folder of a fit.
         fitted_draws: Whether the fitted fields may differ between worlds.
         cameras: Cameras whose pictures are observations; None for those of the task.
+        objects: Names of the objects that worlds hold; None for the task's default.
     """
 
     def __init__(
@@ -55,6 +59,7 @@ class BoundTask:
         fitted: str | None = None,
         fitted_draws: bool = False,
         cameras: Collection[Camera] | None = None,
+        objects: Collection[str] | None = None,
     ) -> None:
         physics = physics or PhysicsOptions()
         self.definition = task
@@ -84,10 +89,15 @@ class BoundTask:
         if self.fit:
             self.fit.delay(edited, physics.timestep or edited.option.timestep)
         varied = {*model_fields, *dynamics, *fields_of_fit}
+        objects_in_model = self._put_objects(edited, objects)
+        if len(self.objects) > 1:
+            varied |= MOVED_INERTIA
         for camera in self.cameras:
             camera.add_to(edited)
         with _file_in_errors(task.model if model is None else model):
-            self.nominal = models.compile_model(edited, data_fields, physics, varied=varied)
+            self.nominal = models.compile_model(
+                edited, data_fields, physics, varied=varied, keep_meshes=bool(self.objects)
+            )
             """The compiled model without the values of a fit."""
         self.model = self.nominal
         if self.fit:
@@ -109,19 +119,44 @@ class BoundTask:
             describe(self.model, name, lagged=name in task.lagged, cleared=name in task.cleared, written=name in inputs)
             for name in dict.fromkeys([*data_fields, "time", "ctrl"])
         ]
-        self._describe_model_fields(model_fields, dynamics)
+        rows = {} if objects_in_model is None else objects_in_model.rows(self.model)
+        self._describe_model_fields(model_fields, dynamics, rows)
+        if fitted_draws and (both := sorted(rows.keys() & set(fields_of_fit))):
+            raise ValueError(f"fitted_draws=True draws {both[0]}, which differs between objects: name one object")
         self.parameters = Parameters(source, self.nominal, params or {}, nworld=nworld, timestep=self.timestep)
         self.layouts = layouts_of(source, self.params)
         self.kernels = kernels_of(source, self.layouts)
 
-    def _describe_model_fields(self, model_fields: Collection[str], dynamics: Collection[str]) -> None:
+    def _put_objects(self, spec: mujoco.MjSpec, names: Collection[str] | None) -> ObjectModels | None:
+        """Put the objects into a spec, unless the worlds keep the geoms of the model."""
+        declared = self.definition.objects
+        self.objects: dict[str, int] = {}
+        """The objects that worlds hold, each with its index."""
+        if declared is None:
+            if names is not None:
+                raise ValueError(f"objects={list(names)} needs a task that declares objects: omit it, or give the task "
+                                 "objects = lw.Objects(...)")  # fmt: skip
+            return None
+        if names is None and (body := spec.body(declared.body)) is not None and body.geoms:
+            return None
+        self.objects = declared.chosen(names)
+        return ObjectModels(spec, declared, self.objects, self.definition)
+
+    def _describe_model_fields(
+        self, model_fields: Collection[str], dynamics: Collection[str], rows: Mapping[str, np.ndarray]
+    ) -> None:
         drawn = self.source.drawn_between_steps
-        self.reset_dynamics = [name for name in model_fields if name in drawn]
+        self.redraws = bool(rows) and self.definition.objects.redraw  # type: ignore[union-attr]
+        """Whether a random reset draws another object."""
+        changed = drawn | rows.keys() if self.redraws else drawn
+        self.reset_dynamics = [name for name in dict.fromkeys([*model_fields, *rows]) if name in changed]
         """The model fields that resets or events write. A reset first restores their nominal values."""
-        varied = drawn | self.writes["startup"] | frozenset(dynamics)
+        if once := sorted(changed & self.writes["startup"] & rows.keys()):
+            raise ValueError(f"startup writes {once[0]}, which a reset changes with the object: write it in randomize")
+        varied = drawn | self.writes["startup"] | frozenset(dynamics) | rows.keys()
         self.dynamics = [
-            describe_model_field(self.model, name)
-            for name in dict.fromkeys([*model_fields, *dynamics])
+            describe_model_field(self.model, name, rows=rows.get(name))
+            for name in dict.fromkeys([*model_fields, *dynamics, *rows])
             if name in varied
         ]
         self.constants = [

@@ -64,7 +64,12 @@ def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
 
 
 def compile_model(
-    spec: mujoco.MjSpec, fields: Collection[str], physics: PhysicsOptions, *, varied: Collection[str] = ()
+    spec: mujoco.MjSpec,
+    fields: Collection[str],
+    physics: PhysicsOptions,
+    *,
+    varied: Collection[str] = (),
+    keep_meshes: bool = False,
 ) -> mujoco.MjModel:
     """Compile a model for both engines.
 
@@ -81,6 +86,7 @@ def compile_model(
         fields: Names of the fields that will be read.
         physics: Options of the solver and the integrator that replace the model's own.
         varied: Names of the model fields that may differ between worlds.
+        keep_meshes: Whether to compile meshes that no geom uses.
     """
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
@@ -97,6 +103,8 @@ def compile_model(
             setattr(spec.option, name, codes[name][value] if name in codes else value)
     if physics.discardvisual is not None:
         spec.compiler.discardvisual = physics.discardvisual
+    if keep_meshes:
+        spec.compiler.discardvisual = False
     for name, limit in (physics.solver or {}).items():
         setattr(spec.option, name, limit)
     for sensor in sorted({ON_DEMAND[name] for name in fields if name in ON_DEMAND}, key=int):

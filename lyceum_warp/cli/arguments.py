@@ -90,6 +90,8 @@ def given(flags: Any) -> dict[str, Any]:
     values = given_values(flags)
     if "solver" in values:
         values["solver"] = dict(map(parameter, values["solver"]))
+    if isinstance(values.get("objects"), str):
+        values["objects"] = values["objects"].split(",")
     return values
 
 
@@ -112,10 +114,15 @@ class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     device: str | None = None
     """cpu (the default), or a CUDA device such as cuda:0. The commands eval and view use the CPU by default if a run's
     engine is auto, because the CPU is faster for a few worlds."""
+    objects: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME...")] = None
+    """Names of the objects that the worlds hold, of those that the task declares. By default, the worlds hold all of
+    them, or the geoms of the model."""
 
 
 class EnvFlags(
-    Placement, options=[EnvOptions], omit=(*NO_FLAGS, "engine", "device", "nthread", "fitted", "fitted_draws")
+    Placement,
+    options=[EnvOptions],
+    omit=(*NO_FLAGS, "engine", "device", "nthread", "fitted", "fitted_draws", "objects"),
 ):
     """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 

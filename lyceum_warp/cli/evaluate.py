@@ -233,6 +233,12 @@ def _print_statistics(env: Env, episodes: Episodes) -> None:
     console.print(table(columns))
     if env.task.functions["success"] is not None:
         console.print(f"success: {episodes.success.mean().item():.0%}")
+    if len(episodes.objects) > 1:
+        parts = {name: episodes.select(held) for name, held in episodes.objects.items() if held.any()}
+        columns = {"object": list(parts), "episodes": [str(len(part.returns)) for part in parts.values()]}
+        for heading, name in (("success", "success"), ("return", "returns")):
+            columns[heading] = [f"{getattr(part, name).mean().item():.4g}" for part in parts.values()]
+        console.print(table(columns))
 
 
 def _print_transfer(verdict: Transfer) -> None:

@@ -196,14 +196,15 @@ def _worlds(
 
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
-    steps: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
-    plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **steps), params)
+    planner_options = given(options.planner) | given(options.planner_physics)
+    own: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
+    own |= {"objects": planner_options.get("objects")}
+    plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **own), params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.definition
     value = None if options.value is None else load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    planner_options = given(options.planner) | given(options.planner_physics)
     if options.planner_model is not None:
         planner_options["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 

@@ -103,7 +103,8 @@ class View:
             if self.follow:
                 watchers.append(Follower(run, controllers["policy"]))
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
-            env = Env(self.what[0], EnvOptions(autoreset=False, nthread=1), params)
+            own = EnvOptions(autoreset=False, nthread=1, objects=options.get("objects"))
+            env = Env(self.what[0], own, params)
         else:
             nworld = 1 if self.nworld is None else self.nworld
             env = Env(self.what[0], EnvOptions(nworld=nworld).changed(options), params)

@@ -34,6 +34,12 @@ from lyceum_warp.core.model_files import (
     playground_model as playground_model,
     read_spec as read_spec,
 )
+from lyceum_warp.core.objects import (
+    Objects as Objects,
+    mesh as mesh,
+    myosuite_objects as myosuite_objects,
+    shape as shape,
+)
 from lyceum_warp.core.options import (
     CONES as CONES,
     INTEGRATORS as INTEGRATORS,

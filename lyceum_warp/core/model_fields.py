@@ -71,6 +71,11 @@ VARYING_FIELDS = (
 )
 """Fields that can differ between worlds, each with the constants that follow from it."""
 
+MESH_FIELDS = ("geom_dataid", "geom_aabb", "geom_rbound")
+OBJECT_FIELDS = ("object", *MESH_FIELDS)
+"""Fields that differ between worlds only if the worlds hold different objects. ``object`` is the object's index, which
+is no field of MjModel."""
+
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 
 _COMPUTED = set(
@@ -111,6 +116,8 @@ class ModelField:
     dtype: type
     """Warp type of an element: float, wp.vec3, wp.vec4 for quaternions (w, x, y, z), ..."""
     constants: Constants
+    rows: np.ndarray | None = dataclasses.field(default=None, compare=False, repr=False)
+    """The values of each object, (objects, size), float64; None if the field does not depend on the object."""
 
     @property
     def size(self) -> int:
@@ -123,13 +130,18 @@ class ModelField:
         return self.name in _OPTIONS
 
     @property
+    def in_model(self) -> bool:
+        """Whether the field is a field of MjModel, not the index of the world's object."""
+        return self.name != "object"
+
+    @property
     def follows(self) -> bool:
         """Whether MuJoCo computes the field from other fields."""
         return self.name in _COMPUTED
 
     def problem(self, model: mujoco.MjModel, rows: np.ndarray) -> str | None:
         """Describe the first invalid value, or return None."""
-        nominal = self.value(model).ravel()
+        nominal = self.nominal(model).min(axis=0)
         bad = ~np.isfinite(rows)
         if self.name in NOT_NEGATIVE:
             bad |= (rows < 0) | ((rows == 0) & (nominal > 0) & (self.name in _POSITIVE))
@@ -148,7 +160,13 @@ class ModelField:
 
     def value(self, model: mujoco.MjModel) -> np.ndarray:
         """Get this field's value in a model, in float64. An array is returned as a view."""
+        if self.name == "object":
+            return np.zeros(1)
         return np.asarray(getattr(model.opt if self.option else model, self.name))
+
+    def nominal(self, model: mujoco.MjModel) -> np.ndarray:
+        """Get the nominal values, (objects, size), float64; (1, size) if they do not depend on the object."""
+        return self.value(model).reshape(1, -1).astype(np.float64) if self.rows is None else self.rows
 
 
 def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[str, torch.Tensor]) -> None:
@@ -173,11 +191,15 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
 
 def is_model_field(name: str) -> bool:
     """Return whether MjModel or MjModel.opt has an attribute of this name."""
-    return name in VARYING_FIELDS or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
+    return name == "object" or hasattr(mujoco.MjModel, name) or hasattr(mujoco.MjOption, name)
 
 
-def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = True) -> ModelField:
-    """Describe a field of a model."""
+def describe_model_field(
+    model: mujoco.MjModel, name: str, *, varies: bool = True, rows: np.ndarray | None = None
+) -> ModelField:
+    """Describe a field of a model; ``rows`` has the values of each object."""
+    if name == "object":
+        return ModelField(name, (1,), wp.float32, Constants.NONE, rows)
     if not varies and name not in VARYING_FIELDS:
         value: Any = getattr(model, name, None)
         numbers = isinstance(value, np.ndarray) and value.dtype == np.float64
@@ -185,15 +207,15 @@ def describe_model_field(model: mujoco.MjModel, name: str, *, varies: bool = Tru
             reason = _REASONS[name] if name == "timestep" else "it has no rows of real numbers; make it a parameter"
             raise ValueError(f"the model field {name!r} cannot be read in World: {reason}")
         return ModelField(name, value.shape[:1], element_type(value.shape), Constants.NONE)
-    if name not in VARYING_FIELDS:
+    if name not in VARYING_FIELDS and rows is None:
         shared = "the engines share it between all worlds" if is_model_field(name) else "it is no field of MjModel"
         raise ValueError(f"the field {name!r} cannot differ between worlds: {_REASONS.get(name, shared)}")
-    constants = VARYING_FIELDS[name]
+    constants = VARYING_FIELDS.get(name, Constants.PRIVATE)
     if name in _WRAPPED and np.isin(model.wrap_type, _WRAPS).any():
         constants |= _POSES
     # a task can write a scalar only as an array of one element
     shape: tuple[int, ...] = np.shape(getattr(model.opt if name in _OPTIONS else model, name)) or (1,)
-    return ModelField(name, shape[:1], element_type(shape), constants)
+    return ModelField(name, shape[:1], element_type(shape), constants, rows)
 
 
 MOVED_INERTIA = {"body_ipos", "body_iquat"}

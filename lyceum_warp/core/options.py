@@ -186,6 +186,9 @@ class EnvOptions:
     fitted_draws: bool = False
     """Whether each world draws its own values from what the fit left uncertain. A world keeps them for all episodes,
     and the task's own draws start from them."""
+    objects: Collection[str] | None = None
+    """Names of objects that the task declares, such as ``["cube", "mug"]``. Each world holds one of them. By default,
+    worlds hold all of the task's objects, or the geoms of the model if the object's body has geoms."""
     cameras: Collection[Camera] | None = None
     """Cameras whose pictures are observations, such as ``[lw.Camera("fixed")]``; by default those of the task."""
     final_pictures: bool = False
@@ -214,13 +217,14 @@ class EnvOptions:
             raise ValueError("fitted_draws=True needs a fit: pass its folder as fitted=...")
         check_flag("graphs", self.graphs)
         check_flag("final_pictures", self.final_pictures)
+        if self.objects is not None:
+            object.__setattr__(self, "objects", _names("objects", self.objects, "objects", "mug"))
+            if len(set(self.objects)) < max(1, len(self.objects)):
+                raise ValueError(f"objects must be at least one name, each once, not {list(self.objects)}")
         if self.cameras is not None:
             object.__setattr__(self, "cameras", cameras_of(self.cameras))
         for option, example in (("fields", "sensordata"), ("dynamics", "body_mass")):
-            names = getattr(self, option)
-            if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):
-                raise ValueError(f"{option} must be names of fields, as in {option}=[{example!r}], not {names!r}")
-            object.__setattr__(self, option, tuple(names))
+            object.__setattr__(self, option, _names(option, getattr(self, option), "fields", example))
 
     @classmethod
     def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
@@ -247,6 +251,12 @@ class EnvOptions:
         own = given_values(self)
         own.pop("physics", None)
         return own | self.physics.given()
+
+
+def _names(option: str, names: Any, what: str, example: str) -> tuple[str, ...]:
+    if not isinstance(names, list | tuple | Set) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f"{option} must be names of {what}, as in {option}=[{example!r}], not {names!r}")
+    return tuple(names)
 
 
 def _physics(given: Any) -> PhysicsOptions:

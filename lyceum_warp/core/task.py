@@ -11,6 +11,7 @@ import warp as wp
 
 from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.gate import Gate
+from lyceum_warp.core.objects import Objects
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.upstream import extend_structs
@@ -390,6 +391,10 @@ class Task:
     ``observe`` is a Warp struct whose fields have the default ``lw.part(size)``."""
     cameras: ClassVar[tuple[Camera, ...]] = ()
     """Cameras whose pictures are further groups of observations, such as ``(lw.Camera("fixed", width=64),)``."""
+    objects: ClassVar[Objects | None] = None
+    """Models of a body, of which each world holds one, such as ``lw.Objects("object", {"cube": lw.shape("box", 0.03,
+    0.03, 0.03), "mug": lw.mesh("mug.stl")})``. ``World`` may list ``object: Row[float]``; its element is the index of
+    the world's object in this dict."""
     params: ClassVar[Mapping[str, Any]] = {}
     """Defaults that replace those of ``Params``, such as ``{"move_speed": 8.0}`` for a faster variant of a task."""
     rewards: ClassVar[Mapping[str, float]] = {}

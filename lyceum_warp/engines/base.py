@@ -61,7 +61,8 @@ class Engine(abc.ABC):
     """The fields that the engine provides, by name, always including ``ctrl``."""
     dynamics: dict[str, ModelField]
     nominal: dict[str, wp.array]
-    """The model's values of the fields in ``dynamics``, (1, ...), float32."""
+    """The nominal values of the fields in ``dynamics``, (1, ...) or, if they depend on the object, (objects, ...),
+    float32."""
     initial: np.ndarray
     """The initial state of worlds after ``reset``, (integration_size,), float64."""
     arrays: dict[str, wp.array]
@@ -95,7 +96,7 @@ class Engine(abc.ABC):
         self.dynamics, self.nominal, self.arrays = {}, {}, {}
         for varied in dynamics:
             self.dynamics[varied.name] = varied
-            self.nominal[varied.name] = self._nominal_rows(varied, 1)
+            self.nominal[varied.name] = self._array_of(varied, varied.nominal(model))
         self.fault = wp.zeros(nworld, dtype=int, device=device)
         self.stage = max(field.refresh for field in self.fields.values())
         self.reset_stage = max(field.reset for field in self.fields.values())
@@ -105,12 +106,16 @@ class Engine(abc.ABC):
         self.initial = _initial_state(model) if initial is None else np.array(initial, dtype=np.float64)
         self._everyone = wp.full(nworld, True, dtype=bool, device=device)
 
-    def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
-        value = np.tile(field.value(self.model).astype(np.float32).reshape(-1), (rows, 1))
-        array: wp.array = wp.zeros((rows, *field.shape), dtype=field.dtype, device=self.device)
-        if value.size:
-            wp.copy(flat(array), wp.array(value, dtype=wp.float32, device=self.device))
+    def _array_of(self, field: ModelField, rows: np.ndarray) -> wp.array:
+        """Make an array of a model field from rows, (n, size)."""
+        array: wp.array = wp.zeros((len(rows), *field.shape), dtype=field.dtype, device=self.device)
+        if rows.size:
+            wp.copy(flat(array), wp.array(rows, dtype=wp.float32, device=self.device))
         return array
+
+    def _nominal_rows(self, field: ModelField, rows: int) -> wp.array:
+        """Make an array of a model field, (rows, ...), with the model's values."""
+        return self._array_of(field, np.tile(field.value(self.model).reshape(1, -1), (rows, 1)))
 
     @classmethod
     def bytes_per_world(

@@ -8,9 +8,10 @@ import torch
 import warp as wp
 
 from lyceum_warp.core.cameras import Camera
+from lyceum_warp.core.model_fields import MESH_FIELDS
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp.sizes import data_bytes
-from lyceum_warp.engines.warp.varied_model import StaticGeoms, put_varied_model
+from lyceum_warp.engines.warp.varied_model import StaticGeoms, put_varied_model, set_meshes
 from lyceum_warp.engines.warp.warp_engine import refusals
 from lyceum_warp.kernels.pictures import unpack_rgb
 from lyceum_warp.support.arrays import flat, torch_view
@@ -63,7 +64,8 @@ class Pictures:
         data.qpos = engine.arrays["qpos"]
         if model.nmocap:
             data.mocap_pos, data.mocap_quat = engine.arrays["mocap_pos"], engine.arrays["mocap_quat"].view(wp.quat)
-        self._rows = [(flat(engine.arrays[f.name]), flat(getattr(self._model, f.name))) for f in seen if f.size]
+        names = [field.name for field in seen if field.size and field.name not in MESH_FIELDS]
+        self._rows = [(flat(engine.arrays[name]), flat(getattr(self._model, name))) for name in names]
         self._static = StaticGeoms(model, engine.dynamics, engine.device)
         self._everyone = wp.full(nworld, True, dtype=bool, device=engine.device)
         self.groups, self._packed = {}, []
@@ -83,6 +85,7 @@ class Pictures:
         for source, target in self._rows:
             wp.copy(target, source)
         with wp.ScopedDevice(self._engine.device):
+            set_meshes(self._model, self._engine.arrays, self._engine.model.nmesh, self._everyone)
             self._static.place(self._model, self._data, self._everyone)
             mjw.fwd_kinematics(self._model, self._data)
             mjw.refit_bvh(self._model, self._data, self._context)

@@ -68,6 +68,9 @@ class WorldArrays:
             self._allocate_masks()
             self.state = wp.zeros((self.nworld, self.state_space.size), dtype=wp.float64)
         self.state_view = torch_view(self.state)
+        index = [float(index) for index in task.objects.values()]
+        self.object_index: wp.array = wp.array(index, dtype=float, device=self.device)
+        """The indices of the objects that worlds hold."""
         self.drawn: dict[str, wp.array] = {}
         """Each world's own values of fitted model fields, (nworld, size), which take the place of the nominal ones."""
         self._allocate_pictures(final_pictures)

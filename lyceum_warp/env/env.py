@@ -2,7 +2,7 @@
 
 import copy
 import functools
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,6 +59,7 @@ def make(  # noqa: D417
     dynamics: Collection[str] = (),
     fitted: str | Path | None = None,
     fitted_draws: bool = False,
+    objects: Collection[str] | None = None,
     cameras: Collection[Camera] | None = None,
     final_pictures: bool = False,
     physics: str | PhysicsOptions | None = None,
@@ -383,9 +384,26 @@ class Env:
             world, column = bad.nonzero()[0].tolist()
             part, number = self.state_space.part_at(column), state[world, column].item()
             raise ValueError(f"the state of world {world} has {number} in its {part!r}: states must be finite")
+        if check and self.task.objects:
+            self._check_objects(state)
         worlds.state_view.copy_(state)
         for call in worlds.programs.restore_state:
             call()
+
+    def _check_objects(self, state: torch.Tensor) -> None:
+        """Raise a ValueError if a state that will be set has an object that no world of this environment can hold."""
+        parts, known = self.state_space.parts, list(self.task.objects.values())
+        held = state[:, parts["object"]].squeeze(1)
+        bad = ~torch.isin(held, torch.tensor(known, dtype=held.dtype, device=held.device))
+        if "geom_dataid" in parts:  # in an environment with other objects, meshes may have other indices
+            meshes = self.worlds.nominal_rows("geom_dataid", held.clamp(0, max(known)))
+            bad |= (state[:, parts["geom_dataid"]] != meshes).any(1)
+        if (bad := bad & self.worlds.mask_view).any():
+            world = int(bad.nonzero()[0])
+            raise ValueError(
+                f"the state of world {world} holds an object of another environment (index {held[world].item():g}): "
+                f"this environment was made with objects={list(self.task.objects)}"
+            )
 
     # getters and setters
 
@@ -502,6 +520,8 @@ class Env:
         Args:
             mask: Worlds to change, (nworld,) bool; by default all.
             fields: Values by name, as in ``body_mass=masses``, with one row per world or one row for all worlds.
+                ``object`` takes the name of an object, or one name per world. The world's model fields that depend on
+                the object then become nominal.
 
         Raises:
             ValueError: A field is not a model field that differs between worlds, or a value is invalid.
@@ -509,10 +529,25 @@ class Env:
         state = self.get_state()
         columns = self.state_space.split(state)
         with errors_of(self.task.definition):
+            if (names := fields.pop("object", None)) is not None:
+                self._put_objects([names] * self.nworld if isinstance(names, str) else names, columns)
             check_fields(fields)
             put_rows(self.task.model, fields, columns)
             self._check_dynamics({name: columns[name] for name in fields})
         self.set_state(state, mask)
+
+    def _put_objects(self, names: Sequence[str], columns: Mapping[str, torch.Tensor]) -> None:
+        known = self.task.objects
+        if len(names) != self.nworld or (unknown := [name for name in names if name not in known]):
+            what = f"{len(names)} names" if len(names) != self.nworld else repr(unknown[0])
+            raise ValueError(
+                f"object must be a name, or one name for each of the {self.nworld} worlds, not {what}: worlds hold "
+                f"{', '.join(known) or 'no objects'}"
+            )
+        held = torch.tensor([known[name] for name in names], device=self.obs.device)
+        for field in self.task.dynamics:
+            if field.rows is not None:
+                columns[field.name].copy_(self.worlds.nominal_rows(field.name, held))
 
     def _check_dynamics(self, rows: Mapping[str, torch.Tensor]) -> None:
         """Raise a ValueError for the first invalid value of model fields, each (nworld, ...)."""

@@ -89,8 +89,10 @@ class OpenLoop:
                 f"and type {wp.types.type_repr(keys.dtype)} on {keys.device}"
             )
         self._keys, self._models = keys, dict(models or {})
+        self._nominal: dict[str, wp.array] = {}
         for name, row in (env.engine.nominal if nominal_model else {}).items():
-            self._models.setdefault(name, wp.array(flat(row).numpy(), dtype=wp.float64, device=env.device))
+            if name not in self._models and name != "object":
+                self._nominal[name] = wp.array(flat(row).numpy(), dtype=wp.float64, device=env.device)
         stepwise = task.functions["control"] is not None or task.functions["substep"] is not None
         length = f"horizon {self.horizon} with frame_skip {task.frame_skip}"
         check_fit(self._bytes_per_world(env, self.horizon), n, env.device, model=length)
@@ -192,8 +194,11 @@ class OpenLoop:
     def _start(self) -> None:
         worlds, device = self.worlds, self.env.device
         wp.launch(rollouts.broadcast, worlds.state.shape, [self._state, worlds.state], device=device)
-        for name, rows in self._models.items():
-            args = [rows, self.env.state_space.parts[name].start, worlds.state]
+        parts = self.env.state_space.parts
+        for name, rows in {**self._nominal, **self._models}.items():
+            # nominal rows belong to objects
+            column = parts["object"].start if name in self._nominal and self.env.task.objects else -1
+            args = [rows, column, parts[name].start, worlds.state]
             wp.launch(rollouts.overwrite_rows, (self.env.nworld, rows.shape[1]), args, device=device)
         rest = worlds.state[:, self.env.engine.state_size :]
         worlds.restore_counters(worlds.everyone, rest)

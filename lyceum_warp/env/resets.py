@@ -3,13 +3,14 @@
 from collections.abc import Iterable
 from functools import partial
 
+import torch
 import warp as wp
 
 from lyceum_warp.core.fields import Stage
 from lyceum_warp.env.arrays import WorldArrays
 from lyceum_warp.graphs.capture import Phase
-from lyceum_warp.kernels import random, state
-from lyceum_warp.support.arrays import flat, launch_rows, launch_worlds, repeated
+from lyceum_warp.kernels import random, resets, state
+from lyceum_warp.support.arrays import flat, launch_lanes, launch_rows, launch_worlds, repeated, torch_view
 
 
 class Resets(WorldArrays):
@@ -38,6 +39,9 @@ class Resets(WorldArrays):
         args = [self.mask, self._seed, first_world, self.counters.key, self.counters.episode]
         wp.launch(random.seed_worlds, self.nworld, args, device=self.device)
         self._clear(self.mask, "lasting_memory")
+        if self.task.objects:
+            args = [self.mask, self.object_index, first_world % len(self.task.objects), self.engine.arrays["object"]]
+            wp.launch(resets.assign_objects, self.nworld, args, device=self.device)
         self._make_nominal(self.mask, [field.name for field in self.task.dynamics])
         if self.task.kernels.start_worlds is not None:
             launch_worlds(self.task.kernels.start_worlds, self.nworld, [self.mask, self.transition], self.device)
@@ -51,6 +55,9 @@ class Resets(WorldArrays):
         if self.task.kernels.reject_worlds is not None:  # a rejected draw must not change lasting memory
             backup, live = self._lasting_before, self.lasting_memory
             launch_rows(state.copy_rows, mask, *((backup, live) if again else (live, backup)))
+        if self.task.redraws and not again:
+            args = [mask, self.object_index, randomly, self.counters, self.engine.arrays["object"]]
+            launch_worlds(resets.choose_objects, self.nworld, args, self.device)
         self._make_nominal(mask, self.task.reset_dynamics)
         args = [mask, randomly, again, self.transition]
         launch_worlds(self.task.kernels.restart, self.nworld, args, self.device)
@@ -76,6 +83,22 @@ class Resets(WorldArrays):
 
     def _make_nominal(self, mask: wp.array, names: Iterable[str]) -> None:
         for name in names:
+            target, nominal = flat(self.engine.arrays[name]), flat(self.engine.nominal[name])
+            if len(nominal) > 1:
+                args = [mask, self.engine.arrays["object"], nominal, target]
+                launch_lanes(resets.take_nominal, self.nworld, args, self.device)
+                continue
             if (rows := self.drawn.get(name)) is None:
-                rows = repeated(flat(self.engine.nominal[name])[0], self.nworld)
-            launch_rows(state.copy_rows, mask, rows, flat(self.engine.arrays[name]))
+                rows = repeated(nominal[0], self.nworld)
+            launch_rows(state.copy_rows, mask, rows, target)
+
+    def nominal_rows(self, name: str, objects: torch.Tensor | None = None) -> torch.Tensor:
+        """Return the nominal values of a model field for worlds with the given objects, (n, size).
+
+        ``objects`` has the objects' indices, (n,); by default those of the worlds.
+        """
+        nominal = torch_view(flat(self.engine.nominal[name]))
+        if len(nominal) == 1:
+            return nominal.expand(self.nworld if objects is None else len(objects), -1)
+        held = torch_view(self.engine.arrays["object"])[:, 0] if objects is None else objects
+        return nominal[held.long()]

@@ -46,7 +46,7 @@ def open_worlds(task: type[Task], options: EnvOptions, params: Mapping[str, Any]
     bound = BoundTask(
         task, options.nworld, model=options.model, fields=options.fields, dynamics=options.dynamics,
         physics=options.physics, params=params, fitted=options.fitted, fitted_draws=options.fitted_draws,
-        cameras=options.cameras,
+        cameras=options.cameras, objects=options.objects,
     )  # fmt: skip
     engine = open_engine(
         options.engine, bound.model, options.nworld, find_device(options.device), bound.fields,

@@ -3,10 +3,47 @@
 import warp as wp
 
 from lyceum_warp.kernels.random import stream
-from lyceum_warp.kernels.step_types import TaskCode
+from lyceum_warp.kernels.step_types import Counters, TaskCode
 
 STARTUP = wp.constant(-1)
 """Replaces the episode number in the random stream of ``startup``."""
+
+OBJECT = wp.constant(-2)
+"""Replaces the step in the random stream from which an episode's object is drawn."""
+
+
+@wp.kernel(enable_backward=False)
+def assign_objects(mask_in: wp.array[bool], index_in: wp.array[float], world: int, object_out: wp.array2d[float]):
+    """Give the masked worlds objects in turn, beginning with that of ``world``; launched over (nworld,)."""
+    w = wp.tid()
+    if mask_in[w]:
+        object_out[w, 0] = index_in[(world + w) % index_in.shape[0]]
+
+
+@wp.kernel(enable_backward=False)
+def choose_objects(
+    mask_in: wp.array[bool], index_in: wp.array[float], random: bool, counters: Counters, object_out: wp.array2d[float],
+    first: int,
+):  # fmt: skip
+    """Draw the objects of the masked worlds' next episodes, or choose the first object; launched over (nworld,)."""
+    w = first + wp.tid()
+    if mask_in[w]:
+        state = stream(counters.key[w], counters.episode[w] + 1, OBJECT)
+        object_out[w, 0] = index_in[wp.where(random, wp.randi(state, 0, index_in.shape[0]), 0)]
+
+
+@wp.kernel(enable_backward=False)
+def take_nominal(
+    mask_in: wp.array[bool], object_in: wp.array2d[float], nominal_in: wp.array2d[float], target_out: wp.array2d[float],
+    lanes: int, first: int,
+):  # fmt: skip
+    """Copy the nominal rows of the masked worlds' objects; launched over (nworld, lanes)."""
+    k, lane = wp.tid()
+    w = first + k
+    if mask_in[w]:
+        row = wp.clamp(int(object_in[w, 0]), 0, nominal_in.shape[0] - 1)
+        for i in range(lane, target_out.shape[1], lanes):
+            target_out[w, i] = nominal_in[row, i]
 
 
 def make_reset_kernels(task: TaskCode) -> None:

@@ -41,10 +41,17 @@ def broadcast(state_in: wp.array2d[wp.float64], state_out: wp.array2d[wp.float64
 
 
 @wp.kernel(enable_backward=False)
-def overwrite_rows(rows_in: wp.array2d[wp.float64], first: int, state_out: wp.array2d[wp.float64]):
-    """Copy row w % rows into the state of world w, starting at column ``first``; launched over (nworld, size)."""
+def overwrite_rows(rows_in: wp.array2d[wp.float64], choice: int, first: int, state_inout: wp.array2d[wp.float64]):
+    """Copy a row into each state, starting at column ``first``; launched over (nworld, size).
+
+    State w gets row w, or the row whose number is in column ``choice`` of the state, if ``choice`` is not negative. The
+    rows repeat.
+    """
     w, i = wp.tid()
-    state_out[w, first + i] = rows_in[w % rows_in.shape[0], i]
+    row = w
+    if choice >= 0:
+        row = int(state_inout[w, choice])
+    state_inout[w, first + i] = rows_in[row % rows_in.shape[0], i]
 
 
 @wp.func

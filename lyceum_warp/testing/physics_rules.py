@@ -173,8 +173,7 @@ def check_dynamics(ctx: Context) -> None:
         if name in once:
             ctx.equal(rows(a, name), first[:, parts[name]].float(), f"{name}, drawn once, after reset")
         elif name not in a.task.writes["initialize"]:
-            nominal = torch_view(flat(a.engine.nominal[name])).expand(a.nworld, -1).contiguous()
-            ctx.equal(rows(a, name), nominal, f"{name} after reset")
+            ctx.equal(rows(a, name), a.worlds.nominal_rows(name).contiguous(), f"{name} after reset")
 
 
 def check_settle(ctx: Context) -> None:

@@ -252,7 +252,7 @@ def _fixed_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a configuration that a run keeps, by their names in config.json."""
     settings = {name: config.get(name) for name in ("task", "algorithm", "nworld", "seed", "network")}
     settings["engine"] = engine_name(config.get("engine", ""), config.get("device"))
-    for name in ("horizon", "fields", "dynamics"):
+    for name in ("horizon", "fields", "dynamics", "objects"):
         settings[name] = config.get("options", {}).get(name)
     for part in ("physics", "params", str(config.get("algorithm"))):
         settings |= {f"{part}.{name}": value for name, value in config.get(part, {}).items()}

@@ -87,7 +87,7 @@ def shots(env: Env, states: torch.Tensor) -> Iterator[Shot]:
     """Yield the content of a frame for each state."""
     parts = env.state_space.parts
     for state in states.numpy():
-        fields = {field.name: state[parts[field.name]] for field in env.task.dynamics}
+        fields = {field.name: state[parts[field.name]] for field in env.task.dynamics if field.in_model}
         ghosts: Any = [(pose, REFERENCE, (0.0, 0.0)) for pose in reference_states(env, state)]
         yield Shot(state=state[: env.engine.integration_size], model_fields=fields, ghosts=ghosts, lines=[], frames=1)
 

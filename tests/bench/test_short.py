@@ -44,6 +44,11 @@ def mppi(*results: Result) -> None:
     assert len(returns) == 2 and max(returns) - min(returns) < 0.2 * abs(min(returns))
 
 
+def objects(*results: Result) -> None:
+    assert len(results) == 2 and all(result["ratio"] > 0.0 for result in results)
+    assert all(result["bytes_per_world"]["many"] > result["bytes_per_world"]["one"] for result in results)
+
+
 def pictures(*results: Result) -> None:
     assert len(results) == 2 and all(result["frames_per_second"] > 0.0 for result in results)
 
@@ -71,6 +76,7 @@ SHORT: dict[Callable[..., None], str] = {
     humanoid: "--threads 1",
     latency: "--threads 1 --samples 8",
     mppi: "--threads 1 --contestants mppi python",
+    objects: "--engines mujoco",
     pictures: "",
     policies: "",
     soak: "--parts random memory --threads 1 --nworld 16 --steps 1600",

@@ -3,6 +3,7 @@ import pytest
 from conftest import SharedEnv, TaskFile
 
 import lyceum_warp as lw
+from lyceum_warp.core.model_fields import describe_model_field
 from lyceum_warp.engines.warp import sizes
 from lyceum_warp.engines.warp.sizes import probe_sizes
 
@@ -92,7 +93,7 @@ def test_buffers_have_rows_for_every_limit_if_ranges_are_randomized() -> None:
         f'<body pos="{i} 0 0"><joint range="-900 900" limited="true"/><geom size=".1"/></body>' for i in range(20)
     )
     model = mujoco.MjModel.from_xml_string(f'<mujoco><option gravity="0 0 0"/><worldbody>{joints}</worldbody></mujoco>')
-    assert probe_sizes(model)[1] < 20 <= probe_sizes(model, ["jnt_range"])[1]
+    assert probe_sizes(model)[1] < 20 <= probe_sizes(model, [describe_model_field(model, "jnt_range")])[1]
 
 
 def test_buffers_have_room_for_contacts_at_the_end_of_slow_servos() -> None:

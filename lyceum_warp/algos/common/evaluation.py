@@ -41,6 +41,8 @@ class Episodes:
     """1.0 for each episode that ended by termination, otherwise 0.0. Time limits and faults are not terminations."""
     metrics: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
     """Each metric of the task, summed over the steps of an episode."""
+    objects: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    """Whether each episode was played with an object, by the object's name, bool."""
     curriculum: Curriculum = dataclasses.field(default_factory=Curriculum)
     """The curriculum at which the episodes began; its ``lasting`` memory has one row for each episode."""
 
@@ -55,6 +57,7 @@ class Episodes:
         return Episodes(
             **tensors,
             metrics={name: sums[rows] for name, sums in self.metrics.items()},
+            objects={name: held[rows] for name, held in self.objects.items()},
             curriculum=dataclasses.replace(self.curriculum, lasting=lasting),
         )
 
@@ -78,7 +81,8 @@ def evaluate(
 
     Every world contributes the same number of episodes. Otherwise, worlds with short episodes would contribute more
     episodes and bias the results. If the task has a curriculum in lasting memory, one episode does not change the level
-    of the next: all worlds play one episode, and then begin again as if they were further worlds.
+    of the next: all worlds play one episode, and then begin again as if they were further worlds. If worlds keep
+    different objects, they begin again, too, so that a seed leads to all objects.
 
     Args:
         env: The environment; its worlds are reset.
@@ -107,14 +111,15 @@ def evaluate(
             "evaluate needs an environment that resets automatically: make the environment with autoreset=True"
         )
     player, each = Player(policy, env), -(-episodes // env.nworld)
-    check_fit(8 * (6 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
+    check_fit(8 * (7 + len(env.episode_metrics)) * each, env.nworld, env.device, model=f"{each} episodes")
     seed = None if seed is None else evaluation_seed(seed)
-    rounds = each if env.task.curriculum else 1
+    several = len(env.task.objects) > 1 and not env.task.redraws
+    rounds = each if env.task.curriculum or several else 1
     if curriculum is not None:
         curriculum.check(env)
     elif seed is None and rounds > 1:
         curriculum = Curriculum.of(env)
-    results = torch.zeros(6 + len(env.metrics), each, env.nworld, device=env.obs.device)
+    results = torch.zeros(7 + len(env.metrics), each, env.nworld, device=env.obs.device)
     starts = []
     for number, part in enumerate(results.chunk(rounds, 1)):
         start_episodes(env, seed, curriculum, first=number * env.nworld, total=each * env.nworld)
@@ -123,11 +128,12 @@ def evaluate(
             if progress is not None:
                 progress(number * env.horizon + t, each * env.horizon)
     columns = results.flatten(1).cpu()
-    metrics = dict(zip(env.episode_metrics, columns[6:], strict=True))
+    metrics = dict(zip(env.episode_metrics, columns[7:], strict=True))
+    objects = {name: columns[6] == index for name, index in env.task.objects.items()}
     lasting = {name: torch.cat([start[name] for start in starts]) for name in env.task.curriculum}
     start = Curriculum(shared={name: memory.cpu().clone() for name, memory in env.shared.items()}, lasting=lasting)
     names = ("returns", "lengths", "rewards", "evals", "success", "terminated")
-    return Episodes(**dict(zip(names, columns[:6], strict=True)), metrics=metrics, curriculum=start)
+    return Episodes(**dict(zip(names, columns[:6], strict=True)), metrics=metrics, objects=objects, curriculum=start)
 
 
 def _play(env: Env, player: Player, results: torch.Tensor) -> Iterator[int]:
@@ -136,11 +142,12 @@ def _play(env: Env, player: Player, results: torch.Tensor) -> Iterator[int]:
     count, total = torch.zeros_like(worlds), torch.zeros_like(env.reward)
     for t in range(1, each * env.horizon + 1):
         length = env.episode_step + 1.0
+        held = env.field("object").flatten().clone() if env.task.objects else torch.zeros_like(total)
         env.action.copy_(player.first(env.obs) if t == 1 else player(env.obs))
         env.step()
         total += env.reward
         ends = (env.success.float(), env.terminated.float())
-        now = torch.stack([total, length, env.reward, env.eval, *ends, *env.episode_metrics.values()])
+        now = torch.stack([total, length, env.reward, env.eval, *ends, held, *env.episode_metrics.values()])
         slot = count.clamp_max(each - 1)
         counts = env.done & (count < each)
         results[:, slot, worlds] = torch.where(counts, now, results[:, slot, worlds])

@@ -122,11 +122,22 @@ class Rollout:
             sums_of = self._stored(env.episode_metric_sums, self._rows_after)
             self.metrics = dict(zip(env.metrics, steps_of.unbind(-1), strict=True))
             self.episode_metrics = dict(zip(env.metrics, sums_of.unbind(-1), strict=True))
+        several = len(env.task.objects) > 1 and env.task.functions["success"] is not None
+        self._object = self._stored(env.field("object"), self._rows_before) if several else None
         outputs = (env.reward, env.eval, env.terminated, env.done, env.success, env.done_reason)
         self._steps, self._outputs = wp.from_torch(env.episode_step), [wp.from_torch(t) for t in outputs]
         graphs = Graphs(env.device, enabled=env.options.graphs)
         self._before_step = graphs.sequence([Phase("store inputs", self._launch_inputs)])
         self._after_step = graphs.sequence([Phase("store outputs", self._launch_outputs)])
+
+    @property
+    def objects(self) -> dict[str, torch.Tensor]:
+        """Whether each world holds an object, by the object's name, (steps, nworld) bool.
+
+        Empty unless the worlds hold several objects, and the task defines ``success``.
+        """
+        held = self._object
+        return {} if held is None else {name: held[..., 0] == index for name, index in self.env.task.objects.items()}
 
     def store_too(self, source: torch.Tensor) -> torch.Tensor:
         """Let ``store_inputs`` also store a tensor, (nworld, size), and return the buffer, (steps, nworld, size)."""

@@ -79,7 +79,11 @@ def gathered(
         "return_min": min(process["return_min"] for process in processes) if episodes else math.nan,
         "return_max": max(process["return_max"] for process in processes) if episodes else math.nan,
         **{name: by_episode(name) for name in ("length_mean", "terminal_reward", "eval_mean", "success")},
-        "metrics": {name: by_episode(METRIC_COLUMN + name) for name in rollout.metrics},
+        "metrics": {name: by_episode(METRIC_COLUMN + name) for name in rollout.metrics}
+        | {
+            f"success/{name}": total(f"success/{name}") / count if (count := total(f"episodes/{name}")) else math.nan
+            for name in rollout.objects
+        },
         "step_metrics": {name: total(STEP_METRIC_COLUMN + name) / len(processes) for name in rollout.metrics},
     }
     return statistics, [{name: process[name] for name in numbers} for process in processes]
@@ -107,6 +111,8 @@ def _sums(rollout: Rollout) -> dict[str, torch.Tensor]:
         "terminal_reward": total(rollout.reward),
         "eval_mean": total(rollout.eval),
         "success": total(rollout.success),
+        **{f"success/{name}": total(rollout.success & held) for name, held in rollout.objects.items()},
+        **{f"episodes/{name}": total(held) for name, held in rollout.objects.items()},
         **{METRIC_COLUMN + name: total(sums) for name, sums in rollout.episode_metrics.items()},
         **{STEP_METRIC_COLUMN + name: steps.double().nan_to_num(0.0, 0.0, 0.0).mean()
            for name, steps in rollout.metrics.items()},

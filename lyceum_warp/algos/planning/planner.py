@@ -47,7 +47,7 @@ from lyceum_warp.engines.memory import NotEnoughMemoryError
 from lyceum_warp.env import Env, OpenLoop, memory_columns, moved
 from lyceum_warp.graphs.capture import Calls, Phase
 from lyceum_warp.kernels import planning
-from lyceum_warp.support.arrays import flat, torch_view
+from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, whole_number
 
@@ -185,8 +185,8 @@ class Planner:
         self.timestep, self.between = self.env.timestep, self.config.between
         self._initial = self.env.get_state()[0]
         # `state_of` must return nominal values, not the random values that `startup` wrote
-        for name, row in self.env.engine.nominal.items():
-            self._initial[parts[name]] = torch_view(flat(row))[0].double()
+        for name in self.env.engine.nominal:
+            self._initial[parts[name]] = self.env.worlds.nominal_rows(name)[0].double()
         if "lasting_memory" in self.env.task.writes["startup"]:
             self._initial[memory_columns(self.env.task, self.env.state_space)["lasting_memory"]] = 0.0
         with wp.ScopedDevice(self.env.device):
@@ -209,6 +209,12 @@ class Planner:
                 f"models={self.config.models} needs a task that draws model fields, but {task.name!r} draws none: "
                 "write model fields in its startup or randomize, as s.body_mass[1] = s.body_mass[1] * "
                 "lw.uniform(rng, 0.8, 1.2)"
+            )
+        depends = [field.name for field in task.dynamics if field.name in names and field.rows is not None]
+        if depends:
+            raise ValueError(
+                f"models={self.config.models} would give all plants the {depends[0]} of one object: plan with one "
+                "model, or with one object"
             )
         return names
 

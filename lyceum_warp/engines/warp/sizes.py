@@ -5,7 +5,7 @@ import copy
 import dataclasses
 import hashlib
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import mujoco
@@ -14,11 +14,12 @@ import numpy as np
 import warp as wp
 from mujoco.batch import Batch, SimulationError
 
+from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.kernels import faults
 
 log = logging.getLogger(__name__)
 
-_WORLDS, _HOLDS, _SUBSTEPS = 48, 25, 20
+_WORLDS, _WORLDS_OF_OBJECT, _HOLDS, _SUBSTEPS = 48, 16, 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
@@ -32,7 +33,7 @@ _CONTACTS = set("geom_margin geom_gap geom_size geom_pos geom_quat pair_margin p
 _known: dict[str, tuple[int, int]] = {}
 
 
-def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[int, int]:
+def probe_sizes(model: mujoco.MjModel, varied: Collection[ModelField] = ()) -> tuple[int, int]:
     """Measure how many contacts and constraints to allocate for each world.
 
     Each number is twice the largest count in random rollouts. The number of constraints also includes constraints that
@@ -45,11 +46,12 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
     In the rollouts, 48 worlds run 500 substeps on the C engine. Two thirds of the worlds draw new controls every 20
     substeps. The others hold each control at one of its bounds, because random controls average out: an arm that is
     driven by velocities would hardly leave its initial pose. The worlds start in the model's initial state or a
-    keyframe, half of them with random velocities. Results are cached for each model.
+    keyframe, half of them with random velocities. If the worlds hold different objects, at least 16 worlds hold each
+    object. Results are cached for each model.
 
     Args:
         model: The compiled model.
-        varied: The names of the model fields that differ between worlds.
+        varied: The model fields that differ between worlds.
 
     Returns:
         (nconmax, njmax), both multiples of 8. They are at least (256, 512) if the model has a flex, and at least (8, 8)
@@ -58,9 +60,11 @@ def probe_sizes(model: mujoco.MjModel, varied: Collection[str] = ()) -> tuple[in
     Raises:
         NotImplementedError, ValueError: MuJoCo Warp does not support the model.
     """
-    contacts, constraints = _probe_once(_with_friction_losses(model, varied))
+    names = {field.name for field in varied}
+    objects = {field.name: field.rows for field in varied if field.rows is not None and field.in_model}
+    contacts, constraints = _probe_once(_with_friction_losses(model, names), objects)
     constraints += _inactive(model)
-    if not _LIMITS.isdisjoint(varied):
+    if not _LIMITS.isdisjoint(names):
         constraints += int(model.jnt_limited.sum() + model.tendon_limited.sum())
     return contacts, -(-constraints // 8) * 8
 
@@ -97,31 +101,46 @@ def _equalities(model: mujoco.MjModel) -> int:
     return int(data.ne)
 
 
-def _probe_once(model: mujoco.MjModel) -> tuple[int, int]:
+def _probe_once(model: mujoco.MjModel, objects: Mapping[str, np.ndarray]) -> tuple[int, int]:
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
-    key = hashlib.sha256(buffer.tobytes()).hexdigest()
+    key = hashlib.sha256(b"".join([buffer.tobytes(), *(rows.tobytes() for rows in objects.values())])).hexdigest()
     if key not in _known:
-        _known[key] = _probe(model)
+        _known[key] = _probe(model, objects)
     return _known[key]
 
 
-def _probe(model: mujoco.MjModel) -> tuple[int, int]:
+def _worlds_with(model: mujoco.MjModel, objects: Mapping[str, np.ndarray], rng: np.random.Generator) -> Batch:
+    """Make worlds that hold the objects in a random order. The rows of fields are (objects, size)."""
+    if not objects:
+        return Batch(model, _WORLDS)
+    used = np.unique(np.hstack([*objects.values()]), axis=0, return_index=True)[1]
+    held = rng.permutation(np.resize(used, max(_WORLDS, _WORLDS_OF_OBJECT * len(used))))
+    batch = Batch(model, len(held))
+    for name, rows in objects.items():
+        expanded = batch.expand(name)
+        expanded[:] = rows[held].reshape(expanded.shape)
+    batch.set_const()
+    return batch
+
+
+def _probe(model: mujoco.MjModel, objects: Mapping[str, np.ndarray]) -> tuple[int, int]:
     with wp.ScopedDevice("cpu"):
         mjw.put_model(model)  # refuse an unsupported model before the probe, which may take a minute
-    batch = Batch(model, _WORLDS)
     rng = np.random.default_rng(0)
+    batch = _worlds_with(model, objects, rng)
+    nworld = batch.nsim
     ncon, nefc = batch.bind("ncon"), batch.bind("nefc")
     if model.nkey:
-        batch.reset(keyframe=np.arange(_WORLDS, dtype=np.int32) % (model.nkey + 1) - 1)
-    batch.qvel[: _WORLDS // 2] += rng.normal(size=(_WORLDS // 2, model.nv))
+        batch.reset(keyframe=np.arange(nworld, dtype=np.int32) % (model.nkey + 1) - 1)
+    batch.qvel[: nworld // 2] += rng.normal(size=(nworld // 2, model.nv))
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-1.0, 1.0)).T
     contacts = constraints = 0
     # a third of the worlds with random velocities, and a third of those without
-    at_bounds = (np.arange(_WORLDS) % (_WORLDS // 2) >= _WORLDS // 3)[:, None]
-    bounds = np.where(rng.random((_WORLDS, model.nu)) < 0.5, low, high)
+    at_bounds = (np.arange(nworld) % (nworld // 2) >= nworld // 3)[:, None]
+    bounds = np.where(rng.random((nworld, model.nu)) < 0.5, low, high)
     for _ in range(_HOLDS):
-        batch.ctrl[:] = np.where(at_bounds, bounds, rng.uniform(low, high, size=(_WORLDS, model.nu)))
+        batch.ctrl[:] = np.where(at_bounds, bounds, rng.uniform(low, high, size=(nworld, model.nu)))
         for _ in range(_SUBSTEPS):
             # the counts are correct even if the memory is too small
             with contextlib.suppress(SimulationError):

@@ -1,16 +1,16 @@
 """Give MuJoCo Warp's model fields one row per world, and recompute the constants derived from them."""
 
 import copy
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from lyceum_warp.core.model_fields import Constants, ModelField
+from lyceum_warp.core.model_fields import MESH_FIELDS, Constants, ModelField
 from lyceum_warp.engines.warp.group import Turns, group_size
-from lyceum_warp.engines.warp.warp_kernels import correct_weights, mark_changed, place_geoms
+from lyceum_warp.engines.warp.warp_kernels import correct_weights, mark_changed, place_geoms, put_meshes
 from lyceum_warp.support.arrays import flat
 
 _POSED_BY = {"geom_pos", "geom_quat", "body_pos", "body_quat"}
@@ -75,7 +75,7 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
     ``mjw.put_model`` disables parts of the physics whose fields are all zero. This function enables the parts whose
     fields may become non-zero in a world.
     """
-    fields = [field for field in fields if field.size]
+    fields = [field for field in fields if field.size and field.in_model]
     names = [field.name for field in fields if not field.option]
     names += [name for name in outputs_of(fields) if np.size(getattr(model, name))]
     put = mjw.put_model(model, batch_sizes=dict.fromkeys(names, nworld))
@@ -103,6 +103,15 @@ def put_varied_model(model: mujoco.MjModel, fields: Collection[ModelField], nwor
         put.jnt_actuatorid = wp.array(every.jnt_actuatorid, dtype=int)
         put.tendon_actuatorid = wp.array(every.tendon_actuatorid, dtype=int)
     return put
+
+
+def set_meshes(model: mjw.Model, arrays: Mapping[str, wp.array], nmesh: int, mask: wp.array) -> None:
+    """Set the meshes of the masked worlds from their fields, if meshes differ between worlds, by a Warp launch."""
+    if "geom_dataid" in arrays:
+        inputs = [arrays[name] for name in MESH_FIELDS]
+        outputs = [getattr(model, name) for name in MESH_FIELDS]
+        args = [mask, model.geom_type, *inputs, nmesh, *outputs]
+        wp.launch(put_meshes, model.geom_dataid.shape, args, device=mask.device)
 
 
 class ModelRows:

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from lyceum_warp.core.fields import Field, Stage, early_sensor_columns
-from lyceum_warp.core.model_fields import ModelField
+from lyceum_warp.core.model_fields import OBJECT_FIELDS, ModelField
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp import forward, sizes
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
@@ -24,6 +24,7 @@ from lyceum_warp.engines.warp.varied_model import (
     outputs_of,
     owner,
     put_varied_model,
+    set_meshes,
 )
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
@@ -71,9 +72,10 @@ class WarpEngine(Engine):
         njmax: int | None = None,
     ) -> None:
         super().__init__(model, nworld, device, fields, dynamics, initial)
-        self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics)
+        self.nconmax, self.njmax = _sizes(model, nconmax, njmax, self.dynamics.values())
         if None in (nconmax, njmax):
-            warn_of_unknown_sizes(self.dynamics, self.nconmax, self.njmax)
+            drawn = [field.name for field in self.dynamics.values() if field.rows is None]
+            warn_of_unknown_sizes(drawn, self.nconmax, self.njmax)
         with refusals():
             self.m = self._put_model()
             self.spare = _contacts_of_one_world(self.m) if nconmax is None else 0
@@ -142,7 +144,7 @@ class WarpEngine(Engine):
         cls, model: mujoco.MjModel, fields: Iterable[Field], dynamics: Iterable[ModelField] = (), **options: Any
     ) -> int:
         dynamics = list(dynamics)
-        sizes = _sizes(model, options.get("nconmax"), options.get("njmax"), [field.name for field in dynamics])
+        sizes = _sizes(model, options.get("nconmax"), options.get("njmax"), dynamics)
         with refusals():
             data = data_bytes(model, *sizes)
         floats = mujoco.mj_stateSize(model, _SPEC) + sum(field.size for field in fields if field.snapshot)
@@ -153,6 +155,8 @@ class WarpEngine(Engine):
     # fields
 
     def _alias_model(self, field: ModelField) -> wp.array:
+        if field.name in OBJECT_FIELDS:  # ``apply_model`` copies them into the model
+            return self._nominal_rows(field, self.nworld)
         source = getattr(owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
@@ -216,6 +220,7 @@ class WarpEngine(Engine):
 
     def apply_model(self, mask: wp.array) -> None:
         with self._on_device():
+            set_meshes(self.m, self.arrays, self.model.nmesh, mask)
             if self._constants is not None:
                 self._constants(mask)
             self._static.place(self.m, self.d, mask)
@@ -292,7 +297,7 @@ class WarpEngine(Engine):
     def _group_of_worlds(self) -> PartialForward:
         size = group_size(self.nworld, self.device)
         fields = list(self.dynamics.values())
-        names = [field.name for field in fields if field.size] + outputs_of(fields)
+        names = [field.name for field in fields if field.size and field.in_model] + outputs_of(fields)
         with wp.ScopedDevice(self.device):
             rows = ModelRows(self.m, names, size)
         return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
@@ -332,7 +337,9 @@ def refusals(fix: str = "use engine='mujoco'") -> Iterator[None]:
         raise ValueError(f"MuJoCo Warp refuses the model: {reason}; change the model, or {fix}") from error
 
 
-def _sizes(model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[str]) -> tuple[int, int]:
+def _sizes(
+    model: mujoco.MjModel, nconmax: int | None, njmax: int | None, varied: Collection[ModelField]
+) -> tuple[int, int]:
     with refusals():
         if (model.geom_plugin >= 0).any() and not has_sdf_functions():
             raise NotImplementedError("SDF plugins need a registered distance function")

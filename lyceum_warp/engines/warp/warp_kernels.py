@@ -14,6 +14,7 @@ from lyceum_warp.kernels.rotations import quat_mul, quat_rotate, quat_to_mat
 
 HFIELD = wp.constant(int(mujoco.mjtGeom.mjGEOM_HFIELD))
 SPHERE = wp.constant(int(mujoco.mjtGeom.mjGEOM_SPHERE))
+MESH = wp.constant(int(mujoco.mjtGeom.mjGEOM_MESH))
 CAPSULE = wp.constant(int(mujoco.mjtGeom.mjGEOM_CAPSULE))
 X, Y = wp.constant(wp.vec3(1.0, 0.0, 0.0)), wp.constant(wp.vec3(0.0, 1.0, 0.0))
 SEPARATE = wp.constant(1.0e6)
@@ -48,6 +49,31 @@ def place_geoms(
         body = body_parentid[body]
     geom_xpos_out[w, geom] = position
     geom_xmat_out[w, geom] = quat_to_mat(wp.normalize(quat))
+
+
+@wp.kernel(enable_backward=False)
+def put_meshes(
+    mask_in: wp.array[bool],
+    geom_type: wp.array[int],
+    mesh_in: wp.array2d[float],
+    aabb_in: wp.array2d[wp.spatial_vector],
+    rbound_in: wp.array2d[float],
+    nmesh: int,
+    dataid_out: wp.array2d[int],
+    aabb_out: wp.array3d[wp.vec3],
+    rbound_out: wp.array2d[float],
+):
+    """Set the meshes and bounds of mesh geoms in the masked worlds; launched over (nworld, ngeom).
+
+    ``mujoco_warp.set_const`` computes the bounds of other geoms.
+    """
+    w, i = wp.tid()
+    if mask_in[w] and geom_type[i] == MESH:
+        dataid_out[w, i] = wp.clamp(int(mesh_in[w, i]), 0, nmesh - 1)
+        box = aabb_in[w, i]
+        aabb_out[w, i, 0] = wp.spatial_top(box)
+        aabb_out[w, i, 1] = wp.spatial_bottom(box)
+        rbound_out[w, i] = rbound_in[w, i]
 
 
 @wp.kernel(enable_backward=False)

@@ -52,7 +52,7 @@ def learner_classes(algorithm: str) -> tuple[Any, Any]:
 def describe(learner: Learner) -> dict[str, Any]:
     """Make the content of config.json. ``Configuration`` makes the same learner from it."""
     env, options = learner.env, learner.env.options
-    names = ["horizon", "graphs", "fields", "dynamics", "fitted", "fitted_draws"]
+    names = ["horizon", "graphs", "fields", "dynamics", "fitted", "fitted_draws", "objects"]
     if learner.team.neighbours == 1:  # a run with several processes may be resumed with a different number of them
         names.append("nthread")
     entries = {name: value for name, value in options.given().items() if name in names}

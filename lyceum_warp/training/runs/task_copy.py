@@ -76,6 +76,9 @@ def _data_files(task: type[Task]) -> tuple[list[Path], list[Path]]:
     """
     sources = source_files(task)
     folder, data = next((file.parent for file in sources), Path()), data_files(sources)
+    if (objects := task.objects) is not None:  # MuJoCo reads meshes without Python
+        geoms = [geom for geoms in objects.models.values() for geom in geoms if not isinstance(geom.file, ModelFile)]
+        data |= stamps(path for geom in geoms if (path := objects.path(geom, task)))
     small = sum(path.stat().st_size for path in data) <= _LARGEST
     copies = [path for path, stamp in data.items() if folder in path.parents and stamps([path]) == {path: stamp}]
     copies = copies if small else []

@@ -113,7 +113,7 @@ class FrameMaker:
         predicted: np.ndarray | None = None,
     ) -> Frame:  # fmt: skip
         parts = self._env.state_space.parts
-        fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics}
+        fields = {field.name: state[parts[field.name]] for field in self._env.task.dynamics if field.in_model}
         references = reference_states(self._env, state)
         ghosts = [*(Ghost(pose, REFERENCE, what="reference of the clip") for pose in references), *ghosts]
         arrows = self._driving.arrows(state)

@@ -13,11 +13,9 @@ from typing import Any
 import mujoco
 import numpy as np
 import torch
-import warp as wp
 
 from lyceum_warp.algos import Planner
 from lyceum_warp.env import Env
-from lyceum_warp.support.arrays import flat, torch_view
 from lyceum_warp.viewer.session.drivers import MOST_SAMPLES, PlanView, WorldControl
 
 SHARE = 0.15
@@ -108,9 +106,10 @@ class TraceRollouts:
         env, count = self.env, view.samples.shape[1]
         self._states.copy_(view.state)
         if self._nominal:
-            nominal: dict[str, wp.array] = env.engine.nominal
-            for name, row in nominal.items():
-                self._states[:, env.state_space.parts[name]] = torch_view(flat(row))[0].double()
+            parts = env.state_space.parts
+            held = self._states[:, parts["object"]].squeeze(1) if env.task.objects else None
+            for name in env.engine.nominal:
+                self._states[:, parts[name]] = env.worlds.nominal_rows(name, held).double()
         actions = view.actions[:, None].repeat(1, MOST_SAMPLES + 1, 1)  # worlds without a sample follow the plan
         actions[:, :count] = view.samples
         actions = actions.to(env.action.device)

@@ -114,6 +114,7 @@ def statistics(rollout: lw.Rollout, *shares: slice) -> dict[str, Any]:
             **{name: getattr(rollout, name)[:, worlds] for name in NAMES}, faults=rollout.faults[worlds],
             episode_metrics={name: sums[:, worlds] for name, sums in rollout.episode_metrics.items()},
             metrics={name: values[:, worlds] for name, values in rollout.metrics.items()},
+            objects={name: held[:, worlds] for name, held in rollout.objects.items()},
         )  # fmt: skip
         found, _ = gathered(part, SimpleNamespace(gather=gather), {})  # type: ignore[arg-type]
     return found
@@ -136,7 +137,7 @@ def test_episode_statistics_cover_only_complete_episodes(rollout: lw.Rollout) ->
         found = statistics(rollout, *shares)
         assert {name: found[name] for name in expected} == pytest.approx(expected, rel=1e-5)
         assert found["metrics"] == pytest.approx(metrics, rel=1e-5)
-    nothing = SimpleNamespace(**vars(rollout) | {"done": torch.zeros_like(rollout.done)})
+    nothing = SimpleNamespace(**vars(rollout) | {"done": torch.zeros_like(rollout.done), "objects": {}})
     found = statistics(nothing, slice(None))  # type: ignore[arg-type]
     assert all(math.isnan(number) for number in (*(found[name] for name in expected), *found["metrics"].values()))
 

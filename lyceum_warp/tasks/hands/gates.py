@@ -1,0 +1,45 @@
+"""Test whether a hand turns an object and holds it."""
+
+from collections.abc import Callable, Iterator
+
+import torch
+
+import lyceum_warp as lw
+
+WORLDS, STEPS, PART = 64, 1000, 200
+
+
+class Turns(lw.Gate):
+    """64 worlds for 50 s, with noise. A world whose object falls starts again.
+
+    Args:
+        metric: Name of the metric that is summed over the 50 s.
+        text: What the sum is, with its unit.
+        least: Least mean of the sum over all worlds.
+        drops: Most drops per hour.
+    """
+
+    def __init__(self, metric: str, text: str, *, least: float, drops: float) -> None:
+        self.metric = metric
+        self.limits = {
+            "drops": lw.Limit("drops per hour", high=drops),
+            "first": lw.Limit(f"{text} in the first 10 s", low=0.2 * 0.5 * least),
+            metric: lw.Limit(f"{text} in 50 s", low=least),
+        }
+
+    def measure(
+        self, worlds: Callable[..., lw.Env], act: Callable[[torch.Tensor], torch.Tensor]
+    ) -> Iterator[dict[str, float]]:
+        """Yield the numbers after 10 s and after 50 s."""
+        env = worlds(WORLDS)
+        total, drops = torch.zeros(WORLDS), torch.zeros(())
+        for step in range(1, STEPS + 1):
+            env.step(act(env.obs))
+            total += env.metrics[self.metric]
+            drops += env.done.count_nonzero()
+            if env.done.any():
+                env.rand_reset(mask=env.done.clone())
+            if step == PART:
+                yield {"first": total.mean().item()}
+        hours = WORLDS * STEPS * env.timestep / 3600.0
+        yield {"drops": drops.item() / hours, self.metric: total.mean().item()}
