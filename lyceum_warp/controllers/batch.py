@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from lyceum_warp.controllers.trajectory import Trajectory, provenance
+from lyceum_warp.controllers.trajectory import Trajectory, pictures_of, provenance, stacked
 from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
 
 
@@ -41,7 +41,7 @@ def policy_episodes(
             start_episodes(env, seed, curriculum, first=number * env.nworld, total=rounds * env.nworld)
         else:
             env.rand_reset()
-        states, obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
+        states, obs, pictures = [env.get_state().cpu()], [env.obs.cpu().clone()], [pictures_of(env)]
         actions: list[torch.Tensor] = []
         outcomes: list[torch.Tensor] = []
         times: list[tuple[float, float, float]] = []  # action's time, duration of the policy's call, step's end
@@ -56,6 +56,7 @@ def policy_episodes(
             env.step()
             states.append(env.get_state().cpu())
             obs.append(env.final_obs.cpu().clone())
+            pictures.append(pictures_of(env))
             outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
             times.append((applied - start, applied - called, time.perf_counter() - start))
             over = env.done.cpu() & (lengths == 0)
@@ -78,7 +79,7 @@ def policy_episodes(
                 plan_starts=applied_at - policy_times, plan_times=policy_times,
                 plan_failed=unknown, plan_effective=unknown,
                 timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
-                done_reason=int(reasons[world]), seed=seed,
+                done_reason=int(reasons[world]), seed=seed, pictures=stacked(pictures[: steps + 1], world),
                 controller=named | {"world": env.first_world + world, "episode": number},
                 **origin | {"params": origin["params"] | params},
             )  # fmt: skip

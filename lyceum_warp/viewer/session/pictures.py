@@ -1,15 +1,14 @@
 """Encode the pictures that cameras give to a policy, for the page."""
 
 import base64
-import struct
 import time
-import zlib
 from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 
 from lyceum_warp.core import Camera
+from lyceum_warp.support.images import png
 
 PERIOD = 0.25
 """Seconds between two pictures of a camera, because each one is sent to all pages."""
@@ -66,16 +65,3 @@ def colours(kind: str, picture: np.ndarray) -> tuple[np.ndarray, str]:
     hashed = np.stack([number * factor % 197 + 58 for factor in (37, 101, 173)], axis=-1)
     seen = picture[..., :1] >= 0
     return np.where(seen, hashed, 0).astype(np.uint8), f", {len(np.unique(number[seen[..., 0]]))} objects"
-
-
-def png(pixels: np.ndarray) -> bytes:
-    """Encode colours, (height, width, 3) uint8, as a PNG file."""
-
-    def chunk(kind: bytes, content: bytes) -> bytes:
-        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
-
-    height, width = pixels.shape[:2]
-    rows = np.pad(pixels.reshape(height, -1), ((0, 0), (1, 0)))  # the first byte of a row is its filter
-    head = struct.pack(">2I5B", width, height, 8, 2, 0, 0, 0)
-    parts = chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows.tobytes())), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)

@@ -50,11 +50,11 @@
   const show = (pictures) => {
     const box = document.getElementById("pictures") ?? document.body.appendChild(document.createElement("div"));
     box.id = "pictures";
-    box.style = "position:fixed;top:44px;left:50%;transform:translateX(-50%);display:flex;gap:8px;pointer-events:none";
+    box.style = "position:fixed;top:60px;left:50%;transform:translateX(-50%);display:flex;gap:8px;pointer-events:none";
     box.replaceChildren(...pictures.map(([caption, src]) => {
       const figure = document.createElement("figure");
-      figure.style = "margin:0;padding:4px;background:#fffd;color:#000;font:12px sans-serif";
-      const image = Object.assign(new Image(), {src, style: "display:block;height:min(25vh,192px);image-rendering:pixelated"});
+      figure.style = "margin:0;padding:4px;width:min-content;background:#fffd;color:#000;font:12px sans-serif";
+      const image = Object.assign(new Image(), {src, style: "display:block;height:min(20vh,160px);image-rendering:pixelated"});
       figure.append(image, caption);
       return figure;
     }));
