@@ -142,7 +142,9 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     folder.mkdir(parents=True)
     for file in (_DATA, _EPISODES):
         (folder / file).parent.mkdir(parents=True)
-    pandas.DataFrame({name: list(rows) for name, rows in columns.items()} | images).to_parquet(folder / _DATA)
+    # LeRobot reads columns of the shape [1] as numbers
+    frames = {name: list(rows[:, 0] if rows.shape[1:] == (1,) else rows) for name, rows in columns.items()}
+    pandas.DataFrame(frames | images).to_parquet(folder / _DATA)
     table.to_parquet(folder / _EPISODES)
     pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")
     for file, content in (("info.json", info), ("stats.json", stats)):

@@ -50,8 +50,9 @@ def test_lerobot_images_are_the_colours_before_each_step(shared_env: SharedEnv, 
     env = shared_env("cartpole", nworld=2, autoreset=False, horizon=10, cameras=[lw.Camera("side", 16, 12)])
     episodes = list(policy_episodes(env, lambda obs: torch.ones(2, 1), 2, seed=0))
     folder = write_lerobot(episodes, tmp_path / "data")
-    rows = pandas.read_parquet(folder / "data/chunk-000/file-000.parquet")["observation.images.camera"]
-    decoded = np.asarray(image.open(io.BytesIO(rows[13]["bytes"])))
+    rows = pandas.read_parquet(folder / "data/chunk-000/file-000.parquet")
+    assert isinstance(rows["action"][0], np.float32)  # LeRobot reads actions of one joint as numbers
+    decoded = np.asarray(image.open(io.BytesIO(rows["observation.images.camera"][13]["bytes"])))
     assert len(rows) == 20 and (decoded == episodes[1].pictures["camera"][3].numpy()).all()
     assert json.loads((folder / "meta/info.json").read_text())["features"]["observation.images.camera"] == {
         "dtype": "image", "shape": [12, 16, 3], "names": ["height", "width", "channels"],
