@@ -120,7 +120,7 @@ class Train:
     algorithm: Annotated[str | None, tyro.conf.arg(metavar="npg|ppo|sac|distill|FILE")] = None
     """npg (the natural policy gradient), ppo, sac (soft actor-critic with a replay buffer), or distill (imitation of
     --teacher or --demonstrations). The default is the algorithm that the task suggests: ppo for walking robots, npg for
-    others. path/to/file.py:Class is your own subclass of lw.Learner. --resume needs this word again.
+    others. path/to/file.py:Class is a learner of your own, a subclass of lw.Learner. --resume needs this word again.
     """
     teacher: Annotated[str | None, tyro.conf.arg(metavar="RUN|FILE|TASK")] = None
     """The policy that distill imitates: a run's folder (its last policy), a policy's file in this folder, or the name
@@ -138,7 +138,7 @@ class Train:
     suggests, or 100.
     """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Seed of the networks, the noise and the worlds' initial states."""
+    """Seed of networks, noise and initial states."""
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N|SEED ...", help_behavior_hint="")] = ()
     """Train this number of seeds, counted from 0, or these seeds, each in a process and a run of its own in --out. The
     same command continues an interrupted training."""

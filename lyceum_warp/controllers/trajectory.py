@@ -163,9 +163,9 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. The array of each tensor has the same name as
-        the tensor, and the array of a camera is called ``pictures.GROUP``. The 0-d array ``info`` is a string with a JSON object. The JSON object holds all other attributes of
-        the trajectory, and ``"format": 1``. For example, the positions are
-        ``states[:, slice(*info["state_parts"]["qpos"])]``.
+        the tensor, and the array of a camera's pictures is ``pictures.GROUP``. The 0-d array ``info`` is a string with
+        a JSON object. The JSON object holds all other attributes of the trajectory, and ``"format": 1``. For example,
+        the positions are ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)
         info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}, "pictures": [*self.pictures]}
