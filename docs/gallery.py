@@ -61,6 +61,8 @@ class Show:
 
 QUADRUPED = FreeCamera(track=1, distance=5.0, azimuth=135.0, elevation=-20.0)
 
+HAND = FreeCamera(lookat=(0.12, 0.04, 0.0), distance=0.5, azimuth=160.0, elevation=-40.0)
+
 SHOWS = {
     "adroit_door": Show(
         seconds=1.2, replan_every=2,
@@ -71,6 +73,8 @@ SHOWS = {
         camera=FreeCamera(lookat=(0.0, 0.0, 0.15), distance=1.1, azimuth=60.0, elevation=-25.0),
     ),
     "adroit_pen": Show(seconds=1.5, replan_every=2),
+    "leap_reorient": Show(seconds=4.0, camera=HAND),
+    "leap_rotate": Show(seconds=4.0, camera=HAND),
     "adroit_relocate": Show(
         seconds=2.0, replan_every=2,
         camera=FreeCamera(lookat=(0.0, 0.0, 0.2), distance=1.2, azimuth=90.0, elevation=-30.0),

@@ -18,7 +18,7 @@ _Names = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(met
 class Fit:
     """Fit model fields, delays and sensors to a robot's log, and say what the log determines.
 
-    The folder gets fit.json, draws.npz, residuals.npz, pictures and report.html. The flag --fitted of other commands,
+    The folder gets fit.json, draws.npz, pictures and report.html. The flag --fitted of other commands,
     and lw.make(..., fitted=FOLDER), use the values. docs/fitting.md describes logs and parameters.
 
     $ lyceum-warp fit go1_velocity log.npz
@@ -66,11 +66,5 @@ class Fit:
             resume=self.resume, progress=lambda stage, k, number: note(f"{stage} {k}: {number:.4g}"),
             **given(self.physics_options), **parameters(self.param),
         )  # fmt: skip
-        say(result.table)
-        for weights in result.directions:
-            say(f"can't be told apart: {', '.join(f'{weight:+.2f} {name}' for name, weight in weights.items())}")
-        nominal, fitted = result.held_out
-        say(f"errors of prediction in multiples of the noise: {nominal:.3g} nominal, {fitted:.3g} fitted")
-        for text in result.notes:
-            note(text)
+        say(result.text)
         say(f"report: {out / 'report.html'}")

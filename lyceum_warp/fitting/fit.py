@@ -22,7 +22,6 @@ from lyceum_warp.fitting.report import write_report
 from lyceum_warp.fitting.result import Fit
 from lyceum_warp.fitting.windows import Predictor, cut_windows
 from lyceum_warp.support.files import replaced
-from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number, positive_number, whole_number
 
 DRAWS = 1024
@@ -52,7 +51,6 @@ def fit(
     out: str | Path | None = None,
     window: float | None = None,
     held_out: float = 0.2,
-    noise: Mapping[str, float] | None = None,
     samples: int = 128,
     iterations: int = 30,
     seed: int = 0,
@@ -77,7 +75,6 @@ def fit(
         out: Folder for the results, as for ``lw.make(..., fitted=out)``.
         window: Seconds of a window; by default 0.25, or 0.1 if the robot's base moves, because contacts are chaotic.
         held_out: Share of the windows, at the end of the log, that is held back to measure errors of prediction.
-        noise: Standard deviations of measurements by kind, such as {"qpos": 0.002}. Others are estimated.
         samples: Hypotheses per round of the search; 0 starts at the nominal values.
         iterations: Most Gauss-Newton steps.
         seed: Seed of the search and of the draws from the posterior.
@@ -107,11 +104,10 @@ def fit(
     columns = [column.name for column in data.columns]
     wanted = [name for name in DEFAULT if _fits(name, compiled, columns)] if parameters is None else parameters
     bound = Parameters(wanted, compiled, columns)
-    groups, usual = _noise(data, compiled, noise or {})
+    groups, usual = _noise(data, compiled)
     windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
     kept = len(windows) - round(held_out * len(windows))
-    free = {label: group for label, group in groups.items() if label not in (noise or {})}
-    problem = LeastSquares(windows.chosen(slice(kept)), predictor, free)
+    problem = LeastSquares(windows.chosen(slice(kept)), predictor, groups)
     report = progress or (lambda stage, iteration, cost: None)
     checkpoint = None if out is None else Path(out) / "estimate.npz"
     if resume and checkpoint is not None and checkpoint.is_file():
@@ -126,23 +122,20 @@ def fit(
     while at.iteration < iterations and at.move >= _CONVERGED:
         at = problem.iterate(at)
         if checkpoint is not None:
-            _save(checkpoint, problem, at)
+            checkpoint.parent.mkdir(parents=True, exist_ok=True)
+            with replaced(checkpoint) as path, path.open("wb") as file:
+                np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(kept, None)), predictor, {}) if kept < len(windows) else problem
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
-    result = _result(bound, problem.covariance(linear), at, linear, groups, errors, notes)
-    result = dataclasses.replace(result, seconds=time.perf_counter() - began, substeps=predictor.substeps)
-    if out is None:
-        return result
-    result = dataclasses.replace(result, folder=Path(out))
-    _write(result, name, bound, problem.covariance(linear), at, seed)
-    times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-    residuals = np.where(problem.seen, linear.residuals * at.noise, np.nan)
-    with replaced(Path(out) / "residuals.npz") as path, path.open("wb") as file:
-        np.savez_compressed(file, time=times, residuals=residuals, columns=np.array(columns))
-    write_report(result, name, times, residuals, groups)
+    covariance = problem.covariance(linear)
+    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, out)
+    if result.folder is not None:
+        _write(result, name, bound, covariance, at, seed)
+        times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
+        write_report(result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
     return result
 
 
@@ -195,17 +188,12 @@ def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], 
     return result
 
 
-def _noise(log: Log, model: mujoco.MjModel, given: Mapping[str, float]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _noise(log: Log, model: mujoco.MjModel) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Group the columns by kind, and get each column's first noise."""
-    kinds = [_kind(column, model) for column in log.columns]
-    groups = {kind: np.array([i for i, k in enumerate(kinds) if k == kind]) for kind in dict.fromkeys(kinds)}
-    for name, number in given.items():
-        if name not in groups:
-            raise ValueError(f"noise has {name!r}, which the log does not measure: {did_you_mean(name, groups)}")
-        positive_number(f"noise of {name!r}", number, "the column's units")
+    kinds = np.array([_kind(column, model) for column in log.columns])
+    groups = {str(kind): np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds)}
     spread = np.nanstd(np.concatenate([take.measured for take in log.takes]), axis=0)
-    usual = _USUAL | dict(given)
-    return groups, np.array([usual.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
+    return groups, np.array([_USUAL.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
 
 
 def _kind(column: Column, model: mujoco.MjModel) -> str:
@@ -235,7 +223,7 @@ def _notes(groups: Mapping[str, np.ndarray], usual: np.ndarray, at: Estimate, *,
 
 def _result(
     bound: Parameters, covariance: np.ndarray, at: Estimate, linear: Linear, groups: Mapping[str, np.ndarray],
-    errors: Sequence[np.ndarray], notes: Sequence[str],
+    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, out: str | Path | None,
 ) -> Fit:  # fmt: skip
     deviation = np.sqrt(np.diag(covariance))
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
@@ -253,7 +241,8 @@ def _result(
         bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
         covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
         rms, (nominal, fitted), bound.fields(bound.model(at.x)),
-        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, 0.0, 0,
+        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds,
+        None if out is None else Path(out),
     )  # fmt: skip
 
 
@@ -273,12 +262,6 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
         np.savez_compressed(file, **draws)
     with replaced(folder / "fit.json") as path:
         path.write_text(json.dumps(content, indent=1))
-
-
-def _save(path: Path, problem: LeastSquares, at: Estimate) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, names=problem.parameters.names, begin=problem.windows.begin, **dataclasses.asdict(at))
 
 
 def _load(path: Path, problem: LeastSquares) -> Estimate:

@@ -48,8 +48,6 @@ class Linear:
 
     residuals: np.ndarray
     """In multiples of the noise, (windows, samples, columns)."""
-    leverage: np.ndarray
-    """The share of each column's residuals that the initial states absorb, (windows, columns)."""
     cost: np.ndarray
     """Costs of the windows, (windows,)."""
     weight: np.ndarray
@@ -106,10 +104,10 @@ class LeastSquares:
         changes = np.zeros((1, 1 + p + nx, nx))
         changes[0, 1 + p :] = np.diag(self.steps)
         parts = [self._equations(rows, at, np.concatenate([eps, self.steps])) for rows in self._rows(at, xs, changes)]
-        residuals, leverage, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
+        residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        return Linear(residuals, leverage, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+        return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
 
     def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
         p, base = self.parameters.size, np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
@@ -123,9 +121,7 @@ class LeastSquares:
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[..., None]
         square, gradient = jacobian.swapaxes(1, 2) @ weighted, np.einsum("wnp,wn->wp", weighted, flat)
         c = square[:, p:, p:] + np.diag(self.ridge)
-        share = np.einsum("wnp,wpn->wn", jacobian[..., p:], np.linalg.solve(c, weighted[..., p:].swapaxes(1, 2)))
-        leverage = share.reshape(base.shape).sum(axis=1)
-        return base, leverage, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
+        return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
     def iterate(self, at: Estimate) -> Estimate:
         """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
@@ -221,10 +217,10 @@ class LeastSquares:
 
     def _noise(self, at: Estimate, linear: Linear) -> np.ndarray:
         """Estimate the noise of each group of columns from the median of the residuals."""
-        noise = at.noise.copy()
+        noise, count = at.noise.copy(), len(linear.b) * linear.b.shape[2] + len(at.x)
+        free = max(0.1, 1.0 - count / self.seen.sum())  # what parameters and initial states leave of the errors
         for group in self.groups.values():
             sizes = np.abs(linear.residuals[..., group][self.seen[..., group]])
-            free = max(0.1, 1.0 - linear.leverage[:, group].sum() / len(sizes))
             noise[group] *= max(1e-6, float(np.median(sizes)) / 0.6745 / np.sqrt(free))
         return noise
 

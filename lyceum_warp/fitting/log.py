@@ -84,8 +84,7 @@ def read_log(source: LogSource, model: mujoco.MjModel, controls: Controls | None
     if not takes:
         raise ValueError("there is no log: pass a file, an episode or a mapping of arrays")
     log = Log(columns, tuple(takes), tuple(notes))
-    _check_units(log, model)
-    _check_order(log, model)
+    _check_joints(log, model)
     return log
 
 
@@ -208,37 +207,32 @@ def _cut(name: str, take: Take, notes: list[str]) -> list[Take]:
     return [Take(take.time[span], take.control[span], take.measured[span]) for span in spans]
 
 
-def _check_units(log: Log, model: mujoco.MjModel) -> None:
-    """Refuse positions far outside of a joint's range."""
-    values = np.concatenate([take.measured for take in log.takes])
-    ranges = {int(model.jnt_qposadr[j]): model.jnt_range[j] for j in np.flatnonzero(model.jnt_limited)}
-    for column, numbers in zip(log.columns, values.T, strict=True):
-        low, high = ranges.get(column.index, (0.0, np.inf)) if column.field == "qpos" else (0.0, np.inf)
-        least, most = np.nanmin(numbers), np.nanmax(numbers)
-        if least < 2.0 * low - high or most > 2.0 * high - low:
-            raise ValueError(
-                f"{column.name!r} reaches from {least:.3g} to {most:.3g}, but the joint's range is {low:.3g} to "
-                f"{high:.3g}: convert degrees to radians, or subtract the encoder's offset"
-            )
-
-
-def _check_order(log: Log, model: mujoco.MjModel) -> None:
-    """Refuse a log in which joints follow each other's servos, or move by velocities of other joints or units."""
+def _check_joints(log: Log, model: mujoco.MjModel) -> None:
+    """Refuse joints in other units, and joints that follow each other's servos or move by each other's velocities."""
     places = {(column.field, column.index): i for i, column in enumerate(log.columns)}
-    scalar = np.flatnonzero(model.jnt_type >= mujoco.mjtJoint.mjJNT_SLIDE.value)
-    pairs = [(places.get(("qpos", int(model.jnt_qposadr[j])), -1), places.get(("qvel", int(model.jnt_dofadr[j])), -1))
-             for j in scalar]  # fmt: skip
+    values = np.concatenate([take.measured for take in log.takes])
+    pairs = []
+    for j in np.flatnonzero(model.jnt_type >= mujoco.mjtJoint.mjJNT_SLIDE.value):
+        if (position := places.get(("qpos", int(model.jnt_qposadr[j])))) is None:
+            continue
+        low, high = model.jnt_range[j]
+        least, most = np.nanmin(values[:, position]), np.nanmax(values[:, position])
+        if model.jnt_limited[j] and (least < 2.0 * low - high or most > 2.0 * high - low):
+            raise ValueError(
+                f"{log.columns[position].name!r} reaches from {least:.3g} to {most:.3g}, but the joint's range is "
+                f"{low:.3g} to {high:.3g}: convert degrees to radians, or subtract the encoder's offset"
+            )
+        if (velocity := places.get(("qvel", int(model.jnt_dofadr[j])))) is not None:
+            pairs.append((position, velocity))
     driven = np.flatnonzero((model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_biasprm[:, 1] < 0))
-    addresses = model.jnt_qposadr[model.actuator_trnid[driven, 0]].tolist()
-    servos = [(int(model.actuator_ctrladr[i]), places.get(("qpos", address), -1))
-              for i, address in zip(driven, addresses, strict=True)]  # fmt: skip
-    pairs, servos = ([pair for pair in both if -1 not in pair] for both in (pairs, servos))
+    followed = {int(model.actuator_ctrladr[i]): ("qpos", int(model.jnt_qposadr[model.actuator_trnid[i, 0]]))
+                for i in driven}  # fmt: skip
+    servos = [(control, places[key]) for control, key in followed.items() if key in places]
     for take in log.takes:
         rates = np.gradient(take.measured, take.time, axis=0)
         for position, velocity in pairs:
-            rate, seen = rates[:, position], take.measured[:, velocity]
-            fine = np.isfinite(rate) & np.isfinite(seen)
-            if rate[fine] @ seen[fine] > 5.0 * rate[fine] @ rate[fine]:
+            rate = rates[:, position]
+            if np.nansum(rate * take.measured[:, velocity]) > 5.0 * np.nansum(rate * rate):
                 raise ValueError(
                     f"{log.columns[velocity].name!r} is more than 5 times the change of {log.columns[position].name!r} "
                     "per second: convert both to the same units (radians, metres, seconds)"

@@ -17,13 +17,16 @@ from lyceum_warp.support.validate import finite_number
 
 _NAME = re.compile(r"(?P<field>[a-z0-9_]+)\.(?P<pattern>.+?)(?:\[(?P<column>\d+)\])?")
 _SERVO = {"kp": (("actuator_gainprm", 0), ("actuator_biasprm", 1)), "kd": (("actuator_biasprm", 2),)}
-_SIGNALS = {"delay": (0.0, 0.02, 0.0, 0.05), "gain": (1.0, 0.1, 0.1, 10.0), "bias": (0.0, 0.02, -np.inf, np.inf)}
-"""The nominal value, the prior's deviation and the bounds of parameters of signals."""
+_SIGN = {"actuator_biasprm": -1.0}
+_SIGNALS = {"delay": (0.02, 0.0, 0.05), "gain": (0.1, -np.log(10.0), np.log(10.0)), "bias": (0.02, -np.inf, np.inf)}
+"""The prior's deviation and the bounds of parameters of signals. A gain is a factor."""
 _SIGNED = {"body_ipos": 0.02, "body_pos": 0.01, "geom_pos": 0.01, "site_pos": 0.01, "jnt_pos": 0.01, "qpos_spring": 0.1}
 """Fields whose columns are shifted apart, with the prior's deviation of the shift."""
 _FROM_ZERO = {"dof_armature": 0.02, "dof_damping": 0.5, "dof_frictionloss": 0.5, "jnt_stiffness": 1.0}
 """The prior's deviation of fields whose nominal value is 0."""
-_FACTOR, _RANGE, _INERTIA = 0.5, 10.0, 0.2
+_FACTOR, _RANGE, _INERTIA = 0.5, np.log(10.0), 0.2
+_FACTORS = ("factor", "gain")
+"""Kinds of coordinates that are logarithms."""
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
 
@@ -45,7 +48,7 @@ class Parameter:
     ``gain``, ``bias``       a logged number is gain * value + bias, for controls and measurements
     =======================  ==========================================================================================
 
-    Factors have a normal prior of the logarithm around 0, and all others a normal prior around the nominal value.
+    Factors and gains have a normal prior of the logarithm around 0, and all others one around the nominal value.
     """
 
     name: str
@@ -73,7 +76,7 @@ class Coordinate:
 
     name: str
     kind: str
-    """"factor" (a logarithm), "shift", "inertia", or a key of ``_SIGNALS``."""
+    """"factor", "shift", "inertia", or a key of ``_SIGNALS``."""
     std: float
     low: float
     high: float
@@ -85,7 +88,7 @@ class Coordinate:
 
     def value(self, x: Any) -> Any:
         """Convert coordinates to factors or values."""
-        return np.exp(x) if self.kind == "factor" else x + (self.kind == "gain")
+        return np.exp(x) if self.kind in _FACTORS else x
 
 
 class Parameters:
@@ -135,8 +138,7 @@ class Parameters:
         for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
             if field in _SIGNALS:
                 places = np.concatenate([self._signals[name] for name in members])
-                nominal, std, low, high = _SIGNALS[field]
-                self._append(given, f"{field}.{label}", field, std, low - nominal, high - nominal, signals=places)
+                self._append(given, f"{field}.{label}", field, *_SIGNALS[field], signals=places)
             elif field == "inertia":
                 self._touch(_INERTIAL, members)
                 body = elements(self.nominal, own, label).start
@@ -147,35 +149,29 @@ class Parameters:
                 self._add_field(given, field, label, members, None if match["column"] is None else int(match["column"]))
 
     def _add_field(self, given: Parameter, field: str, label: str, names: list[str], column: int | None) -> None:
-        pairs = _SERVO.get(field, ((field, column), *((("body_inertia", None),) if field == "body_mass" else ())))
-        self._touch([name for name, _ in pairs], names)
-        rows = np.asarray(getattr(self.nominal, pairs[0][0]))
+        rows = np.asarray(getattr(self.nominal, _SERVO[field][0][0] if field in _SERVO else field))
         width = rows.size // max(1, len(rows))
         if column is not None and column >= width:
             raise ValueError(f"the parameter {given.name!r} is out of range: {field} has {width} columns")
-        places = [(name, self._indices(name, names, k)) for name, k in pairs]
-        if field in _SIGNED:
-            for k in range(width) if column is None else [column]:
-                place = self._indices(field, names, k)
-                whole = f"{field}.{label}" + (f"[{k}]" if width > 1 else "")
-                shift = ((field, place, np.ones(len(place))),)
-                self._append(given, whole, "shift", _SIGNED[field], -np.inf, np.inf, writes=shift)
-            return
-        whole = f"{field}.{label}" + ("" if column is None else f"[{column}]")
-        writes: Any = [(name, place, np.full(len(place), -1.0 if name == "actuator_biasprm" else 1.0))
-                       for name, place in places]  # fmt: skip
-        if any(np.ravel(getattr(self.nominal, name))[place].any() for name, place in places):
-            self._append(given, whole, "factor", _FACTOR, -np.log(_RANGE), np.log(_RANGE), writes=writes)
-        else:
-            least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
-            self._append(given, whole, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
+        for k in range(width) if field in _SIGNED and column is None else [column]:
+            pairs = _SERVO.get(field, ((field, k), *((("body_inertia", None),) if field == "body_mass" else ())))
+            self._touch([name for name, _ in pairs], names)
+            writes = [(name, place := self._indices(name, names, at), np.full(len(place), _SIGN.get(name, 1.0)))
+                      for name, at in pairs]  # fmt: skip
+            whole = f"{field}.{label}" + ("" if k is None or width == 1 else f"[{k}]")
+            if field in _SIGNED:
+                self._append(given, whole, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
+            elif any(np.ravel(getattr(self.nominal, name))[place].any() for name, place, _ in writes):
+                self._append(given, whole, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
+            else:
+                least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
+                self._append(given, whole, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
 
     def _append(self, given: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any) -> None:
-        into: Callable[[float], float] = np.log if kind == "factor" else lambda value: value - (kind == "gain")
-        if kind == "factor" and min(given.low or 1.0, given.high or 1.0) <= 0.0:
+        if kind in _FACTORS and min(given.low or 1.0, given.high or 1.0) <= 0.0:
             raise ValueError(f"the bounds of {given.name!r} are factors of the nominal value, and must be positive")
-        low = low if given.low is None else float(into(given.low))
-        high = high if given.high is None else float(into(given.high))
+        into: Callable[[float], float] = np.log if kind in _FACTORS else float
+        low, high = (old if new is None else float(into(new)) for old, new in ((low, given.low), (high, given.high)))
         if not low <= 0.0 <= high or low == high:
             raise ValueError(f"the bounds of {given.name!r} must lie around the nominal value")
         self.coordinates.append(Coordinate(name, kind, given.prior or std, low, high, **more))
@@ -221,11 +217,11 @@ class Parameters:
 
     def signals(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Get delay, gain and bias of each control and then of each column of the log."""
-        values = {kind: np.full(self._count, nominal) for kind, (nominal, *_) in _SIGNALS.items()}
+        values = {kind: np.zeros(self._count) for kind in _SIGNALS}
         for value, coordinate in zip(x, self.coordinates, strict=True):
             if coordinate.kind in values:
                 values[coordinate.kind][coordinate.signals] += value
-        return values
+        return values | {"gain": np.exp(values["gain"])}
 
     @property
     def longest_delays(self) -> np.ndarray:

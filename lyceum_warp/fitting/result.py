@@ -46,18 +46,24 @@ class Fit:
     """What to know about the log and the fit."""
     seconds: float
     """Wall seconds of the fit."""
-    substeps: int
-    """Substeps that the fit simulated."""
     folder: Path | None = None
     """The folder, which ``lw.make(..., fitted=folder)`` reads."""
 
     @property
-    def table(self) -> str:
-        """Format the parameters as lines of text."""
-        width = max(map(len, self.names))
-        lines = []
-        for i, name in enumerate(self.names):
-            interval = f"{self.value[i]:10.4g}  [{self.low[i]:.4g}, {self.high[i]:.4g}]"
-            unit = " x nominal" if self.kinds[i] == "factor" else ""
-            lines.append(f"{name:{width}} {interval}{unit}{'' if self.determined[i] else '  undetermined'}")
-        return "\n".join(lines)
+    def text(self) -> str:
+        """Values, what can't be told apart, errors of prediction, and notes, as lines of text."""
+        width, columns = max(map(len, self.names)), (self.names, self.kinds, self.value, self.low, self.high)
+        lines = [
+            f"{name:{width}} {value:10.4g}  [{low:.4g}, {high:.4g}]{' x nominal' * (kind == 'factor')}"
+            f"{'' if known else '  undetermined'}"
+            for name, kind, value, low, high, known in zip(*columns, self.determined, strict=True)
+        ]
+        for weights in self.directions:
+            lines.append(
+                f"can't be told apart: {', '.join(f'{weight:+.2f} {name}' for name, weight in weights.items())}"
+            )
+        lines.append("errors of prediction in windows held back:")
+        for name, (nominal, fitted) in self.errors.items():
+            lines.append(f"{name}: {nominal:.3g} nominal, {fitted:.3g} fitted, noise {self.noise[name]:.3g}")
+        lines.append("in multiples of the noise: {:.3g} nominal, {:.3g} fitted".format(*self.held_out))
+        return "\n".join([*lines, *self.notes])

@@ -1,6 +1,7 @@
 """Cut a log into windows, guess their initial states, and predict what each window measured."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -77,17 +78,15 @@ class Predictor:
     """Predicts the measurements of windows under hypotheses, in worlds of the C engine in float64."""
 
     def __init__(self, log: Log, parameters: Parameters, *, nthread: int = 0) -> None:
-        self.log, self.parameters, self.model, self.nthread = log, parameters, parameters.nominal, nthread
+        self.log, self.parameters, self.model = log, parameters, parameters.nominal
         self.nx = 2 * self.model.nv + self.model.na
         """Numbers by which an initial state may differ from another: positions, velocities and activations."""
         self.sources = {name: [(i, c.index) for i, c in enumerate(log.columns) if c.field == name]
                         for name in dict.fromkeys(column.field for column in log.columns)}  # fmt: skip
         self.quats = _quaternions(log.columns, self.model)
         self._record = [_STATE, *(name for name in self.sources if name in ("sensordata", "actuator_force"))]
-        self._batches: dict[int, Batch] = {}
+        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
         self._data = mujoco.MjData(self.model)
-        self.substeps = 0
-        """Substeps of all worlds so far."""
 
     def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
@@ -137,7 +136,6 @@ class Predictor:
                     states[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
                 data.ctrl[:] = controls[k]
                 mujoco.mj_step(model, data)
-            self.substeps += steps
         return states
 
     def predict(self, windows: Windows, states: np.ndarray, xs: np.ndarray, changes: np.ndarray) -> np.ndarray:
@@ -164,7 +162,6 @@ class Predictor:
             batch.bind(name)[...] = part
         controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
         controls = controls.reshape(-1, windows.steps, self.model.nu)
-        self.substeps += len(initial) * windows.steps
         bad = np.zeros(len(initial), bool)
         try:
             records = batch.rollout(windows.steps, controls, record=self._record)
@@ -173,12 +170,11 @@ class Predictor:
             bad[error.ids] = True
         bad |= batch.warning[:, :, 1].any(axis=1)
         rolled = np.concatenate([initial[:, None], records[_STATE][:, :-1]], axis=1)
+        fields = records | dict(zip(("qpos", "qvel", "act"), np.split(rolled, edges, axis=2), strict=True))
         predicted = np.empty((*rolled.shape[:2], len(self.log.columns)))
         for name, pairs in self.sources.items():
-            offset = {"qpos": 0, "qvel": edges[0], "act": edges[1]}.get(name)
-            source = rolled if offset is not None else records[name].reshape(*rolled.shape[:2], -1)
             columns, indices = np.array(pairs).T
-            predicted[..., columns] = source[..., indices + (offset or 0)]
+            predicted[..., columns] = fields[name].reshape(*rolled.shape[:2], -1)[..., indices]
         predicted[bad] = np.inf
         return self._compared(windows, predicted.reshape(len(windows), count, windows.steps, -1), signals)
 
@@ -223,12 +219,6 @@ class Predictor:
             for quat in self.quats:
                 difference[..., quat] = _turn(values[..., quat], measured[..., quat])
             return np.where(np.isnan(measured), 0.0, np.where(np.isfinite(difference), difference, np.inf))
-
-    def _batch(self, worlds: int) -> Batch:
-        if worlds not in self._batches:
-            self._batches = {key: batch for key, batch in self._batches.items() if len(self._batches) < 4}
-            self._batches[worlds] = Batch(self.model, worlds, self.nthread)
-        return self._batches[worlds]
 
 
 def _quaternions(columns: Sequence[Column], model: mujoco.MjModel) -> list[list[int]]:

@@ -125,13 +125,16 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
 
 
 def servo_metadata(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-    """Collect the names, gains and poses that a robot needs to run a policy. Lists are in the order of ``joints``."""
+    """Collect the names, gains and poses that a robot needs to run a policy. Lists are in the order of ``joints``.
+
+    A robot with the parameter ``imu`` has a floating base.
+    """
     actuators = servos(model, p)
     # the joint's own damping adds to the servo's damping
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
+    imu = {"base": model.body(base(model)).name, "velocimeter": np.asarray(p.imu).tolist()} if hasattr(p, "imu") else {}
     return {
-        "base": model.body(base(model)).name,
-        "velocimeter": np.asarray(p.imu).tolist(),  # position on the base, in m
+        **imu,  # the velocimeter's position on the base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),

@@ -29,6 +29,13 @@ def fidelity(result: Result) -> None:
     assert result["pairs"]["engines"]["obs"]["p99"][-1] > 0.0
 
 
+def fits(*results: Result) -> None:
+    assert len(results) == 3  # policies from the fit, from wide draws and from the nominal robot
+    for result in results:
+        errors, falls = result["plants"]["0"].values()
+        assert len(errors) == len(falls) == 4 and all(0.0 < error < 3.0 for error in errors)
+
+
 def humanoid(*results: Result) -> None:
     assert all(not result["fell"] and result["up_share"] == 1.0 for result in results)
 
@@ -73,6 +80,7 @@ SHORT: dict[Callable[..., None], str] = {
     agreement: "--tasks hopper ant",
     equivalence: "--threads 1",
     fidelity: "--tasks point_mass --nworld 3 --steps 4",
+    fits: "--parts policies",
     humanoid: "--threads 1",
     latency: "--threads 1 --samples 8",
     mppi: "--threads 1 --contestants mppi python",

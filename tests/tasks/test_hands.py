@@ -1,5 +1,7 @@
 """Compare the LEAP hand's tasks with MuJoCo Playground's formulas, computed anew from MuJoCo's own quantities."""
 
+import itertools
+
 import mujoco
 import numpy as np
 import pytest
@@ -125,7 +127,7 @@ def test_goal_turns_after_a_success_and_then_comes_to_rest(shared_env: SharedEnv
     for _ in range(12):
         goals.append(step())
         assert env.metrics["success"].item() == 0.0
-    steps = np.array([angle(b, a) for a, b in zip(goals, goals[1:], strict=False)])
+    steps = np.array([angle(b, a) for a, b in itertools.pairwise(goals)])
     assert np.isclose(0.1 * np.linalg.norm(spin), steps[0], rtol=1e-3)
     assert np.allclose(steps[1:] / steps[:-1], 0.8, atol=0.01)
 

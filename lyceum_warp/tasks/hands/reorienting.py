@@ -205,6 +205,9 @@ class Reorient(rotating.Rotate):
         "excess_l2": -0.1,
     }
     metrics = ("success",)
+    planning = lw.Planning(
+        settings={"horizon": 12, "samples": 128, "temperature": 0.05, "noise": 0.3}, params={"goal_angle": [0.1, 0.1]}
+    )
     cleared = ("actuator_force",)
     training = lw.Training(
         algorithm="ppo",

@@ -1,13 +1,14 @@
 """Define in-hand rotation: spin an object about the vertical axis, as in MuJoCo Playground's LeapCubeRotateZAxis.
 
 The palm faces upwards and does not move. The model has a site ``grasp_site`` above the palm, a geom and a site of the
-same name at each fingertip, one free joint, which is the object's, a keyframe "home", and a position servo for each joint
-of the hand. An action is an offset of the servos' targets from the pose of the keyframe.
+same name at each fingertip, one free joint, which is the object's, a keyframe "home", and a position servo for each of
+the hand's joints. An action is an offset of the servos' targets from the pose of the keyframe.
 
 Differences from Playground: the last action in an observation is the latest one, the critic's observation has no noise,
 positions are those after the last substep, and worlds differ in friction, damping, gains and the object's mass.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import mujoco
@@ -241,6 +242,7 @@ class Rotate(lw.Task):
     rewards = {"spin": 1.0, "drop": -100.0, "excess_l2": -0.1}
     terminations = ("dropped",)
     actions = {"joint_position": "joints"}
+    planning = lw.Planning(settings={"horizon": 16, "samples": 128, "temperature": 0.02, "noise": 0.6})
     training = lw.Training(
         algorithm="ppo",
         iterations=300,
@@ -248,6 +250,5 @@ class Rotate(lw.Task):
     )
 
     @staticmethod
-    def edit_model(spec: mujoco.MjSpec) -> None:
-        """Limit the iterations of convex collisions, as Playground does."""
-        spec.option.ccd_iterations = 10
+    def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        return walkers.servo_metadata(model, p)

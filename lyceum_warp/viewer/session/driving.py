@@ -18,7 +18,7 @@ _NEVER = 1e9  # seconds until the task chooses a new command
 # arrows start _HEIGHT metres above the base; the length of an arrow is its velocity times _SECONDS
 _HEIGHT, _SECONDS = 0.25, 0.4
 _COMMANDED, _MEASURED = (0.1, 0.35, 0.95, 1.0), (0.1, 0.85, 0.55, 1.0)
-_SCALE = f"{_SECONDS:g} m per m/s; up or down: turn left or right, {_SECONDS:g} m per rad/s"
+_SCALE = f"{_SECONDS:g} m per m/s; up: turn left, {_SECONDS:g} m per rad/s"
 
 
 class Driving:

@@ -33,9 +33,12 @@ def task_numbers(env: Env) -> Numbers:
 
 
 def nominal_fields(env: Env) -> dict[str, np.ndarray]:
-    """Return the nominal values of the fields that differ between worlds and cannot be negative, such as masses."""
-    model = env.task.model
-    values = {field.name: np.ravel(getattr(owner_of(model, field.name), field.name)) for field in env.task.dynamics}
+    """Return the nominal values of the fields that a task draws and that cannot be negative, such as masses.
+
+    Fields whose nominal values depend on a world's object are left out.
+    """
+    model, drawn = env.task.model, [field.name for field in env.task.dynamics if field.rows is None]
+    values = {name: np.ravel(getattr(owner_of(model, name), name)) for name in drawn}
     return {name: value for name, value in values.items() if (value >= 0).all() and value.any()}
 
 

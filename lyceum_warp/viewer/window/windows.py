@@ -26,7 +26,7 @@ NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 SIDE = 330
 """Width of the windows on both sides, in pixels. They have one width, so that the scene's free part is centred."""
-HINT = "drag: turn   right drag: move   wheel: zoom   push: double-click a body, then Ctrl + right drag   F1: all keys"
+HINT = "drag: turn   right drag: move   wheel: zoom   double-click, then Ctrl + right drag: push   F1: keys"
 _LEGEND_PLACE = int(implot.Location.North)
 _OVERLAY = (
     int(imgui.WindowFlags.NoDecoration) | int(imgui.WindowFlags.NoInputs) | int(imgui.WindowFlags.AlwaysAutoResize)
@@ -106,7 +106,7 @@ class Windows:
             self._overlay("newest messages", (width / 2, height - 40), (0.5, 1.0), room, lines)
         if self._frame is not None and (lines := legend(self._frame)):
             left = 10.0 if width < NARROW else SIDE + 20.0
-            self._overlay("legend", (left, height - 40 - 24 * TOASTS), (0.0, 1.0), room, lines)
+            self._overlay("legend", (left, height - 40 - 32 * TOASTS), (0.0, 1.0), room, lines)
 
     def _overlay(
         self, title: str, place: tuple[float, float], pivot: tuple[float, float], room: float, lines: list[Line]
