@@ -106,7 +106,7 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     }  # fmt: skip
     observed = [f"{part}_{k}" for part, (start, stop) in first.obs_parts.items() for k in range(stop - start)]
     names = {"observation.state": observed, "action": list(first.action_names)}
-    info = {
+    info: dict[str, Any] = {
         "codebase_version": "v3.0", "robot_type": first.task, "total_episodes": len(episodes),
         "total_frames": len(frame), "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200, "fps": round(rate) if abs(rate - round(rate)) < 1e-6 else rate,

@@ -118,6 +118,7 @@ class Demonstrations(nn.Module):
     """The actions, (steps, nact)."""
     step: torch.Tensor
     """Number of steps since the episode's start, (steps,)."""
+    shape: dict[str, Any]
 
     def __init__(self, episodes: Iterable[Any]) -> None:
         super().__init__()
@@ -239,8 +240,9 @@ class Distill(Learner):
         fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
         seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
         fitted |= seen | ({} if "own" in shape else {"recurrent": shape.get("recurrent", 0)})
-        for group, size in self.policy.pictures.items() if isinstance(teacher, Demonstrations) else ():
-            if tuple(teacher.shape["pictures"].get(group, ())[1:]) != tuple(size):
+        given = teacher.obs_groups if isinstance(teacher, Demonstrations) else env.obs_groups
+        for group, size in self.policy.pictures.items():
+            if group not in given or given[group].shape[1:] != size:
                 raise ValueError(
                     f"the demonstrations have no pictures {group!r} of the shape {tuple(size)}: save the episodes of "
                     "an environment with this camera, or use policy_groups=('policy',)"

@@ -178,7 +178,8 @@ def cameras(text: str) -> tuple[Camera, ...]:
             raise ValueError(f"a camera must be written as NAME, NAME:64x64 or NAME:64x64:depth, not {word!r}")
         name, width, height, kind = match.groups()
         group = "camera" if len(words) == 1 else name if kind in (None, "rgb") else f"{name}_{kind}"
-        parsed.append(Camera(name, int(width or 64), int(height or 64), kind or "rgb", group))
+        values: dict[str, Any] = {"width": width and int(width), "height": height and int(height), "kind": kind}
+        parsed.append(Camera(name, group=group, **{key: value for key, value in values.items() if value is not None}))
     return tuple(parsed)
 
 
