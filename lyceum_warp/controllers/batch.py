@@ -5,8 +5,10 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
+import warp as wp
 
 from lyceum_warp.controllers.trajectory import Trajectory, pictures_of, provenance, stacked
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
 
 
@@ -31,11 +33,16 @@ def policy_episodes(
 
     Yields:
         The first episode of each world, then the second episode of each world, and so on.
+
+    Raises:
+        NotEnoughMemoryError: The pictures of all worlds do not fit into memory.
     """
     player = Player(policy, env)
     named = {"name": type(policy).__name__, **(controller or {})}
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)
+    if seen := sum(env.obs_groups[camera.group][0].nbytes for camera in env.task.cameras):
+        check_fit(seen * env.horizon, env.nworld, wp.get_device("cpu"), model=f"{env.horizon} steps with pictures")
     for number in range(rounds):
         if number == 0 or env.task.curriculum:
             start_episodes(env, seed, curriculum, first=number * env.nworld, total=rounds * env.nworld)

@@ -78,6 +78,12 @@ def test_episodes_hold_the_pictures_of_their_states(shared_env: SharedEnv, tmp_p
         Trajectory.load(episode.save(tmp_path / "short.npz"))
 
 
+def test_episodes_whose_pictures_do_not_fit_into_memory_are_refused(shared_env: SharedEnv) -> None:
+    env = shared_env("cartpole", nworld=2, autoreset=False, horizon=10**9, cameras=[lw.Camera("side", 16, 12)])
+    with pytest.raises(ValueError, match="2 worlds of 1000000000 steps with pictures need about 1.15e"):
+        next(policy_episodes(env, lambda obs: torch.ones(2, 1), 2))
+
+
 def test_episode_has_the_parameters_of_its_own_world() -> None:
     env = lw.make("point_mass", nworld=2, horizon=3, autoreset=False, success_distance=[0.1, 0.2])
     first, second = policy_episodes(env, lambda obs: torch.zeros(2, 2), 2)

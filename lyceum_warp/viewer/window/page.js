@@ -54,7 +54,8 @@
     box.replaceChildren(...pictures.map(([caption, src]) => {
       const figure = document.createElement("figure");
       figure.style = "margin:0;padding:4px;width:min-content;background:#fffd;color:#000;font:12px sans-serif";
-      const image = Object.assign(new Image(), {src, style: "display:block;height:min(20vh,160px);image-rendering:pixelated"});
+      const style = "display:block;height:min(20vh,160px);image-rendering:pixelated";
+      const image = Object.assign(new Image(), {src, style});
       figure.append(image, caption);
       return figure;
     }));
