@@ -180,7 +180,7 @@ def gap_tables(rows: Sequence[Row]) -> list[Table]:
     lines = [
         [row.case["run"] or "cartpole, 32 x 32 pixels, from a teacher", row.case["renderer"],
          f"{statistics.mean(row.result['returns']):.1f} ± {statistics.pstdev(row.result['returns']):.1f}",
-         f"{min(row.result['returns']):.1f}", str(len(row.result["returns"])), f"{row.result['differing']:.1%}"]
+         f"{min(row.result['returns']):.1f}", str(len(row.result["returns"])), f"{row.result['differing']:.2%}"]
         for row in rows
     ]  # fmt: skip
     title = (
