@@ -240,9 +240,9 @@ class Distill(Learner):
         fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
         seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
         fitted |= seen | ({} if "own" in shape else {"recurrent": shape.get("recurrent", 0)})
-        given = teacher.obs_groups if isinstance(teacher, Demonstrations) else env.obs_groups
+        demonstrated = teacher.obs_groups if isinstance(teacher, Demonstrations) else env.obs_groups
         for group, size in self.policy.pictures.items():
-            if group not in given or given[group].shape[1:] != size:
+            if group not in demonstrated or demonstrated[group].shape[1:] != size:
                 raise ValueError(
                     f"the demonstrations have no pictures {group!r} of the shape {tuple(size)}: save the episodes of "
                     "an environment with this camera, or use policy_groups=('policy',)"
