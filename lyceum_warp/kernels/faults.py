@@ -100,15 +100,23 @@ def faults_of_fields(
     contact_bits: int,
     constraint_bits: int,
     ignored_bits: int,
+    jacobian_out: wp.array3d[float],
     fault_out: wp.array[int],
 ):
-    """Find faults of the Warp engine in the masked worlds, from states and overflow bits; launched over (nworld,)."""
+    """Find faults of the Warp engine in the masked worlds, from states and overflow bits; launched over (nworld,).
+
+    Contacts of a geom whose position is NaN leave NaN in rows of the Jacobian. The solver multiplies unused rows by
+    zero, and NaN times zero is NaN. So the Jacobian of a world with NaN is cleared.
+    """
     w = wp.tid()
     if not mask_in[w]:
         return
     fault = int(0)
     if not (row_in_range(qpos_in[w], 0, 1) and row_in_range(qvel_in[w], 0, 1) and row_in_range(act_in[w], 0, 1)):
         fault = NAN
+        for i in range(jacobian_out.shape[1]):
+            for j in range(jacobian_out.shape[2]):
+                jacobian_out[w, i, j] = 0.0
     overflow = overflow_in[w] & ~ignored_bits
     if (overflow & contact_bits) != 0:
         fault = fault | CONTACT

@@ -10,6 +10,8 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.hands.leap import LeapReorient
+from lyceum_warp.testing import check_task
+from lyceum_warp.testing.fault_rules import check_bad_state
 
 QUIET = {
     "joint_position_noise": 0.0, "object_position_noise": 0.0, "object_rotation_noise": 0.0, "goal_angle": [0.1, 0.1],
@@ -174,3 +176,7 @@ def test_hand_holds_other_objects(shared_env: SharedEnv) -> None:
     for _ in range(10):
         env.step(torch.zeros_like(env.action))
     assert not env.terminated.any() and sum(env.fault_counts.values()) == 0
+
+
+def test_world_recovers_from_nan_among_many_contacts() -> None:
+    check_task("leap_rotate", engine="warp", steps=50, checks=(check_bad_state,))

@@ -47,8 +47,9 @@ def test_task_passes_all_checks_of_check_task(task: str, engine: str) -> None:
 def test_task_passes_the_quick_checks_of_check_task(task: str, engine: str) -> None:
     done = OF_THE_TASK if engine == "mujoco" else OF_THE_STATE
     checks = [check for check in CHECKS if check not in done]
-    if engine == "warp" and "rough" in task:
-        # on a height field, the C engine creates more contacts than MuJoCo Warp
+    if engine == "warp" and ("rough" in task or "leap" in task):
+        # on a height field, the C engine creates more contacts than MuJoCo Warp; in a hand's contacts, five iterations
+        # of the solver do not converge
         checks.remove(check_dynamics)
     check_task(task, engine=engine, checks=checks, **options(task, engine))
 

@@ -106,10 +106,6 @@ class WarpEngine(Engine):
         moves_mocap = any(self.fields[name].written for name in ("mocap_pos", "mocap_quat") if name in self.fields)
         current_parts = () if moves_mocap else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.POSITION)
-        # A geom whose position is NaN has contacts with every element of a flex. The Jacobian rows of these contacts
-        # hold NaN. The solver multiplies unused rows by zero, and NaN times zero is NaN. So a reset clears these rows.
-        self._jacobian = flat(self.d.efc.J if model.nflex else wp.zeros((nworld, 0), dtype=float, device=device))
-        self._zeros = wp.zeros(self._jacobian.shape[1], dtype=float, device=device)
         self._conditional = Conditional(device)
         # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
         self._partial = self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
@@ -252,13 +248,12 @@ class WarpEngine(Engine):
     def find_faults(self, mask: wp.array) -> None:
         d = self.d
         bits = [sizes.CONTACT_BITS, sizes.CONSTRAINT_BITS, sizes.IGNORED_BITS]
-        args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, self.fault]
+        args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, d.efc.J, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
 
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
             mjw.reset_data(self.m, self.d, reset=mask)
-            launch_rows(copy_rows, mask, repeated(self._zeros, self.nworld), self._jacobian)
             if self._start is not None:
                 launch_rows(copy_rows, mask, repeated(self._start, self.nworld), self._state)
                 mjw.set_state(self.m, self.d, self._state, _SPEC, mask)

@@ -1,6 +1,7 @@
 """Test whether a hand turns an object and holds it."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 
@@ -17,10 +18,11 @@ class Turns(lw.Gate):
         text: What the sum is, with its unit.
         least: Least mean of the sum over all worlds.
         drops: Most drops per hour.
+        params: Parameters of the task.
     """
 
-    def __init__(self, metric: str, text: str, *, least: float, drops: float) -> None:
-        self.metric = metric
+    def __init__(self, metric: str, text: str, *, least: float, drops: float, **params: Any) -> None:
+        self.metric, self.params = metric, params
         self.limits = {
             "drops": lw.Limit("drops per hour", high=drops),
             "first": lw.Limit(f"{text} in the first 10 s", low=0.2 * 0.5 * least),
@@ -31,7 +33,7 @@ class Turns(lw.Gate):
         self, worlds: Callable[..., lw.Env], act: Callable[[torch.Tensor], torch.Tensor]
     ) -> Iterator[dict[str, float]]:
         """Yield the numbers after 10 s and after 50 s."""
-        env = worlds(WORLDS)
+        env = worlds(WORLDS, **self.params)
         total, drops = torch.zeros(WORLDS), torch.zeros(())
         for step in range(1, STEPS + 1):
             env.step(act(env.obs))

@@ -192,7 +192,7 @@ class Reorient(rotating.Rotate):
     """A hand turns an object to a goal, then to the next, and does not drop it."""
 
     horizon = 1000
-    gate = gates.Turns("success", "goals reached", least=10.0, drops=20.0)
+    gate = gates.Turns("success", "goals reached", least=2.0, drops=20.0, goal_angle=[0.1, 0.1])
     rewards = {
         "aligned": 0.1,
         "progress": 1.0,
@@ -206,11 +206,12 @@ class Reorient(rotating.Rotate):
     }
     metrics = ("success",)
     planning = lw.Planning(
-        settings={"horizon": 12, "samples": 128, "temperature": 0.05, "noise": 0.3}, params={"goal_angle": [0.1, 0.1]}
+        settings={"horizon": 12, "samples": 128, "temperature": 0.05, "noise": 0.3},
+        params={"goal_angle": [0.1, 0.1], "drop": -2000.0, "centred": 2.0},
     )
     cleared = ("actuator_force",)
     training = lw.Training(
         algorithm="ppo",
-        iterations=600,
+        iterations=1200,
         settings={"log_std": -0.7, "entropy_coef": 0.001},
     )

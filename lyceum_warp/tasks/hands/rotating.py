@@ -242,10 +242,12 @@ class Rotate(lw.Task):
     rewards = {"spin": 1.0, "drop": -100.0, "excess_l2": -0.1}
     terminations = ("dropped",)
     actions = {"joint_position": "joints"}
-    planning = lw.Planning(settings={"horizon": 16, "samples": 128, "temperature": 0.02, "noise": 0.6})
+    planning = lw.Planning(
+        settings={"horizon": 16, "samples": 128, "temperature": 0.02, "noise": 0.6}, params={"drop": -400.0}
+    )
     training = lw.Training(
         algorithm="ppo",
-        iterations=300,
+        iterations=600,
         settings={"gamma": 0.97, "log_std": -0.7, "entropy_coef": 0.001},
     )
 
