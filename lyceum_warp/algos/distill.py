@@ -98,7 +98,8 @@ class Demonstrations(nn.Module):
 
     Args:
         episodes: The episodes, ``lw.Trajectory`` or other objects with the tensors ``obs``, (steps + 1, nobs), and
-            ``actions``, (steps, nact).
+            ``actions``, (steps, nact). For a student that sees cameras, ``pictures`` maps their groups to tensors,
+            (steps + 1, height, width, channels).
 
     Raises:
         ValueError: There is no episode.
@@ -110,22 +111,39 @@ class Demonstrations(nn.Module):
     """The actions, (steps, nact)."""
     step: torch.Tensor
     """Number of steps since the episode's start, (steps,)."""
+    shape: dict[str, Any]
 
     def __init__(self, episodes: Iterable[Any]) -> None:
         super().__init__()
+        episodes = list(episodes)
         parts = [(each.obs[: len(each.actions)], each.actions, torch.arange(len(each.actions))) for each in episodes]
         if not parts:
             raise ValueError("there is no episode to imitate: pass at least one")
         for name, rows in zip(("obs", "action", "step"), zip(*parts, strict=True), strict=True):
             self.register_buffer(name, torch.cat(rows).float())
         self.nobs, self.nact = self.obs.shape[1], self.action.shape[1]
-        self.shape = {"steps": len(self.obs), "nobs": self.nobs, "nact": self.nact}
+        kinds: dict[str, list[Any]] = {}
+        for number, (group, first) in enumerate(getattr(episodes[0], "pictures", {}).items()):
+            kinds[group] = [str(first.dtype).removeprefix("torch."), *first.shape[1:]]
+            seen = torch.cat([each.pictures[group][: len(each.actions)] for each in episodes])
+            self.register_buffer(f"pictures_{number}", seen)  # a group's name may be no name of an attribute
+        self.shape = {"steps": len(self.obs), "nobs": self.nobs, "nact": self.nact, "pictures": kinds}
+
+    @property
+    def obs_groups(self) -> dict[str, torch.Tensor]:
+        """``obs``, as the group "policy", and the pictures before all steps, (steps, height, width, channels)."""
+        pictures = {group: getattr(self, f"pictures_{number}") for number, group in enumerate(self.shape["pictures"])}
+        return {"policy": self.obs, **pictures}
 
     @staticmethod
-    def like(shape: Mapping[str, int]) -> "Demonstrations":
+    def like(shape: Mapping[str, Any]) -> "Demonstrations":
         """Make demonstrations with the given ``shape``, whose content is loaded later."""
         obs, actions = (torch.empty(shape["steps"], shape[size]) for size in ("nobs", "nact"))
-        return Demonstrations([SimpleNamespace(obs=obs, actions=actions)])
+        pictures = {
+            group: torch.empty(shape["steps"], *size, dtype=getattr(torch, dtype))
+            for group, (dtype, *size) in shape.get("pictures", {}).items()
+        }
+        return Demonstrations([SimpleNamespace(obs=obs, actions=actions, pictures=pictures)])
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,10 +223,13 @@ class Distill(SamplingLearner):
         )  # fmt: skip
         if policy is None:
             initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
-        if self._clones and self.policy.pictures:
-            raise ValueError(
-                "demonstrations hold no pictures: use policy_groups=('policy',), or a policy as the teacher"
-            )
+        demonstrated = teacher.obs_groups if isinstance(teacher, Demonstrations) else env.obs_groups
+        for group, size in self.policy.pictures.items():
+            if group not in demonstrated or demonstrated[group].shape[1:] != size:
+                raise ValueError(
+                    f"the demonstrations have no pictures {group!r} of the shape {tuple(size)}: save the episodes of "
+                    "an environment with this camera, or use policy_groups=('policy',)"
+                )
         self.config = config = dataclasses.replace(config, **policy_settings(self.policy))
         self.teacher = teacher
         self.policy.to(device)
@@ -301,8 +322,10 @@ class Distill(SamplingLearner):
         steps = torch.arange(rollout.steps, device=self._start.device)[:, None]
         index = (self._start + self.iteration * rollout.steps + steps) % len(given.obs)
         self._state.copy_(self._player.state)
-        rollout.obs.copy_(given.obs[index])
+        for group, rows in rollout.obs_groups.items():
+            rows.copy_(given.obs_groups[group][index])
         rollout.step.copy_(given.step[index])
+        self.policy.observe_pictures({group: rows[0] for group, rows in rollout.obs_groups.items()}, self.team)
         self.label.copy_(given.action[index])
 
     def update(self) -> None:

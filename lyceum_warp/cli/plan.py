@@ -121,7 +121,7 @@ class Plan:
     camera: CameraWords = ()
     planner: Placement = Placement()
     """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
-    engine."""
+    engine, and has the cameras."""
     mppi: Settings = Settings()
     planner_physics: Physics = Physics()
 
@@ -185,7 +185,7 @@ def _worlds(
     """
     planner_options = given(options.planner) | given(options.planner_physics)
     own: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
-    own |= {"objects": planner_options.get("objects")}
+    own |= {"objects": planner_options.get("objects"), "cameras": planner_options.pop("cameras", None)}
     plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **own), params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")

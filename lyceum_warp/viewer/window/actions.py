@@ -139,6 +139,9 @@ class Actions:
             toggles["ghosts"] = ghosts.worlds > 0, lambda: self.set_ghosts(worlds=0 if ghosts.worlds else most)
         if self.status.planner:
             toggles["plan"] = ghosts.plan, lambda: self.set_ghosts(plan=not ghosts.plan)
+        if self.scene.sees:
+            shown = self.status.pictures
+            toggles["pictures"] = shown, lambda: self.do(commands.set_pictures, not shown)
         return toggles
 
     def toggle_video(self) -> None:

@@ -13,6 +13,7 @@ from lyceum_warp.viewer.commands import (
     set_ghosts,
     set_mode,
     set_paused,
+    set_pictures,
     set_speed,
     set_video,
     set_watched,
@@ -76,6 +77,18 @@ def test_panel_draws_ghosts_and_traces(bench: Bench) -> None:
     state[1] += 1.0  # qpos[0]
     bench.draw(frame_of(bench.model, bench.data, ghosts=(Ghost(state, None),), traces=np.zeros((2, 5, 3))))
     assert len(bench.viewer.extra_geoms) == 9
+
+
+def test_button_asks_for_the_pictures_of_cameras_and_the_page_gets_them(bench: Bench) -> None:
+    bench.show(status_of())
+    assert "pictures" not in bench.panel.actions.toggles()
+    seeing = Bench(bench.model, scene_of(bench.model, sees=True))
+    seeing.show(status_of(pictures=False))
+    seeing.panel.actions.toggles()["pictures"][1]()
+    assert seeing.sent == [command(set_pictures, True)]
+    seeing.draw(frame_of(seeing.model, seeing.data, status_of(pictures=True), pictures=(("camera", "data:,1"),)))
+    seeing.draw(frame_of(seeing.model, seeing.data, status_of(pictures=True)))
+    assert seeing.told == ['pictures=[["camera", "data:,1"]]']
 
 
 # keys
