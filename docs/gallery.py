@@ -309,7 +309,7 @@ def page(results: dict[str, dict[str, str]]) -> str:
 
 def card(name: str, stem: str, result: dict[str, str]) -> list[str]:
     """Return a task's picture, its shortest command, and its result."""
-    command = f"lyceum-warp view {name} --pretrained" if name in pretrained_tasks() else f"lyceum-warp plan {name}"
+    command = shortest_command(name)
     link = f"]({address(name, stem)})"
     lines = ["<div>", "", f"[![{name}](images/gallery/{file_name(name)}.webp){link}", "", f"[{name}{link}", ""]
     lines += ["```", command, "```", ""]
@@ -321,6 +321,11 @@ def card(name: str, stem: str, result: dict[str, str]) -> list[str]:
     if name in pretrained_tasks():
         lines += [f"<!-- turnable: {name} -->", ""]
     return [*lines, "</div>", ""]
+
+
+def shortest_command(name: str) -> str:
+    """Return the shortest command that shows a task."""
+    return f"lyceum-warp view {name} --pretrained" if name in pretrained_tasks() else f"lyceum-warp plan {name}"
 
 
 def address(name: str, stem: str) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from gallery import turnable_tasks
+from gallery import shortest_command, turnable_tasks
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
@@ -169,6 +169,7 @@ def task_section(name: str) -> str:
     picture = f"images/gallery/{file_name(name)}.webp"
     if (DOCS / picture).exists():
         lines += [f"![{name}](../{picture})", ""]
+    lines += ["```", *commands(name, cls, shown=(DOCS / picture).exists()), "```", ""]
     lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         lines += observations(group, layout, OBSERVATIONS.get(name, {}).get(group, {}))
@@ -184,6 +185,15 @@ def task_section(name: str) -> str:
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
     return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def commands(name: str, cls: type[lw.Task], *, shown: bool) -> list[str]:
+    """Return the commands that show and train a task. ``shown`` tells whether the gallery shows the task."""
+    lines = [shortest_command(name)] if shown or cls.planning.settings else []
+    if ".balance." not in cls.__module__:  # those tasks are for planners
+        teacher = " --teacher RUN" if cls.training.algorithm == "distill" else ""
+        lines.append(f"lyceum-warp train {name}{teacher}")
+    return lines
 
 
 def observations(group: str, layout: dict[str, int], sources: dict[str, list[str]]) -> list[str]:
