@@ -116,9 +116,10 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Shorten a signature: omit a dataclass's fields, and shorten default objects."""
+    """Shorten a signature: omit a dataclass's fields and private arguments, and shorten default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
+    signature = signature and re.sub(r"(, \*)?(, _\w+=\w+)+(?=\))", "", signature)
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
 
 
@@ -340,6 +341,7 @@ def count(number: int, noun: str) -> str:
 
 def folded(title: str, lines: list[str]) -> list[str]:
     """Put lines into a collapsible block."""
+    title = re.sub(r"`(.+?)`", r"<code>\1</code>", title)
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
 
 
