@@ -87,7 +87,7 @@ def robot(name: str) -> str:
 
 PLACES = {
     "contents": contents, "names": reference.names, "modules": reference.modules, "tasks": reference.tasks,
-    "turnable": reference.turnable, "robot": robot,
+    "turnable": reference.turnable, "robot": robot, "keys": reference.keys,
 }  # fmt: skip
 
 

@@ -24,6 +24,7 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.core.spaces import action_space
 from lyceum_warp.core.task import Element, FromModel
 from lyceum_warp.support.docstrings import attribute_docs
+from lyceum_warp.viewer.window.actions import HELP
 
 DOCS = Path(__file__).parent
 
@@ -323,6 +324,11 @@ def spelled(default: Any, value: Any) -> str:
     if numbers.ndim == 0:
         return str(value) if numbers.dtype.kind == "b" else f"{value:.6g}"
     return ", ".join(f"{number:.6g}" for number in numbers.ravel().tolist())
+
+
+def keys(_: str) -> str:
+    """Return a table of what the mouse and the keys do in the viewer."""
+    return "\n".join(table(("mouse or key", ""), list(HELP)))
 
 
 # Markdown
