@@ -1,11 +1,15 @@
 """Measure frames per second of an environment with a camera, beside the bare renderer of MuJoCo Warp.
 
-    lyceum-warp bench pictures --device cuda
+    lyceum-warp bench pictures --parts speed --device cuda
+    MUJOCO_GL=egl lyceum-warp bench pictures --parts gap --runs runs/first runs/second
     lyceum-warp bench pictures --short
 
-A frame is one step of one world with its picture. The environment and the bare engine take turns of ten steps, from the
-same states (kept.py). The bare engine is one graph of ``mujoco_warp.step``, ``refit_bvh`` and ``render``. With final
-pictures, all worlds are rendered a second time in each step in which an episode ends.
+Part "speed": a frame is one step of one world with its picture. The environment and the bare engine take turns of ten
+steps, from the same states (kept.py). The bare engine is one graph of ``mujoco_warp.step``, ``refit_bvh`` and
+``render``. With final pictures, all worlds are rendered a second time in each step in which an episode ends.
+
+Part "gap": policies that see are judged with their own pictures and with those of MuJoCo's renderer (picture_gap.py).
+Without ``--runs``, a policy first learns to balance a pole, which takes minutes on a CPU core.
 """
 
 import dataclasses
@@ -19,6 +23,7 @@ import experiment
 import kept
 import mujoco_warp as mjw
 import numpy as np
+import picture_gap
 import warp as wp
 from experiment import Experiment, Row, Table, choose
 
@@ -26,6 +31,7 @@ import lyceum_warp as lw
 
 TASKS = ("cartpole", "half_cheetah", "go1_velocity", "aloha_lift")
 CONTESTANTS = ("pictures", "final pictures")
+PARTS = ("speed", "gap")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +42,12 @@ class Options(experiment.Options):
     """Numbers of worlds."""
     blocks: int = 10
     """Turns of ten steps."""
+    parts: tuple[str, ...] = ()
+    """speed and gap; by default both."""
+    runs: tuple[str, ...] = ("",)
+    """Folders of runs whose policies see cameras, for the gap."""
+    episodes: int = 32
+    """Episodes with each renderer, for the gap."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +60,32 @@ class Case:
     blocks: int
 
 
-def cases(options: Options) -> list[Case]:
+@dataclasses.dataclass(frozen=True)
+class GapCase:
+    run: str
+    renderer: str
+    seed: int
+    episodes: int
+    iterations: int
+    """Iterations of the learners if there is no run."""
+
+
+def cases(options: Options) -> list[Case | GapCase]:
+    parts = choose(options.parts, PARTS, what="part")
+    return [*(speed_cases(options) if "speed" in parts else []), *(gap_cases(options) if "gap" in parts else [])]
+
+
+def gap_cases(options: Options) -> list[GapCase]:
+    episodes, iterations = (2, 1) if options.short else (options.episodes, 60)
+    return [
+        GapCase(run, renderer, seed, episodes, iterations)
+        for run in options.runs
+        for seed in options.seeds or (1,)
+        for renderer in picture_gap.RENDERERS
+    ]
+
+
+def speed_cases(options: Options) -> list[Case]:
     tasks = choose(options.tasks, TASKS, TASKS[:1] if options.short else TASKS, what="task")
     worlds, blocks = ((4,), 1) if options.short else (options.worlds, options.blocks)
     return [
@@ -60,7 +97,9 @@ def cases(options: Options) -> list[Case]:
     ]
 
 
-def estimate(case: Case) -> float:
+def estimate(case: Case | GapCase) -> float:
+    if isinstance(case, GapCase):
+        return 5.0 + 3.0 * case.episodes + case.iterations
     return 20.0 + case.blocks
 
 
@@ -86,7 +125,11 @@ class BareWithPictures(kept.BareWarp):
         self.graph, self._context = capture.graph, context
 
 
-def measure(case: Case, options: Options) -> dict[str, Any]:
+def measure(case: Case | GapCase, options: Options) -> dict[str, Any]:
+    return picture_gap.gap(**vars(case)) if isinstance(case, GapCase) else speed(case)
+
+
+def speed(case: Case) -> dict[str, Any]:
     statistic = lw.make(case.task).model.stat
     look = statistic.center
     place = look + statistic.extent * np.array([0.6, -1.2, 0.5])
@@ -128,6 +171,26 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
+    gaps = [row for row in rows if "renderer" in row.case]
+    return [*speed_tables([row for row in rows if row not in gaps]), *gap_tables(gaps)]
+
+
+def gap_tables(rows: Sequence[Row]) -> list[Table]:
+    header = ["policy", "pictures", "return", "lowest", "episodes", "pixels that differ visibly"]
+    lines = [
+        [row.case["run"] or "cartpole, 32 x 32 pixels, from a teacher", row.case["renderer"],
+         f"{statistics.mean(row.result['returns']):.1f} ± {statistics.pstdev(row.result['returns']):.1f}",
+         f"{min(row.result['returns']):.1f}", str(len(row.result["returns"])), f"{row.result['differing']:.2%}"]
+        for row in rows
+    ]  # fmt: skip
+    title = (
+        "The picture gap: returns of the same episodes on the C engine, with pictures of this package and of "
+        "mujoco.Renderer; plain: without shadows, reflections and antialiasing."
+    )
+    return [Table(title, header, lines)] if lines else []
+
+
+def speed_tables(rows: Sequence[Row]) -> list[Table]:
     header = ["task", "worlds", "size", "", "frames/s", "of the bare engine's", "kB a world"]
     lines = [
         [row.case["task"], f"{row.case['worlds']:,}", str(row.case["size"]), row.case["contestant"],
@@ -141,8 +204,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = Experiment(
     name="pictures",
-    conditions="The Warp engine steps tasks with their own (exact) physics, and renders one camera.",
-    summary="Frames per second of environments with a camera, beside MuJoCo Warp's bare renderer.",
+    conditions="Frames: the Warp engine steps tasks with their own (exact) physics. Gap: the C engine, exact physics.",
+    summary="Frames per second of environments with a camera, and policies under MuJoCo's own renderer.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
 

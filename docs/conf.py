@@ -28,6 +28,7 @@ for each in ("lyceum_warp", "traitlets"):
 sys.modules["lw"] = lw  # the reference shows names as users write them: lw.make
 
 project, version, author = "lyceum_warp", lw.__version__, "The lyceum_warp authors"
+copyright = f"{author}, MIT licence"
 extensions = ["myst_nb", "sphinx.ext.autodoc"]
 root_doc = "docs/index"
 include_patterns = ["docs/**", "CONTRIBUTING.md", "CHANGELOG.md", "bench/README.md", "bench/results/*.md"]
@@ -40,7 +41,7 @@ html_css_files, html_js_files = ["site.css"], [("site.js", {"defer": "defer"})]
 templates_path, html_additional_pages = ["templates"], {"404": "404.html"}
 html_context = {"site_root": html_baseurl.rstrip("/") + "/"}
 html_theme_options = {"sidebar_hide_name": False, "navigation_with_keys": True}
-html_show_copyright = html_show_sourcelink = False
+html_show_sourcelink = False
 
 highlight_language = "none"  # blocks without a language are output and formulas
 myst_enable_extensions = ["dollarmath"]
@@ -87,7 +88,7 @@ def robot(name: str) -> str:
 
 PLACES = {
     "contents": contents, "names": reference.names, "modules": reference.modules, "tasks": reference.tasks,
-    "turnable": reference.turnable, "robot": robot,
+    "turnable": reference.turnable, "robot": robot, "keys": reference.keys,
 }  # fmt: skip
 
 

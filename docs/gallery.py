@@ -290,7 +290,7 @@ def page(results: dict[str, dict[str, str]]) -> str:
     """Return the gallery's page."""
     introduction = (
         "Each picture links to its task, and each command shows the task. Where the animation has a command of its "
-        "own, the result unfolds it. A policy's return is the mean over whole episodes. A planner's return is the sum "
+        "own, a fold contains it. A policy's return is the mean over whole episodes. A planner's return is the sum "
         "of the rewards from the start of the episode to the last frame of the animation."
     )
     lines = ["# Gallery", "", *textwrap.wrap(introduction, 120), ""]
@@ -309,18 +309,21 @@ def page(results: dict[str, dict[str, str]]) -> str:
 
 def card(name: str, stem: str, result: dict[str, str]) -> list[str]:
     """Return a task's picture, its shortest command, and its result."""
-    command = f"lyceum-warp view {name} --pretrained" if name in pretrained_tasks() else f"lyceum-warp plan {name}"
+    command = shortest_command(name)
     link = f"]({address(name, stem)})"
     lines = ["<div>", "", f"[![{name}](images/gallery/{file_name(name)}.webp){link}", "", f"[{name}{link}", ""]
-    lines += ["```", command, "```", ""]
-    if result["command"] == command:
-        lines += [result["result"], ""]
-    else:
-        head = f"<details><summary>{result['result']}</summary>"
+    lines += ["```", command, "```", "", result["result"], ""]
+    if result["command"] != command:
+        head = "<details><summary>How this was made</summary>"
         lines += [head, "", "```", result["command"], "```", "", "</details>", ""]
     if name in pretrained_tasks():
         lines += [f"<!-- turnable: {name} -->", ""]
     return [*lines, "</div>", ""]
+
+
+def shortest_command(name: str) -> str:
+    """Return the shortest command that shows a task."""
+    return f"lyceum-warp view {name} --pretrained" if name in pretrained_tasks() else f"lyceum-warp plan {name}"
 
 
 def address(name: str, stem: str) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import warp as wp
-from gallery import turnable_tasks
+from gallery import shortest_command, turnable_tasks
 from sphinx.ext.napoleon import Config, GoogleDocstring
 
 import lyceum_warp as lw
@@ -24,6 +24,7 @@ from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.core.spaces import action_space
 from lyceum_warp.core.task import Element, FromModel
 from lyceum_warp.support.docstrings import attribute_docs
+from lyceum_warp.viewer.window.actions import HELP
 
 DOCS = Path(__file__).parent
 
@@ -116,9 +117,10 @@ def converted(text: str) -> list[str]:
 
 
 def short_signature(app: Any, what: str, name: str, obj: Any, options: Any, signature: str, result: str) -> Any:
-    """Shorten a signature: omit a dataclass's fields, and shorten default objects."""
+    """Shorten a signature: omit a dataclass's fields and private arguments, and shorten default objects."""
     if what == "class" and dataclasses.is_dataclass(obj):
         return "", result
+    signature = signature and re.sub(r"(, \*)?(, _\w+=\w+)+(?=\))", "", signature)
     return signature and re.sub(r"(PhysicsOptions)\(.*?\)", r"\1()", signature), result
 
 
@@ -169,6 +171,7 @@ def task_section(name: str) -> str:
     picture = f"images/gallery/{file_name(name)}.webp"
     if (DOCS / picture).exists():
         lines += [f"![{name}](../{picture})", ""]
+    lines += ["```", *commands(name, cls, shown=(DOCS / picture).exists()), "```", ""]
     lines += [turnable(name, "../"), "", about, "", markdown(body), "", *facts(task), ""]
     for group, layout in task.layouts.obs.items():
         lines += observations(group, layout, OBSERVATIONS.get(name, {}).get(group, {}))
@@ -184,6 +187,15 @@ def task_section(name: str) -> str:
     place = source.relative_to(DOCS.parent).as_posix()
     code = [f"```{{literalinclude}} /{place}", ":language: python", "```", ""]
     return "\n".join([*lines, *folded(f"The file <code>{place}</code>", code)])
+
+
+def commands(name: str, cls: type[lw.Task], *, shown: bool) -> list[str]:
+    """Return the commands that show and train a task. ``shown`` tells whether the gallery shows the task."""
+    lines = [shortest_command(name)] if shown or cls.planning.settings else []
+    if ".balance." not in cls.__module__:  # those tasks are for planners
+        teacher = " --teacher RUN" if cls.training.algorithm == "distill" else ""
+        lines.append(f"lyceum-warp train {name}{teacher}")
+    return lines
 
 
 def observations(group: str, layout: dict[str, int], sources: dict[str, list[str]]) -> list[str]:
@@ -314,6 +326,11 @@ def spelled(default: Any, value: Any) -> str:
     return ", ".join(f"{number:.6g}" for number in numbers.ravel().tolist())
 
 
+def keys(_: str) -> str:
+    """Return a table of what the mouse and the keys do in the viewer."""
+    return "\n".join(table(("mouse or key", ""), list(HELP)))
+
+
 # Markdown
 
 
@@ -330,6 +347,7 @@ def count(number: int, noun: str) -> str:
 
 def folded(title: str, lines: list[str]) -> list[str]:
     """Put lines into a collapsible block."""
+    title = re.sub(r"`(.+?)`", r"<code>\1</code>", title)
     return [f"<details><summary>{title}</summary>", "", *lines, "", "</details>", ""]
 
 

@@ -140,10 +140,10 @@ def test_viewer_window_does_not_import_torch_warp_or_other_subpackages() -> None
     loaded = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout.split()
     assert not {"torch", "warp"} & set(loaded)
     own = {name for name in loaded if name.partition(".")[0] == "lyceum_warp"}
-    faces = {"lyceum_warp.support", "lyceum_warp.support.collection", "lyceum_warp.support.faces"}
+    support = {f"lyceum_warp.support{module}" for module in ("", ".collection", ".docstrings", ".faces")}
     rendering = {"lyceum_warp.viz", "lyceum_warp.viz.render"}
     messages = {"lyceum_warp.viewer.commands", "lyceum_warp.viewer.protocol"}
-    assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *rendering, *faces, *window}
+    assert own == {"lyceum_warp", "lyceum_warp.viewer", *messages, *rendering, *support, *window}
 
 
 def test_viewer_session_imports_nothing_from_the_window() -> None:

@@ -34,6 +34,11 @@ for (const frame of document.querySelectorAll("iframe")) {
   if (frame.contentDocument?.readyState === "complete") prepare(frame);
 }
 
+// A robot that is unfolded scrolls into view.
+for (const fold of document.querySelectorAll("details.turnable")) {
+  fold.addEventListener("toggle", () => fold.open && fold.scrollIntoView({ block: "nearest" }));
+}
+
 // Folds around a link's target open.
 const unfold = () => {
   const target = document.getElementById(decodeURIComponent(location.hash.slice(1)));

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from lyceum_warp.controllers import Trajectory
 from lyceum_warp.core import Done
 from lyceum_warp.support.extras import check_extra
+from lyceum_warp.support.images import png
 
 _DATA, _EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 
@@ -17,7 +19,8 @@ _DATA, _EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/f
 def write_minari(episodes: Sequence[Trajectory], dataset_id: str, **options: Any) -> Any:
     """Write episodes as a Minari dataset, with the extra ``minari``.
 
-    ``minari.load_dataset(dataset_id)`` loads it. An episode that a limit or a fault has ended is truncated.
+    ``minari.load_dataset(dataset_id)`` loads it. An episode that a limit or a fault has ended is truncated. With
+    pictures, observations are dicts of ``policy`` and the cameras' groups.
 
     Args:
         episodes: Episodes of one task, such as ``list(load_episodes(folder).values())``.
@@ -33,17 +36,26 @@ def write_minari(episodes: Sequence[Trajectory], dataset_id: str, **options: Any
     """
     check_extra("writing a Minari dataset", "minari")
     import minari
-    from gymnasium.spaces import Box
+    from gymnasium.spaces import Box, Dict
     from minari.data_collector import EpisodeBuffer
 
-    spaces = [Box(-np.inf, np.inf, (rows.shape[1],)) for rows in (_first(episodes).obs, _first(episodes).actions)]
+    first = _first(episodes)
+    spaces: list[Any] = [Box(-np.inf, np.inf, (rows.shape[1],)) for rows in (first.obs, first.actions)]
+    if first.pictures:
+        limits = {np.dtype("uint8"): (0, 255), np.dtype("float32"): (0, np.inf), np.dtype("int32"): (-1, 2**31 - 1)}
+        types = {group: rows.numpy().dtype for group, rows in first.pictures.items()}
+        seen = {g: Box(*limits[kind], first.pictures[g].shape[1:], kind.type) for g, kind in types.items()}
+        spaces[0] = Dict({"policy": spaces[0], **seen})
     buffers = []
     for number, episode in enumerate(episodes):
+        observations: Any = episode.obs.numpy()
+        if first.pictures:
+            observations = {"policy": observations, **{g: rows.numpy() for g, rows in episode.pictures.items()}}
         last = np.arange(episode.steps) == episode.steps - 1
         terminated = bool(episode.done_reason & Done.TERMINATED)
         buffers.append(
             EpisodeBuffer(
-                id=number, seed=episode.seed, observations=episode.obs.numpy(), actions=episode.actions.numpy(),
+                id=number, seed=episode.seed, observations=observations, actions=episode.actions.numpy(),
                 rewards=episode.rewards.tolist(), terminations=(last & terminated).tolist(),
                 truncations=(last & (not terminated)).tolist(),
             )
@@ -57,7 +69,7 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     """Write episodes as a dataset of LeRobot, format v3.0, without videos, with the extra ``lerobot``.
 
     ``LeRobotDataset(repo_id, root=folder)`` loads it. A frame has the observation before a step, the action, and the
-    reward, the end and the success after it.
+    reward, the end and the success after it. Colours are images, ``observation.images.GROUP``.
 
     Args:
         episodes: Episodes of one task, such as ``list(load_episodes(folder).values())``.
@@ -65,14 +77,20 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         instruction: The task in words; by default the task's name.
 
     Raises:
-        ValueError: There is no episode.
+        ValueError: There is no episode, or the format cannot hold its pictures.
         FileExistsError: The folder exists.
         ImportError: pandas or pyarrow is not installed.
     """
+    first, folder = _first(episodes), Path(folder)
+    for group, rows in first.pictures.items():
+        if rows.dtype != torch.uint8:
+            raise ValueError(
+                f"LeRobot's images are colours, unlike the pictures {group!r}: omit them, as in "
+                "[dataclasses.replace(episode, pictures={}) for episode in episodes]"
+            )
     check_extra("writing a LeRobot dataset", "lerobot", "pandas", "pyarrow")
     import pandas
 
-    first, folder = _first(episodes), Path(folder)
     lengths = np.array([episode.steps for episode in episodes])
     ends, number = np.cumsum(lengths), np.repeat(np.arange(len(episodes)), lengths)
     frame = np.concatenate([np.arange(length) for length in lengths])
@@ -88,7 +106,7 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     }  # fmt: skip
     observed = [f"{part}_{k}" for part, (start, stop) in first.obs_parts.items() for k in range(stop - start)]
     names = {"observation.state": observed, "action": list(first.action_names)}
-    info = {
+    info: dict[str, Any] = {
         "codebase_version": "v3.0", "robot_type": first.task, "total_episodes": len(episodes),
         "total_frames": len(frame), "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200, "fps": round(rate) if abs(rate - round(rate)) < 1e-6 else rate,
@@ -104,6 +122,17 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         | {"count": [len(rows)]}
         for name, rows in columns.items()
     }
+    images: dict[str, list[Any]] = {}
+    for group, rows in first.pictures.items():
+        pictures = np.concatenate([episode.pictures[group][:-1].numpy() for episode in episodes])
+        images[name := f"observation.images.{group}"] = [{"bytes": png(each), "path": None} for each in pictures]
+        info["features"][name] = {
+            "dtype": "image", "shape": [*rows.shape[1:]], "names": ["height", "width", "channels"],
+        }  # fmt: skip
+        stats[name] = {"count": [len(pictures)]} | {
+            key: (getattr(pictures, key)(axis=(0, 1, 2)) / 255).reshape(3, 1, 1).tolist()
+            for key in ("min", "max", "mean", "std")
+        }
     words = instruction or first.task
     table = pandas.DataFrame({
         "episode_index": range(len(episodes)), "tasks": [[words]] * len(episodes), "length": lengths,
@@ -113,7 +142,9 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     folder.mkdir(parents=True)
     for file in (_DATA, _EPISODES):
         (folder / file).parent.mkdir(parents=True)
-    pandas.DataFrame({name: list(rows) for name, rows in columns.items()}).to_parquet(folder / _DATA)
+    # LeRobot reads columns of the shape [1] as numbers
+    frames = {name: list(rows[:, 0] if rows.shape[1:] == (1,) else rows) for name, rows in columns.items()}
+    pandas.DataFrame(frames | images).to_parquet(folder / _DATA)
     table.to_parquet(folder / _EPISODES)
     pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")
     for file, content in (("info.json", info), ("stats.json", stats)):

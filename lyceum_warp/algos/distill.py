@@ -17,37 +17,31 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
-from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
-from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.common.hyperparameters import GROUP, PICTURE_RULES, Activation, PictureConfig
 from lyceum_warp.algos.common.minibatches import precision
 from lyceum_warp.algos.common.networks import initialize_as_torch, trainable
-from lyceum_warp.algos.common.pictures import (
-    picture_settings,
-    policy_inputs,
-    shift_pictures,
-)
+from lyceum_warp.algos.common.pictures import policy_inputs, policy_settings, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_sizes
 from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
+from lyceum_warp.algos.common.sampling import SamplingLearner
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.env import Env, Player
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_group, check_kind
+from lyceum_warp.support.validate import Rule, check_fields, check_group
 
 _EPS = 1e-2
 """Constant that is added to the normaliser's standard deviations, as in PPO."""
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "epochs": 1, "gradient_length": 1, "learning_rate": 0.0, "max_grad_norm": 0.0,
-    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1, **PICTURE_BOUNDS,
+    "log_std": (-13.8, 13.8), "recurrent": 0, "mean_every": 0, "mean_episodes": 1, "teacher_group": GROUP,
+    **PICTURE_RULES,
 }  # fmt: skip
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DistillConfig(PictureConfig):
     """Hyperparameters of ``Distill``.
@@ -90,12 +84,11 @@ class DistillConfig(PictureConfig):
     """Number of episodes in an evaluation of the student."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.num_steps % self.gradient_length:
             raise ValueError(f"gradient_length={self.gradient_length} must divide num_steps, which is {self.num_steps}")
 
 
-@document_attributes
 class Demonstrations(nn.Module):
     """Saved episodes of a policy or a planner as a teacher.
 
@@ -105,7 +98,8 @@ class Demonstrations(nn.Module):
 
     Args:
         episodes: The episodes, ``lw.Trajectory`` or other objects with the tensors ``obs``, (steps + 1, nobs), and
-            ``actions``, (steps, nact).
+            ``actions``, (steps, nact). For a student that sees cameras, ``pictures`` maps their groups to tensors,
+            (steps + 1, height, width, channels).
 
     Raises:
         ValueError: There is no episode.
@@ -117,25 +111,41 @@ class Demonstrations(nn.Module):
     """The actions, (steps, nact)."""
     step: torch.Tensor
     """Number of steps since the episode's start, (steps,)."""
+    shape: dict[str, Any]
 
     def __init__(self, episodes: Iterable[Any]) -> None:
         super().__init__()
+        episodes = list(episodes)
         parts = [(each.obs[: len(each.actions)], each.actions, torch.arange(len(each.actions))) for each in episodes]
         if not parts:
             raise ValueError("there is no episode to imitate: pass at least one")
         for name, rows in zip(("obs", "action", "step"), zip(*parts, strict=True), strict=True):
             self.register_buffer(name, torch.cat(rows).float())
         self.nobs, self.nact = self.obs.shape[1], self.action.shape[1]
-        self.shape = {"steps": len(self.obs), "nobs": self.nobs, "nact": self.nact}
+        kinds: dict[str, list[Any]] = {}
+        for number, (group, first) in enumerate(getattr(episodes[0], "pictures", {}).items()):
+            kinds[group] = [str(first.dtype).removeprefix("torch."), *first.shape[1:]]
+            seen = torch.cat([each.pictures[group][: len(each.actions)] for each in episodes])
+            self.register_buffer(f"pictures_{number}", seen)  # a group's name may be no name of an attribute
+        self.shape = {"steps": len(self.obs), "nobs": self.nobs, "nact": self.nact, "pictures": kinds}
+
+    @property
+    def obs_groups(self) -> dict[str, torch.Tensor]:
+        """``obs``, as the group "policy", and the pictures before all steps, (steps, height, width, channels)."""
+        pictures = {group: getattr(self, f"pictures_{number}") for number, group in enumerate(self.shape["pictures"])}
+        return {"policy": self.obs, **pictures}
 
     @staticmethod
-    def like(shape: Mapping[str, int]) -> "Demonstrations":
+    def like(shape: Mapping[str, Any]) -> "Demonstrations":
         """Make demonstrations with the given ``shape``, whose content is loaded later."""
         obs, actions = (torch.empty(shape["steps"], shape[size]) for size in ("nobs", "nact"))
-        return Demonstrations([SimpleNamespace(obs=obs, actions=actions)])
+        pictures = {
+            group: torch.empty(shape["steps"], *size, dtype=getattr(torch, dtype))
+            for group, (dtype, *size) in shape.get("pictures", {}).items()
+        }
+        return Demonstrations([SimpleNamespace(obs=obs, actions=actions, pictures=pictures)])
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DistillIteration(SampledIteration):
     """Statistics of one iteration of ``Distill``.
@@ -149,8 +159,7 @@ class DistillIteration(SampledIteration):
     """Seconds for the update."""
 
 
-@document_attributes
-class Distill(Learner):
+class Distill(SamplingLearner):
     """Infinite iterator of ``DistillIteration`` that learns a student policy from a teacher.
 
     Example:
@@ -174,7 +183,7 @@ class Distill(Learner):
         FloatingPointError: The loss, or a parameter, is not finite after an iteration.
     """
 
-    sees = True
+    config_type, sees = DistillConfig, True
     algorithm = "distill"
     """The name of the algorithm in a run's config.json."""
     config: DistillConfig
@@ -182,9 +191,6 @@ class Distill(Learner):
     policy: GaussianPolicy
     """The student."""
     teacher: nn.Module
-    generator: torch.Generator
-    rollout: Rollout
-    """The samples of the last iteration."""
     group: str
     """Group of the teacher's observations."""
 
@@ -198,9 +204,8 @@ class Distill(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("config of Distill", config, DistillConfig | None, "as lw.DistillConfig(recurrent=64)")
-        super().__init__(env, seed=seed, team=team)
-        config, team, device = config or DistillConfig(), self.team, env.obs.device
+        super().__init__(env, config, seed=seed, team=team)
+        config, team, device = self.config, self.team, env.obs.device
         self._clones = isinstance(teacher, Demonstrations)
         if not (self._clones or all(hasattr(teacher, name) for name in ("act", "nobs", "nact"))):
             raise ValueError(f"teacher must be a policy with act, nobs and nact, or lw.Demonstrations, not {teacher!r}")
@@ -218,15 +223,14 @@ class Distill(Learner):
         )  # fmt: skip
         if policy is None:
             initialize_as_torch(getattr(self.policy.network, "network", self.policy), init)  # not the encoders
-        shape = self.policy.shape
-        fitted: dict[str, Any] = {name: shape[name] for name in ("hidden", "activation", "normalize") if name in shape}
-        seen = {name: value for name, value in picture_settings(self.policy).items() if value is not None}
-        fitted |= seen | ({} if "own" in shape else {"recurrent": shape.get("recurrent", 0)})
-        if self._clones and self.policy.pictures:
-            raise ValueError(
-                "demonstrations hold no pictures: use policy_groups=('policy',), or a policy as the teacher"
-            )
-        self.config = config = dataclasses.replace(config, **fitted)
+        demonstrated = teacher.obs_groups if isinstance(teacher, Demonstrations) else env.obs_groups
+        for group, size in self.policy.pictures.items():
+            if group not in demonstrated or demonstrated[group].shape[1:] != size:
+                raise ValueError(
+                    f"the demonstrations have no pictures {group!r} of the shape {tuple(size)}: save the episodes of "
+                    "an environment with this camera, or use policy_groups=('policy',)"
+                )
+        self.config = config = dataclasses.replace(config, **policy_settings(self.policy))
         self.teacher = teacher
         self.policy.to(device)
         self.generator = torch.Generator(device).manual_seed(int(torch.randint(2**62, (), generator=init)))
@@ -250,7 +254,6 @@ class Distill(Learner):
         self._epoch = Captured(self.learn, team, device)
         self._act = Captured(self._choose, team, device)
         self._observe = Captured(lambda: self.policy.observe(env.obs, team, eps=_EPS), team, device)
-        self._evaluate_mean = MeanPolicyEvaluation(env, config, team)
         self.rollout.restart()
         players = [self._player]
         if isinstance(teacher, Demonstrations):
@@ -277,7 +280,7 @@ class Distill(Learner):
             else:
                 self.sample()
                 self.env.update_shared(team.sum)
-            timer.mark()
+            timer.mark("sample")
 
             # 2. Run the epochs.
             self.update()
@@ -286,26 +289,13 @@ class Distill(Learner):
         finite = torch.stack([x.isfinite().all() for x in (self._loss, *self.policy.parameters())]).all()
         loss = self._loss[0] * config.gradient_length / (config.epochs * config.num_steps)
         statistics, (update, *_) = gathered(rollout, team, {"finite": finite, "loss": loss})
-        timer.mark()
-        if not update.pop("finite"):
-            raise FloatingPointError(
-                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the observations, "
-                f"smaller ({rollout.extremes()})"
-            )
+        timer.mark("update")
+        self._check_finite(update, "observations")
         if self._clones:
             statistics = {"faults": 0}
 
         # 3. Evaluate the student without noise.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_update, time_mean = timer.seconds()
-        return DistillIteration(
-            iteration=self.iteration, samples=self.samples, **statistics, **update, time_sample=time_sample,
-            time_update=time_update, time_mean=time_mean, samples_per_second=self.count / (time_sample + time_update),
-        )  # fmt: skip
+        return self._finished(DistillIteration, timer, statistics | update, rate_of=("sample", "update"))
 
     @torch.no_grad()
     def sample(self) -> None:
@@ -313,18 +303,11 @@ class Distill(Learner):
 
         After each step, the normaliser is updated with the step's observations.
         """
-        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.policy.observe_pictures(self.env.obs_groups, team)
+            self.policy.observe_pictures(self.env.obs_groups, self.team)
             self._state.copy_(self._player.state)
-            rollout.begin()
-            for _ in range(rollout.steps):
-                self._act()
-                rollout.store_inputs()
-                self.env.step()
-                rollout.store_outputs()
-                self._observe()
+            self.rollout.fill(self._act, self._observe)
 
     @torch.no_grad()
     def _choose(self) -> None:
@@ -339,8 +322,10 @@ class Distill(Learner):
         steps = torch.arange(rollout.steps, device=self._start.device)[:, None]
         index = (self._start + self.iteration * rollout.steps + steps) % len(given.obs)
         self._state.copy_(self._player.state)
-        rollout.obs.copy_(given.obs[index])
+        for group, rows in rollout.obs_groups.items():
+            rows.copy_(given.obs_groups[group][index])
         rollout.step.copy_(given.step[index])
+        self.policy.observe_pictures({group: rows[0] for group, rows in rollout.obs_groups.items()}, self.team)
         self.label.copy_(given.action[index])
 
     def update(self) -> None:
@@ -379,7 +364,6 @@ class Distill(Learner):
         """Copy the complete state; see ``Learner``."""
         state = {
             "optimizer": self._step.optimizer.state_dict(),
-            "returns": self.team.gather(self.rollout.running_return),
             "memory": [self.team.gather(player.state) for player in self._remembering],
         }
         return super().state_dict() | copy.deepcopy(state)
@@ -389,6 +373,5 @@ class Distill(Learner):
         super().load_state_dict(state)
         self._step.optimizer.load_state_dict(state["optimizer"])
         self._epoch.forget()  # the graph contains the learning rate
-        self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for player, memory in zip(self._remembering, state["memory"], strict=True):
             player.state.copy_(memory[self.own_worlds])

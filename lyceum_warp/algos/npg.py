@@ -16,7 +16,7 @@ import torch
 
 from lyceum_warp.algos.common.dense import dense_policy, predict
 from lyceum_warp.algos.common.distributed import Team, unflatten
-from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, LEAST, Activation
 from lyceum_warp.algos.common.networks import Normalizer
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence
@@ -26,8 +26,8 @@ from lyceum_warp.algos.common.value import BOUND, ValueFunction
 from lyceum_warp.algos.common.value_fit import ValueFit
 from lyceum_warp.algos.natural_gradient import FisherProduct, conjugate_gradient, score_gradient
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
+from lyceum_warp.support.validate import Rule, check_fields
 
 log = logging.getLogger(__name__)
 
@@ -41,11 +41,11 @@ _DRIFT = 0.2
 """Maximum KL divergence that an update of the normaliser may cause, as a fraction of the desired KL divergence."""
 
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "samples": 1, "cg_iterations": 1, "value_epochs": 0, "value_batch": 1, "time_orders": 0, "mean_every": 0,
     "mean_episodes": 1, "gamma": (0.0, 1.0), "lam": (0.0, 1.0), "delta": 0.0, "damping": 0.0,
     "fisher_fraction": (0.0, 1.0), "kl_limit": 1.0, "log_std": LEAST, "min_log_std": LEAST, "value_rate": 0.0,
-    "min_restarts": 0.0,
+    "min_restarts": 0.0, "value_group": GROUP,
 }  # fmt: skip
 
 _LONG_EPISODE = 20
@@ -55,7 +55,6 @@ when an episode took 16 iterations (bench/README.md, "NPG's learning curves").""
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGConfig:
     """Hyperparameters of NPG. The defaults follow Rajeswaran et al., 2017, except as noted.
@@ -126,7 +125,7 @@ class NPGConfig:
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.fisher_fraction == 0.0:
             raise ValueError("fisher_fraction must be greater than 0, such as 0.1 for every tenth sample")
         if self.log_std < self.min_log_std:
@@ -148,7 +147,6 @@ def least_restarts(config: NPGConfig, nworld: int, steps: int, horizon: int) -> 
     return round(min(nworld, share * nworld * steps / horizon))
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class NPGIteration(OnPolicyIteration):
     """Statistics of one iteration of NPG.
@@ -181,7 +179,6 @@ class NPGIteration(OnPolicyIteration):
     includes the overlapping time."""
 
 
-@document_attributes
 class NPG(OnPolicyLearner):
     """Infinite iterator of ``NPGIteration`` that learns a policy by NPG.
 
@@ -269,7 +266,7 @@ class NPG(OnPolicyLearner):
         elif self._least_restarts:
             rollout.restart_some(self._least_restarts, self.generator, team)
         self.sample()
-        timer.mark()
+        timer.mark("sample")
 
         # 2. Update the policy's normaliser.
         obs, value_obs = rollout.obs.flatten(0, 1), rollout.obs_groups[self.value.group].flatten(0, 1)
@@ -282,7 +279,7 @@ class NPG(OnPolicyLearner):
         action = rollout.action.flatten(0, 1)
         weight = advantage.flatten() / self.count
         gradient = team.sum(score_gradient(self._dense, obs, action, weight))
-        timer.mark()
+        timer.mark("gradient")
 
         # 5. Compute the natural gradient x = F^-1 g, and the step x sqrt(delta / (g.x)), so that step.F.step = delta.
         fisher = self.fisher(obs)
@@ -295,7 +292,7 @@ class NPG(OnPolicyLearner):
             direction = conjugate_gradient(fisher, gradient, config.cg_iterations)
             step = direction * torch.sqrt(config.delta / (gradient @ direction + 1e-20))
             finite, fraction, kl = self.move(step, obs, old_mean)
-            timer.mark()
+            timer.mark("solve")
             fitted = fit_result()
 
         # copy all numbers to the host at once
@@ -308,26 +305,10 @@ class NPG(OnPolicyLearner):
         statistics |= {name: processes[0][name] for name in update} | value_statistics(processes, len(obs))
         statistics["outliers"] = round(sum(process["outliers"] for process in processes))
         statistics["skipped_updates"] = self._check_updates(processes[0])
-        timer.mark()
+        timer.mark("value")
 
         # 7. Evaluate the mean policy.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_gradient, time_solve, time_value, time_mean = timer.seconds()
-        return NPGIteration(
-            iteration=self.iteration,
-            samples=self.samples,
-            **statistics,
-            time_sample=time_sample,
-            time_gradient=time_gradient,
-            time_solve=time_solve,
-            time_value=time_value,
-            time_mean=time_mean,
-            samples_per_second=self.count / time_sample,
-        )
+        return self._finished(NPGIteration, timer, statistics, rate_of=("sample",))
 
     def _check_updates(self, update: Mapping[str, float]) -> int:
         parts = {"the step of the policy": update["finite"], "the fit of the value function": update["fitted"]}

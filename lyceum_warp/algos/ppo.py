@@ -17,7 +17,7 @@ from torch import nn
 
 from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
-from lyceum_warp.algos.common.hyperparameters import PICTURE_BOUNDS, Activation, Bound, PictureConfig, check_fields
+from lyceum_warp.algos.common.hyperparameters import GROUP, PICTURE_RULES, Activation, PictureConfig
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
 from lyceum_warp.algos.common.networks import LIMIT, MLP
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
@@ -28,9 +28,8 @@ from lyceum_warp.algos.common.symmetry import apply_symmetry
 from lyceum_warp.algos.common.timing import PhaseTimer, one_thread
 from lyceum_warp.algos.common.value import ValueFunction
 from lyceum_warp.env import Env, Player
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import whole_number
+from lyceum_warp.support.validate import Rule, check_fields, whole_number
 
 log = logging.getLogger(__name__)
 
@@ -44,16 +43,15 @@ _SMALLEST_STD = 1e-6
 _SLOWEST, _FASTEST, _FACTOR = 1e-5, 1e-2, 1.5
 """Limits of the adaptive learning rate, and the factor by which the rate changes."""
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0, "state_coef": 0.0, **PICTURE_BOUNDS,
+    "recurrent": 0, "state_coef": 0.0, "value_group": GROUP, **PICTURE_RULES,
 }  # fmt: skip
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOConfig(PictureConfig):
     """Hyperparameters of PPO. Except for ``desired_kl``, the defaults are mjlab's settings for legged robots.
@@ -143,7 +141,7 @@ class PPOConfig(PictureConfig):
     """Number of episodes in an evaluation of the mean policy."""
 
     def __post_init__(self) -> None:
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         object.__setattr__(self, "entropy_decay", _iterations("entropy_decay", self.entropy_decay))
 
     def entropy_weight(self, iteration: int) -> float:
@@ -166,7 +164,6 @@ def _iterations(name: str, value: Any) -> tuple[int, int]:
     return pair
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PPOIteration(OnPolicyIteration):
     """Statistics of one iteration of PPO.
@@ -189,7 +186,6 @@ class PPOIteration(OnPolicyIteration):
     """Seconds for the update."""
 
 
-@document_attributes
 class PPO(OnPolicyLearner):
     """Infinite iterator of ``PPOIteration`` that learns a policy by PPO.
 
@@ -312,7 +308,7 @@ class PPO(OnPolicyLearner):
 
             # 2. Compute values and advantages.
             samples = self.evaluated_samples()
-            timer.mark()
+            timer.mark("sample")
 
             # 3. Run the epochs.
             self.update(samples)
@@ -326,31 +322,12 @@ class PPO(OnPolicyLearner):
             "learning_rate": self.rate, "value_loss": losses[0], "surrogate_loss": losses[1], "entropy": losses[2],
         })  # fmt: skip
         self._recent.extend(self._returns()[-RECENT:])
-        timer.mark()
-        if not update.pop("finite"):
-            raise FloatingPointError(
-                f"the update of iteration {self.iteration + 1} is not finite: make learning_rate, or the rewards and "
-                f"observations, smaller ({rollout.extremes()})"
-            )
+        update["return_recent"] = sum(self._recent) / len(self._recent) if self._recent else math.nan
+        timer.mark("update")
+        self._check_finite(update)
 
         # 4. Evaluate the mean policy.
-        self.iteration += 1
-        self.samples += self.count
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_update, time_mean = timer.seconds()
-        return PPOIteration(
-            iteration=self.iteration,
-            samples=self.samples,
-            **statistics,
-            **update,
-            return_recent=sum(self._recent) / len(self._recent) if self._recent else math.nan,
-            time_sample=time_sample,
-            time_update=time_update,
-            time_mean=time_mean,
-            samples_per_second=self.count / time_sample,
-        )
+        return self._finished(PPOIteration, timer, statistics | update, rate_of=("sample",))
 
     @torch.no_grad()
     def sample(self) -> None:
@@ -358,18 +335,11 @@ class PPO(OnPolicyLearner):
 
         After each step, the normalisers are updated with the step's observations.
         """
-        rollout, team = self.rollout, self.team
         with one_thread():
             self.noise.normal_(generator=self.generator)
-            self.policy.observe_pictures(self.env.obs_groups, team)
-            rollout.begin()
+            self.policy.observe_pictures(self.env.obs_groups, self.team)
             self._first.copy_(self._player.state)
-            for _ in range(rollout.steps):
-                self._act()
-                rollout.store_inputs()
-                self.env.step()
-                rollout.store_outputs()
-                self._observe()
+            self.rollout.fill(self._act, self._observe)
 
     @torch.no_grad()
     def _choose(self) -> None:

@@ -21,33 +21,32 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from lyceum_warp.algos.common.adam import GradientStep
 from lyceum_warp.algos.common.distributed import Captured, Team
-from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
-from lyceum_warp.algos.common.hyperparameters import LEAST, Activation, Bound, check_fields
-from lyceum_warp.algos.common.learner import Learner
+from lyceum_warp.algos.common.hyperparameters import GROUP, LEAST, Activation
 from lyceum_warp.algos.common.minibatches import precision, room
 from lyceum_warp.algos.common.networks import trainable
 from lyceum_warp.algos.common.policy_check import check_sizes
 from lyceum_warp.algos.common.replay import Replay, Transitions, default_capacity
 from lyceum_warp.algos.common.rollout_buffer import Rollout
 from lyceum_warp.algos.common.rollout_statistics import SampledIteration, gathered
+from lyceum_warp.algos.common.sampling import SamplingLearner
 from lyceum_warp.algos.common.squashed_policy import SquashedPolicy
 from lyceum_warp.algos.common.symmetry import apply_symmetry
 from lyceum_warp.algos.common.timing import PhaseTimer
 from lyceum_warp.algos.common.twin_critic import TwinCritic, quantile_loss
 from lyceum_warp.algos.common.value import value_group
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_kind
+from lyceum_warp.support.validate import Rule, check_fields, check_kind
 
 _EPS = 1e-2
 """Constant that is added to the normalisers' standard deviations."""
 
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "num_steps": 1, "replay": 1, "warmup": 0, "updates": 1, "actor_every": 1, "batch": 1, "n_step": 1, "quantiles": 1,
     "dropped_quantiles": 0, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0), "tau": (0.0, 1.0),
     "learning_rate": 0.0, "temperature": 1e-6, "target_entropy": LEAST, "action_limit": 1e-6, "symmetry_coef": 0.0,
+    "value_group": GROUP,
 }  # fmt: skip
 
 MANY_WORLDS = 256
@@ -66,7 +65,6 @@ _MANY: dict[str, Any] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACConfig:
     """Hyperparameters of SAC.
@@ -158,7 +156,7 @@ class SACConfig:
 
     def __post_init__(self) -> None:
         """Check every value."""
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         if self.dropped_quantiles >= self.quantiles > 1:
             raise ValueError(
                 f"dropped_quantiles={self.dropped_quantiles} must be less than quantiles, which is {self.quantiles}"
@@ -185,7 +183,6 @@ class SACConfig:
         return config
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SACIteration(SampledIteration):
     """Statistics of one iteration of SAC.
@@ -210,8 +207,7 @@ class SACIteration(SampledIteration):
     """Seconds for the updates."""
 
 
-@document_attributes
-class SAC(Learner):
+class SAC(SamplingLearner):
     """Infinite iterator of ``SACIteration`` that learns a policy by SAC.
 
     In an iteration, every world makes ``num_steps`` steps, and each step is followed by ``updates`` updates. On a GPU,
@@ -237,6 +233,7 @@ class SAC(Learner):
 
     algorithm = "sac"
     """The name of the algorithm in a run's config.json."""
+    config_type = SACConfig
     policy: SquashedPolicy
     value: TwinCritic
     """The critics."""
@@ -246,9 +243,6 @@ class SAC(Learner):
     """Hyperparameters: an ``SACConfig`` with defaults in place of None."""
     replay: Replay
     """The samples of this process's worlds."""
-    generator: torch.Generator
-    rollout: Rollout
-    """The samples of the last iteration."""
     log_temperature: torch.Tensor
     """Logarithm of the temperature."""
 
@@ -262,18 +256,16 @@ class SAC(Learner):
         seed: int = 0,
         team: Team | None = None,
     ) -> None:
-        check_kind("config of SAC", config, SACConfig | None, "as lw.SACConfig(hidden=(64, 64))")
         check_kind("policy of SAC", policy, SquashedPolicy | None, "as lw.load(run) returns it for a run of SAC")
         check_kind("value of SAC", value, TwinCritic | None, "as lw.load_value(run) returns it for a run of SAC")
-        super().__init__(env, seed=seed, team=team)
+        super().__init__(env, config, seed=seed, team=team)
         self._all_worlds, self._warms_up = env.nworld * self.team.size, policy is None
-        self.config = (config or SACConfig()).resolved(self._all_worlds)
+        self.config = self.config.resolved(self._all_worlds)
         init = torch.Generator().manual_seed(self.seed)
         self._make_networks(policy, value, init)
         self._make_replay()
         self.generator = torch.Generator(env.obs.device).manual_seed(int(torch.randint(2**62, (), generator=init)))
         self._make_buffers()
-        self._evaluate_mean = MeanPolicyEvaluation(env, self.config, self.team)
         self.rollout.restart()
         self.rollout.stagger(self.generator, self.team)
 
@@ -357,14 +349,14 @@ class SAC(Learner):
             for _ in range(config.num_steps):
                 # 1. Step the worlds, and store the transitions in the replay buffer.
                 self.sample()
-                timer.mark()
+                timer.mark("sample")
 
                 # 2. Update critics, actor and temperature on samples of the buffer.
                 if self.replay.stored * self._all_worlds >= config.warmup:
                     self.draw()
                     self._learn()
                     updates += config.updates
-                timer.mark()
+                timer.mark("update")
         self.env.update_shared(team.sum)
         parameters = [self.log_temperature, *self.policy.parameters(), *self.value.parameters()]
         team.copy_leader([*parameters, *self.target.parameters()])
@@ -374,32 +366,12 @@ class SAC(Learner):
         sums = dict(zip(("critic_loss", "q_mean", "actor_loss", "entropy"), self._sums, strict=True))
         numbers = {"finite": finite, "temperature": self.log_temperature.detach().exp(), **sums}
         statistics, (update, *_) = gathered(rollout, team, numbers)
-        times = timer.seconds()
-        if not update.pop("finite"):
-            raise FloatingPointError(
-                f"the updates of iteration {self.iteration + 1} are not finite: make learning_rate, or the rewards and "
-                f"observations, smaller ({rollout.extremes()})"
-            )
+        timer.mark()
+        self._check_finite(update)
         update |= {name: update[name] / updates if updates else math.nan for name in sums}
 
         # 3. Evaluate the mean policy.
-        self.iteration += 1
-        self.samples += self.count
-        timer = PhaseTimer(self.env.obs.device)
-        statistics = self._evaluate_mean.added(statistics, self.policy, self.iteration)
-        timer.mark()
-
-        time_sample, time_update = sum(times[::2]), sum(times[1::2])
-        return SACIteration(
-            iteration=self.iteration,
-            samples=self.samples,
-            **statistics,
-            **update,
-            time_sample=time_sample,
-            time_update=time_update,
-            time_mean=timer.seconds()[0],
-            samples_per_second=self.count / (time_sample + time_update),
-        )
+        return self._finished(SACIteration, timer, statistics | update, rate_of=("sample", "update"))
 
     @torch.no_grad()
     def sample(self) -> None:
@@ -517,7 +489,6 @@ class SAC(Learner):
         state = {
             "target": self.target.state_dict(),
             "temperature": self.log_temperature.detach(),
-            "returns": self.team.gather(self.rollout.running_return),
             "optimizers": [step.optimizer.state_dict() for step in self._steps],
             "warms_up": self._warms_up,
         }
@@ -529,7 +500,6 @@ class SAC(Learner):
         self.target.load_state_dict(state["target"])
         with torch.no_grad():
             self.log_temperature.copy_(state["temperature"])
-        self.rollout.running_return.copy_(state["returns"][self.own_worlds])
         for step, saved in zip(self._steps, state["optimizers"], strict=True):
             step.optimizer.load_state_dict(saved)
         self._learn.forget()  # the graph contains the learning rate

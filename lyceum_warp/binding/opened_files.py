@@ -17,11 +17,9 @@ Stamps: TypeAlias = dict[Path, tuple[int, int] | None]
 _READERS = frozenset(("<module>", "edit_model", "model", "obs"))
 """The code of a task's module that may read files: its top level, and the functions that ``BoundTask`` calls."""
 
-_INSTALLED = tuple(
-    f"{folder}{os.sep}"
-    for folder in {*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), Path(__file__).parents[1]}
-)
-"""Folders of installed packages. Files in these folders are no data of a task."""
+_PACKAGES = {*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), Path(__file__).parents[1]}
+_NO_DATA = tuple(f"{folder}{os.sep}" for folder in (*_PACKAGES, "/proc", "/sys", "/dev"))
+"""Folders of installed packages and of the kernel, whose files are no data of a task."""
 
 _reads: "weakref.WeakKeyDictionary[ModuleType, Stamps]" = weakref.WeakKeyDictionary()
 
@@ -67,7 +65,7 @@ def _record(event: str, arguments: tuple[Any, ...]) -> None:
     if frame is None or (name := frame.f_globals.get("__name__", "__main__")) == "__main__":
         return  # no module is being imported or bound
     module, path = sys.modules.get(name), os.path.normpath(os.fsdecode(arguments[0]))
-    if isinstance(module, ModuleType) and not path.startswith(_INSTALLED) and not path.endswith((".py", ".pyc")):
+    if isinstance(module, ModuleType) and not path.startswith(_NO_DATA) and not path.endswith((".py", ".pyc")):
         _reads.setdefault(module, {}).update(stamps([Path(path)]))
 
 

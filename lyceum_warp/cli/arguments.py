@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import os
+import re
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from lyceum_warp.core import OPTIONS, EnvOptions, PhysicsOptions, given_values
+from lyceum_warp.core import OPTIONS, Camera, EnvOptions, PhysicsOptions, given_values
 from lyceum_warp.support.docstrings import attribute_docs
 
 Repeated = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="NAME=VALUE")]
@@ -92,12 +93,13 @@ def given(flags: Any) -> dict[str, Any]:
         values["solver"] = dict(map(parameter, values["solver"]))
     if isinstance(values.get("objects"), str):
         values["objects"] = values["objects"].split(",")
+    if isinstance(values.get("cameras"), str):
+        values["cameras"] = cameras(values["cameras"])
     return values
 
 
 NO_FLAGS = (
-    "nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "cameras", "final_pictures",
-    "physics",
+    "nworld", "seed", "first_world", "autoreset", "graphs", "model", "fields", "dynamics", "final_pictures", "physics",
 )  # fmt: skip
 """Options of an environment for which no flag is generated.
 
@@ -117,12 +119,16 @@ class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     objects: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME...")] = None
     """Names of the objects that the worlds hold, of those that the task declares. By default, the worlds hold all of
     them, or the geoms of the model."""
+    cameras: Annotated[str | None, tyro.conf.arg(metavar="NAME:WxH:KIND,...")] = None
+    """Cameras of the model whose pictures are observations, such as side or side:64x64,top:84x84:depth; each kind is
+    rgb (the default), depth or segmentation. The group of observations is "camera", or with several cameras the name,
+    and _KIND unless it is rgb: side,top_depth. By default, the cameras are those of the run or the task."""
 
 
 class EnvFlags(
     Placement,
     options=[EnvOptions],
-    omit=(*NO_FLAGS, "engine", "device", "nthread", "fitted", "fitted_draws", "objects"),
+    omit=(*NO_FLAGS, "engine", "device", "nthread", "fitted", "fitted_draws", "objects", "cameras"),
 ):
     """Where the worlds run, and the length of their episodes. The defaults come from the run, if there is one."""
 
@@ -158,6 +164,23 @@ def parameter(text: str) -> tuple[str, Any]:
         return name, str(Path(os.path.expanduser(value)).resolve())
     values = [_value(part, text) for part in parts]
     return name, values[0] if len(values) == 1 else values
+
+
+_CAMERA = re.compile(r"([^:]+)(?::(\d+)x(\d+))?(?::([a-z]+))?")
+
+
+def cameras(text: str) -> tuple[Camera, ...]:
+    """Parse cameras, such as side:64x64,top:84x84:depth."""
+    words = text.split(",")
+    parsed: list[Camera] = []
+    for word in words:
+        if (match := _CAMERA.fullmatch(word)) is None:
+            raise ValueError(f"a camera must be written as NAME, NAME:64x64 or NAME:64x64:depth, not {word!r}")
+        name, width, height, kind = match.groups()
+        group = "camera" if len(words) == 1 else name if kind in (None, "rgb") else f"{name}_{kind}"
+        values: dict[str, Any] = {"width": width and int(width), "height": height and int(height), "kind": kind}
+        parsed.append(Camera(name, group=group, **{key: value for key, value in values.items() if value is not None}))
+    return tuple(parsed)
 
 
 def _value(part: str, text: str) -> bool | int | float:

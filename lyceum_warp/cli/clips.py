@@ -6,15 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.algos import EXACT, ClipResults, evaluate_clips, simulation
-from lyceum_warp.binding import BoundTask, find_task
+from lyceum_warp import algos, binding, core, motions, viz
 from lyceum_warp.cli.display import console, say, table, tried
-from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.env import Env, Policy
-from lyceum_warp.motions import Clips, load_clips
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.viz import CameraChoice, draw_moments
 
 _COLUMNS = {
     "mpkpe": ("MPKPE, mm", 1000.0), "r_mpkpe": ("R-MPKPE, mm", 1000.0),
@@ -24,18 +20,18 @@ _COLUMNS = {
 """The heading and the factor of each error."""
 
 
-def clips_of_task(files: Sequence[Path], task: str, options: EnvOptions) -> Clips:
+def clips_of_task(files: Sequence[Path], task: str, options: core.EnvOptions) -> motions.Clips:
     """Load clips at the rate of a task."""
-    definition = find_task(task)
+    definition = binding.find_task(task)
     physics = options.physics.resolved(definition.physics)
-    bound = BoundTask(definition, model=options.model, physics=physics)
-    clips = load_clips(files, bound.model, rate=1.0 / bound.timestep, device=options.device or "cpu")
+    bound = binding.BoundTask(definition, model=options.model, physics=physics)
+    clips = motions.load_clips(files, bound.model, rate=1.0 / bound.timestep, device=options.device or "cpu")
     say(f"{len(clips)} clips, {clips.seconds:.6g} s: {', '.join(clips.names)}")
     return clips
 
 
 def print_clips(
-    env: Env, policy: Policy, files: Sequence[Path], picture: Path | None = None, camera: CameraChoice = None
+    env: Env, policy: Policy, files: Sequence[Path], picture: Path | None = None, camera: viz.CameraChoice = None
 ) -> None:
     """Play clips on the C engine under exact physics, and in the environment's own simulation, and print the errors.
 
@@ -49,20 +45,22 @@ def print_clips(
     changes: dict[str, Any] = {}
     names = None
     if files:
-        changes["clips"] = clips = load_clips(files, env.model, rate=1.0 / env.timestep, device=env.device.alias)
+        changes["clips"] = clips = motions.load_clips(
+            files, env.model, rate=1.0 / env.timestep, device=env.device.alias
+        )
         names = clips.names
-    exact = env.replicate(nworld=1, **options_on_cores(), physics=EXACT)
-    for worlds in (exact, env) if simulation(exact) != simulation(env) else (exact,):
+    exact = env.replicate(nworld=1, **options_on_cores(), physics=algos.EXACT)
+    for worlds in (exact, env) if algos.simulation(exact) != algos.simulation(env) else (exact,):
         with LongWork("playing the clips", "steps", console) as work:
-            results = evaluate_clips(worlds, policy, progress=work, **changes)
+            results = algos.evaluate_clips(worlds, policy, progress=work, **changes)
         names = names or tuple(f"clip {i}" for i in range(len(results.failed)))
-        say(f"{env.task.name}: {results.failures} of {len(names)} clips failed on the {simulation(worlds)}")
+        say(f"{env.task.name}: {results.failures} of {len(names)} clips failed on the {algos.simulation(worlds)}")
         console.print(table(_columns(names, results)))
         if worlds is exact and picture is not None:
-            say(f"worst moments: {tried(draw_moments, exact, names, results, picture, camera=camera)}")
+            say(f"worst moments: {tried(viz.draw_moments, exact, names, results, picture, camera=camera)}")
 
 
-def _columns(names: Sequence[str], results: ClipResults) -> dict[str, Sequence[str]]:
+def _columns(names: Sequence[str], results: algos.ClipResults) -> dict[str, Sequence[str]]:
     """Make the columns of a table with a row for each clip, and a row for all."""
     fails = np.where(results.failed, [f"{at:.2f} s" for at in results.tracked.tolist()], "")
     columns: dict[str, Sequence[str]] = {

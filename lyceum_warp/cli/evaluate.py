@@ -8,42 +8,15 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from lyceum_warp.algos import (
-    EXACT,
-    Episodes,
-    Transfer,
-    check_sizes,
-    evaluate,
-    evaluation_seed,
-    evaluation_worlds,
-    simulation,
-    transfer,
-)
-from lyceum_warp.binding import file_name, find_task, task_name
+from lyceum_warp import algos, binding, controllers, training, viz
 from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, given, parameter, parameters
 from lyceum_warp.cli.clips import print_clips
 from lyceum_warp.cli.display import console, say, say_entries, table, tried
-from lyceum_warp.controllers import policy_episodes, source
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import options_for_few_worlds, options_on_cores
 from lyceum_warp.env import Curriculum, Env, Policy
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import whole_number
-from lyceum_warp.training import (
-    AUTO,
-    EPISODES,
-    Configuration,
-    Run,
-    choose_policy,
-    load,
-    load_curriculum,
-    note_changes,
-    pretrained_run,
-    pretrained_text,
-    read_checkpoint,
-    run_env,
-)
-from lyceum_warp.viz import check_video, find_camera, parsed_camera, policy_video
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -69,7 +42,7 @@ class Eval:
     """The run's folder; with --pretrained, the name of a task."""
     pretrained: bool = False
     """Whether to evaluate the package's pretrained policy of a task."""
-    which: str = AUTO
+    which: str = training.AUTO
     """The policy to evaluate: auto (the better of the last and the best policy in new episodes), last, best, or the
     number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
@@ -111,27 +84,27 @@ class Eval:
         whole_number("episodes", self.episodes, low=1)
         if self.transfer and self.env.engine is not None:
             raise ValueError("--transfer plays episodes on both engines: omit --engine")
-        camera = parsed_camera(self.camera)
+        camera = viz.parsed_camera(self.camera)
         if self.video:
-            check_video()
+            viz.check_video()
         elif camera is not None:
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         if self.episodes_to is not None:
-            Run.check_free(self.episodes_to)
-        run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
+            training.Run.check_free(self.episodes_to)
+        run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
         options = given(self.env) | given(self.physics)
         env = run_worlds(run, options, parameters(self.param), nworld=nworld, task=self.task)
-        find_camera(env.model, camera)
+        viz.find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
-            env = evaluation_worlds(env, nworld)
+            env = algos.evaluation_worlds(env, nworld)
         which = better_policy(run, self.which, task=self.task)
-        policy = load(run, which=which, device=env.obs.device)
-        check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
+        policy = training.load(run, which=which, device=env.obs.device)
+        algos.check_sizes(policy, env, f"the policy in {run.policy_file(which)}")
         place = f"{self.folder} --pretrained" if self.pretrained else self.folder
         if self.clips is not None:
-            picture = Path(f"{file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
+            picture = Path(f"{binding.file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
             print_clips(env, policy, self.clips, picture if self.video else None, camera)
             say_entries(next=f"lyceum-warp view {place}")
             return
@@ -141,11 +114,13 @@ class Eval:
         results = []
         with LongWork("evaluating the policy", "steps", console) as work:
             for curriculum in curricula:
-                episodes = evaluate(env, policy, self.episodes, seed=self.seed, curriculum=curriculum, progress=work)
+                episodes = algos.evaluate(
+                    env, policy, self.episodes, seed=self.seed, curriculum=curriculum, progress=work
+                )
                 results.append(episodes.first(self.episodes))
-        folder = pretrained_text(run) if self.pretrained else f"in {self.folder}"
+        folder = training.pretrained_text(run) if self.pretrained else f"in {self.folder}"
         policy_text = "the mean policy" if which == "last" else f"the mean policy {which!r}"
-        say(f"{env.task.name}: {self.episodes} episodes of {policy_text} {folder}, on the {simulation(env)}")
+        say(f"{env.task.name}: {self.episodes} episodes of {policy_text} {folder}, on the {algos.simulation(env)}")
         if len(results) > 1:
             _print_levels(results)
         else:
@@ -154,25 +129,26 @@ class Eval:
             _print_statistics(env, results[0])
         if self.transfer:
             with LongWork("judging the policy's transfer", "steps", console) as work:
-                verdict = transfer(
+                verdict = algos.transfer(
                     env, policy, max(2, self.episodes), seed=self.seed, curriculum=curricula[0],
                     device=self.env.device, progress=work,
                 )  # fmt: skip
             _print_transfer(verdict)
         if self.episodes_to is not None:
-            say(f"episodes: {_save_episodes(env, policy, self, run, which, curricula[0], origin)}")
+            controller = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
+            say(f"episodes: {_save_episodes(env, policy, self, curricula[0], controller, origin)}")
         if self.video:
-            path = Path(f"{file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
-            seed = evaluation_seed(self.seed)
-            say(f"video: {tried(policy_video, env, policy, path, seed, curriculum=curricula[0], camera=camera)}")
+            path = Path(f"{binding.file_name(env.task.name)}.mp4") if self.pretrained else run.folder / "eval.mp4"
+            seed = algos.evaluation_seed(self.seed)
+            say(f"video: {tried(viz.policy_video, env, policy, path, seed, curriculum=curricula[0], camera=camera)}")
         say_entries(next=f"lyceum-warp view {place}")
 
-    def _curricula(self, run: Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
+    def _curricula(self, run: training.Run, which: str, env: Env) -> tuple[list[Curriculum], str]:
         """Return the curricula at which to play, one for each value of --memory, and where they come from."""
         if self.memory and self.fresh_memory:
             raise ValueError("--memory sets the memory that --fresh-memory leaves at its start: omit one of them")
         if not self.memory:
-            saved = None if self.fresh_memory or self.task else load_curriculum(run, which=which)
+            saved = None if self.fresh_memory or self.task else training.load_curriculum(run, which=which)
             if saved is not None:
                 return [saved], "the run's"
             return [Curriculum(shared={name: memory * 0.0 for name, memory in env.shared.items()})], "new"
@@ -191,24 +167,24 @@ class Eval:
         return curricula, "as given"
 
 
-def better_policy(run: Run, which: str, *, task: str | None = None) -> str:
+def better_policy(run: training.Run, which: str, *, task: str | None = None) -> str:
     """Return "last" or "best" for ``AUTO``, and print the choice; return any other ``which`` as it is."""
-    if which != AUTO:
+    if which != training.AUTO:
         return which
 
     def worlds() -> Env:
-        env = run_worlds(run, options_on_cores(), {}, nworld=EPISODES, task=task)
-        return env if env.horizon else evaluation_worlds(env, EPISODES)
+        env = run_worlds(run, options_on_cores(), {}, nworld=training.EPISODES, task=task)
+        return env if env.horizon else algos.evaluation_worlds(env, training.EPISODES)
 
     if not run.best.is_file():
         return "last"
     with LongWork("comparing the last and the best policy", "steps", console) as work:
-        choice = choose_policy(run, worlds, progress=work)
+        choice = training.choose_policy(run, worlds, progress=work)
     say(choice.text)
     return choice.which
 
 
-def _print_levels(results: list[Episodes]) -> None:
+def _print_levels(results: list[algos.Episodes]) -> None:
     columns = {"memory at the start": [episodes.curriculum.text for episodes in results]}
     for heading, name in (("return", "returns"), ("length", "lengths"), ("evaluation", "evals"), ("success", "success"),
                           ("terminated", "terminated")):  # fmt: skip
@@ -217,7 +193,7 @@ def _print_levels(results: list[Episodes]) -> None:
     console.print(table(columns))
 
 
-def _print_statistics(env: Env, episodes: Episodes) -> None:
+def _print_statistics(env: Env, episodes: algos.Episodes) -> None:
     # terms, ends and what measure writes add up over an episode; other metrics, such as a level, do not
     averaged = env.task.definition.metrics if env.task.functions["measure"] is None else ()
     numbers = {
@@ -241,7 +217,7 @@ def _print_statistics(env: Env, episodes: Episodes) -> None:
         console.print(table(columns))
 
 
-def _print_transfer(verdict: Transfer) -> None:
+def _print_transfer(verdict: algos.Transfer) -> None:
     for comparison in verdict.comparisons:
         differences = comparison.differences
         columns = {
@@ -260,19 +236,19 @@ def _print_transfer(verdict: Transfer) -> None:
 
 
 def run_worlds(
-    run: Run, options: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None = None
+    run: training.Run, options: dict[str, Any], params: dict[str, Any], *, nworld: int, task: str | None = None
 ) -> Env:
     """Make worlds of a run's task, with the run's options and parameters as defaults.
 
     The physics is that of the run's last iteration. A different task has its own defaults. With the engine auto and no
     device, the worlds run on the CPU.
     """
-    saved = Configuration.of(run)
+    saved = training.Configuration.of(run)
     defaults = saved.options.changed({"seed": 0})
     if (number := run.config.get("exact_from")) is not None:
-        done = read_checkpoint(run.policy_file(), parts=("iteration",))["iteration"]
-        defaults = defaults.changed({"physics": EXACT} if done > number else {})
-    if task is None or task_name(find_task(task)) == run.task_name:
+        done = training.read_checkpoint(run.policy_file(), parts=("iteration",))["iteration"]
+        defaults = defaults.changed({"physics": algos.EXACT} if done > number else {})
+    if task is None or binding.task_name(binding.find_task(task)) == run.task_name:
         params = {**saved.params, **params}
     else:
         defaults = EnvOptions(engine=defaults.engine, device=defaults.device, nthread=defaults.nthread)
@@ -280,24 +256,23 @@ def run_worlds(
     if "device" not in options:
         merged = merged.changed(options_for_few_worlds(merged.engine, merged.device))
     try:
-        env = run_env(run, merged, params, task=task)
+        env = training.run_env(run, merged, params, task=task)
     except (ValueError, FileNotFoundError) as error:
         run.note_settings(error)
         raise
     if task is None:
-        note_changes(run, env, model=env.options.physics == saved.options.physics)
+        training.note_changes(run, env, model=env.options.physics == saved.options.physics)
     return env
 
 
 def _save_episodes(
-    env: Env, policy: Policy, options: Eval, run: Run, which: str, curriculum: Curriculum, source: dict[str, Any]
+    env: Env, policy: Policy, options: Eval, curriculum: Curriculum, controller: dict[str, Any], source: dict[str, Any]
 ) -> str:
     """Run the same episodes again, write one file per episode, and return a glob pattern of the files."""
     assert options.episodes_to is not None
-    controller = {"name": type(policy).__name__, "run": str(run.folder.resolve()), "which": which}
     with LongWork("running the episodes that are saved", "steps", console) as work:
-        episodes = policy_episodes(
-            env.replicate(autoreset=False), policy, options.episodes, seed=evaluation_seed(options.seed),
+        episodes = controllers.policy_episodes(
+            env.replicate(autoreset=False), policy, options.episodes, seed=algos.evaluation_seed(options.seed),
             curriculum=curriculum, controller=controller, progress=work,
         )  # fmt: skip
         for number, episode in enumerate(episodes):
@@ -306,9 +281,9 @@ def _save_episodes(
     return str(options.episodes_to / "episode-*.npz")
 
 
-def _source(env: Env, run: Run) -> dict[str, Any]:
+def _source(env: Env, run: training.Run) -> dict[str, Any]:
     """Return the ``Trajectory.source`` of saved episodes, with the path of the model's copy if it was used."""
-    content = source(env)
+    content = controllers.source(env)
     copy = run.config.get("kept", {}).get("model")
     if copy is not None and env.options.model is not None and "model" not in content["options"]:
         content["options"]["model"] = str((run.task_folder / copy).resolve())

@@ -6,12 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.algos import check_export, export_policy
+from lyceum_warp import algos, engines, training
 from lyceum_warp.cli.display import note, say, say_entries
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
-from lyceum_warp.engines import options_on_cores
 from lyceum_warp.env import Env, start_episodes
-from lyceum_warp.training import AUTO, Run, load, load_curriculum
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -30,7 +28,7 @@ class Export:
     """The run's folder."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file to write, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
-    which: str = AUTO
+    which: str = training.AUTO
     """The policy to export: auto (the better of the last and the best policy in new episodes), last, best, or the
     number of a saved iteration."""
     task: Annotated[str | None, tyro.conf.arg(metavar="TASK")] = None
@@ -38,19 +36,19 @@ class Export:
 
     def run(self) -> None:
         path = self.to or self.folder / "policy.onnx"
-        check_export(path)
-        run = Run.open(self.folder)
+        algos.check_export(path)
+        run = training.Run.open(self.folder)
         which = better_policy(run, self.which, task=self.task)
-        policy = load(run, which=which)
-        export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
+        policy = training.load(run, which=which)
+        algos.export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
         say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
         say_entries(next="docs/deployment.md runs the policy on a robot")
 
-    def _env(self, run: Run, which: str) -> Env | None:
+    def _env(self, run: training.Run, which: str) -> Env | None:
         """Make an environment of the run's task, for the metadata. If the task cannot be loaded, print a message."""
         try:
-            env = run_worlds(run, options_on_cores(), {}, nworld=1, task=self.task)
-            start_episodes(env, None, load_curriculum(run, which=which))
+            env = run_worlds(run, engines.options_on_cores(), {}, nworld=1, task=self.task)
+            start_episodes(env, None, training.load_curriculum(run, which=which))
             return env
         except (ValueError, FileNotFoundError, ImportError) as error:
             note(f"the file has no metadata on the robot: {error}")

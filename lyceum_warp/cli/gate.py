@@ -6,12 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from lyceum_warp.algos import gate
+from lyceum_warp import algos, engines, training
 from lyceum_warp.cli.display import console, say, say_entries, table
 from lyceum_warp.cli.evaluate import run_worlds
-from lyceum_warp.engines import options_on_cores
 from lyceum_warp.support.long_work import LongWork
-from lyceum_warp.training import Run, load, load_curriculum, pretrained_run
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,12 +39,12 @@ class Gate:
     """Threads of the C engine; by default all cores."""
 
     def run(self) -> int:
-        run = Run.open(pretrained_run(str(self.folder)) if self.pretrained else self.folder)
-        env = run_worlds(run, {**options_on_cores(), "physics": "exact"}, {}, nworld=1, task=self.task)
-        policy = load(run, which=self.which)
-        curriculum = None if self.task else load_curriculum(run, which=self.which)
+        run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
+        env = run_worlds(run, {**engines.options_on_cores(), "physics": "exact"}, {}, nworld=1, task=self.task)
+        policy = training.load(run, which=self.which)
+        curriculum = None if self.task else training.load_curriculum(run, which=self.which)
         with LongWork("testing the policy", "parts", console):
-            verdict = gate(env, policy, seed=self.seed, curriculum=curriculum, nthread=self.nthread)
+            verdict = algos.gate(env, policy, seed=self.seed, curriculum=curriculum, nthread=self.nthread)
         limits = [(limit, verdict.numbers[name]) for name, limit in verdict.limits.items()]
         columns = {
             "": [limit.text for limit, _ in limits],

@@ -12,25 +12,17 @@ from typing import Annotated, Literal
 import mujoco
 import tyro
 
+from lyceum_warp import core
 from lyceum_warp.binding import compile_model, find_task, package_task_names, snake_case
 from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.task_text import TRAINING, actuated_joints, literal, plain_text, tracking_text, velocity_text
-from lyceum_warp.core import (
-    CONES,
-    ModelFile,
-    PhysicsOptions,
-    gymnasium_model,
-    gymnasium_robotics_model,
-    menagerie_model,
-    read_spec,
-)
 from lyceum_warp.models import Legs
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 
-_SOURCES: dict[str, Callable[[str], ModelFile]] = {
-    "menagerie": menagerie_model,
-    "gymnasium": gymnasium_model,
-    "gymnasium_robotics": gymnasium_robotics_model,
+_SOURCES: dict[str, Callable[[str], core.ModelFile]] = {
+    "menagerie": core.menagerie_model,
+    "gymnasium": core.gymnasium_model,
+    "gymnasium_robotics": core.gymnasium_robotics_model,
 }
 
 _TAKEN = ("World", "Params", "Row")
@@ -83,7 +75,7 @@ class New:
         source, spec = _model(self.model, path)
         names = {"file": path.name, "class_name": class_name, "source": source}
         try:
-            model = compile_model(spec, ("sensordata",), PhysicsOptions())
+            model = compile_model(spec, ("sensordata",), core.PhysicsOptions())
             if model.nu == 0:
                 raise ValueError("the model has no actuators, so actions would have no effect: add actuators")
             if model.nv == 0:
@@ -96,8 +88,7 @@ class New:
                 text = (tracking_text if tracks else velocity_text)(legs, **names)
         except ValueError as error:
             raise ValueError(f"{self.model}: {error}") from error
-        with replaced(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        replace_text(path, text)
         task = find_task(path)
         if self.template == "plain":
             step_ms = 1000 * task.frame_skip * model.opt.timestep
@@ -107,7 +98,7 @@ class New:
         training = {"plain": "", "velocity": f" {TRAINING}", "tracking": " --clips FILES --device cuda"}[self.template]
         say(f"{path}: {sizes}")
         if self.template != "plain":
-            cone = next(name for name, kind in CONES.items() if kind == model.opt.cone)
+            cone = next(name for name, kind in core.CONES.items() if kind == model.opt.cone)
             physics = f"{task.frame_skip} substeps of {1000 * model.opt.timestep:g} ms with {cone} friction cones"
             say(f"a step has {physics}; lyceum-warp tune {path} finds faster physics")
         say_entries(next=f"lyceum-warp check {path}", then=f"lyceum-warp train {path}{training}")
@@ -139,4 +130,4 @@ def _model(text: str, path: Path) -> tuple[str, mujoco.MjSpec]:
     if not model.is_file():
         raise FileNotFoundError(f"there is no model file {text!r}")
     place = model if model.is_absolute() else Path(os.path.relpath(model, path.parent))
-    return literal(place.as_posix()), read_spec(model)
+    return literal(place.as_posix()), core.read_spec(model)

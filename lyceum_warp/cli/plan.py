@@ -15,6 +15,7 @@ import torch
 import tyro
 from rich.markup import escape
 
+from lyceum_warp import controllers, training, viz
 from lyceum_warp.algos import MPPI, MPPIConfig, PlanUpdate, task_config
 from lyceum_warp.binding import file_name, find_task, made_in_file, spelled_task, task_name
 from lyceum_warp.cli.arguments import (
@@ -29,25 +30,11 @@ from lyceum_warp.cli.arguments import (
     parameters,
 )
 from lyceum_warp.cli.display import console, counted, episode_result, say, say_entries, tried
-from lyceum_warp.controllers import (
-    CheckedController,
-    ControlReport,
-    RealTimeChoice,
-    RealTimeSetting,
-    Trajectory,
-    choose_setting,
-    control,
-    control_async,
-    control_report,
-    planning_time,
-)
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
 from lyceum_warp.support.interrupts import Interrupted
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number, whole_number
-from lyceum_warp.training import Run, load_value
-from lyceum_warp.viz import find_camera, parsed_camera, write_video
 
 
 class Settings(OptionFlags, options=[MPPIConfig]):
@@ -134,7 +121,7 @@ class Plan:
     camera: CameraWords = ()
     planner: Placement = Placement()
     """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
-    engine."""
+    engine, and has the cameras."""
     mppi: Settings = Settings()
     planner_physics: Physics = Physics()
 
@@ -152,30 +139,30 @@ class Plan:
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
                 "break: omit one of them"
             )
-        camera = parsed_camera(self.camera)
+        camera = viz.parsed_camera(self.camera)
         if camera is not None and not self.video:
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         task = task_name(find_task(self.task))
         if self.value is not None:
-            run = Run.open(self.value)
+            run = training.Run.open(self.value)
             if run.task_name != task or run.config.get("algorithm") == "sac":
                 raise ValueError(
                     f"--value {self.value} is a run of {run.config['algorithm']} and the task {run.task_name!r}: use a "
                     f"run of npg or ppo and the task {task!r}"
                 )
         out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
-        Run.check_free(out)
+        training.Run.check_free(out)
         torch.set_num_threads(1)
         params = parameters(self.param)
         planner_params = parameters(self.planner_param)
         plant, make_planner = _worlds(self, params, planner_params)
-        find_camera(plant.model, camera)
+        viz.find_camera(plant.model, camera)
         choice = _choice(self, plant, make_planner) if self.real_time else None
         if choice is not None:
             every = round(choice.deadline / plant.timestep) * choice.replan_every
             say(str(choice))
         planner = make_planner(None if choice is None else choice.setting)
-        CheckedController(planner, plant).check_horizon(planner.horizon, every)
+        controllers.CheckedController(planner, plant).check_horizon(planner.horizon, every)
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.definition), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
@@ -185,30 +172,30 @@ class Plan:
             "episodes": self.episodes, "steps": self.steps,
             "replan_every": every, "seed": self.seed, "real_time": self.real_time, "predict": self.predict,
         }  # fmt: skip
-        run = Run.create(out, config)
+        run = training.Run.create(out, config)
         _run(run, plant, planner, dataclasses.replace(self, replan_every=every))
 
 
 def _worlds(
     options: Plan, params: dict[str, Any], planner_params: dict[str, Any]
-) -> tuple[Env, Callable[[RealTimeSetting | None], MPPI]]:
+) -> tuple[Env, Callable[[controllers.RealTimeSetting | None], MPPI]]:
     """Make the controlled world, and a function that makes a planner.
 
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
     planner_options = given(options.planner) | given(options.planner_physics)
     own: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
-    own |= {"objects": planner_options.get("objects")}
+    own |= {"objects": planner_options.get("objects"), "cameras": planner_options.pop("cameras", None)}
     plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **own), params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.definition
-    value = None if options.value is None else load_value(options.value)
+    value = None if options.value is None else training.load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
     if options.planner_model is not None:
         planner_options["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 
-    def make(setting: RealTimeSetting | None) -> MPPI:
+    def make(setting: controllers.RealTimeSetting | None) -> MPPI:
         changes: dict[str, Any] = {}
         physics: dict[str, Any] = {}
         if setting is not None:
@@ -226,7 +213,9 @@ def _worlds(
 _SAMPLES = (16, 32, 64, 128, 256, 512, 1024)
 
 
-def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) -> RealTimeChoice | None:
+def _choice(
+    options: Plan, plant: Env, make: Callable[[controllers.RealTimeSetting], MPPI]
+) -> controllers.RealTimeChoice | None:
     """Choose the settings for which no flag was given, by measuring planning times.
 
     A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
@@ -247,12 +236,12 @@ def _choice(options: Plan, plant: Env, make: Callable[[RealTimeSetting], MPPI]) 
         return None
 
     @functools.cache
-    def measure(setting: RealTimeSetting) -> float:
-        return planning_time(plant, make(setting))
+    def measure(setting: controllers.RealTimeSetting) -> float:
+        return controllers.planning_time(plant, make(setting))
 
-    choice = choose_setting(samples, horizons, physics, measure, deadline=plant.timestep)
+    choice = controllers.choose_setting(samples, horizons, physics, measure, deadline=plant.timestep)
     if choice.replan_every > 1 and (step := make(choice.setting).timestep) > plant.timestep:
-        choice = choose_setting(samples, horizons, physics, measure, deadline=step)
+        choice = controllers.choose_setting(samples, horizons, physics, measure, deadline=step)
     return choice
 
 
@@ -268,7 +257,7 @@ def _fill(texts: tuple[str, ...]) -> Any:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
-def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
+def _run(run: training.Run, plant: Env, planner: MPPI, options: Plan) -> None:
     simulated, update = planner.env, planner.settings["update"]
     name = {"mppi": "MPPI", "cem": "CEM", "predictive_sampling": "predictive sampling"}.get(update, update)
     physics = ", ".join(f"{option} {value}" for option, value in simulated.options.physics.given().items())
@@ -279,11 +268,11 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
         f"{'real time' if options.real_time else 'the world waits'}; files in {escape(str(run.folder))}",
         soft_wrap=True,
     )  # fmt: skip
-    complete: list[Trajectory] = []
-    aborted: list[Trajectory] = []
-    method: Any = functools.partial(control, replan_every=options.replan_every)
+    complete: list[controllers.Trajectory] = []
+    aborted: list[controllers.Trajectory] = []
+    method: Any = functools.partial(controllers.control, replan_every=options.replan_every)
     if options.real_time:
-        method = functools.partial(control_async, predict=options.predict)
+        method = functools.partial(controllers.control_async, predict=options.predict)
     end = math.inf if options.minutes is None else time.monotonic() + 60 * options.minutes
     try:
         for episode in range(options.episodes):
@@ -317,19 +306,19 @@ def _run(run: Run, plant: Env, planner: MPPI, options: Plan) -> None:
             say(f"  {label:<30}{text}")
     paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
     if options.video:
-        camera = parsed_camera(options.camera)
-        paths["video"] = tried(write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
+        camera = viz.parsed_camera(options.camera)
+        paths["video"] = tried(viz.write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
     paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
     say_entries(**paths)
 
 
-def _file(run: Run, episode: int) -> Path:
+def _file(run: training.Run, episode: int) -> Path:
     return run.folder / f"episode-{episode:03d}.npz"
 
 
-def _save(run: Run, episodes: list[Trajectory], options: Plan) -> ControlReport:
+def _save(run: training.Run, episodes: list[controllers.Trajectory], options: Plan) -> controllers.ControlReport:
     episodes[-1].save(_file(run, len(episodes) - 1))
     # the deadline of a plan is the time from one plan to the next
-    report = control_report(episodes, rate=1 / (options.replan_every * episodes[0].period))
+    report = controllers.control_report(episodes, rate=1 / (options.replan_every * episodes[0].period))
     report.write(run.folder / "report.json")
     return report

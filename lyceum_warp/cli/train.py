@@ -138,7 +138,7 @@ class Train:
     suggests, or 100.
     """
     seed: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
-    """Seed of the networks, the noise and the worlds' initial states."""
+    """Seed of networks, noise and initial states."""
     seeds: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N|SEED ...", help_behavior_hint="")] = ()
     """Train this number of seeds, counted from 0, or these seeds, each in a process and a run of its own in --out. The
     same command continues an interrupted training."""

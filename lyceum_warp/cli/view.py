@@ -9,7 +9,7 @@ import tyro
 
 from lyceum_warp.algos import MPPI, check_sizes, task_config
 from lyceum_warp.binding import task_names
-from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, given, parameters
+from lyceum_warp.cli.arguments import ParamWords, Physics, Placement, cameras, given, parameters
 from lyceum_warp.cli.display import note
 from lyceum_warp.cli.evaluate import better_policy, run_worlds
 from lyceum_warp.cli.plan import Settings
@@ -103,13 +103,14 @@ class View:
             if self.follow:
                 watchers.append(Follower(run, controllers["policy"]))
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
-            own = EnvOptions(autoreset=False, nthread=1, objects=options.get("objects"))
+            own = EnvOptions(autoreset=False, nthread=1, objects=options.get("objects"), cameras=options.get("cameras"))
             env = Env(self.what[0], own, params)
         else:
             nworld = 1 if self.nworld is None else self.nworld
             env = Env(self.what[0], EnvOptions(nworld=nworld).changed(options), params)
         if self.mppi:
             config = self.planner.on_top_of(task_config(env.task.definition))
+            options.pop("cameras", None)
             options |= {} if env.options.model is None else {"model": env.options.model}
             controllers["mppi"] = MPPI(env.task.definition, config, seed=self.seed, params=env.given_params, **options)
         view(env, controllers, seed=None if kind == "run" else self.seed, watchers=watchers, **page)
@@ -120,7 +121,8 @@ class View:
         names = [file.name for file in files]
         unique = len(set(names)) == len(names)
         episodes = dict(zip(names if unique else map(str, files), files.values(), strict=True))
-        view(episode_env(files, task=self.task, **params), episodes=episodes, **page)
+        seen = {} if self.place.cameras is None else {"cameras": cameras(self.place.cameras)}
+        view(episode_env(files, task=self.task, **params, **seen), episodes=episodes, **page)
 
     def _policy(self, run: Run, options: dict[str, Any], params: dict[str, Any]) -> tuple[Env, Policy]:
         """Return a run's worlds in their first states, and its policy."""

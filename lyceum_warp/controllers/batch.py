@@ -5,8 +5,10 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import torch
+import warp as wp
 
-from lyceum_warp.controllers.trajectory import Trajectory, provenance
+from lyceum_warp.controllers.trajectory import Trajectory, pictures_of, provenance, stacked
+from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
 
 
@@ -31,17 +33,22 @@ def policy_episodes(
 
     Yields:
         The first episode of each world, then the second episode of each world, and so on.
+
+    Raises:
+        NotEnoughMemoryError: The pictures of all worlds do not fit into memory.
     """
     player = Player(policy, env)
     named = {"name": type(policy).__name__, **(controller or {})}
     origin = provenance(env)
     rounds = -(-episodes // env.nworld)
+    if seen := sum(env.obs_groups[camera.group][0].nbytes for camera in env.task.cameras):
+        check_fit(seen * env.horizon, env.nworld, wp.get_device("cpu"), model=f"{env.horizon} steps with pictures")
     for number in range(rounds):
         if number == 0 or env.task.curriculum:
             start_episodes(env, seed, curriculum, first=number * env.nworld, total=rounds * env.nworld)
         else:
             env.rand_reset()
-        states, obs = [env.get_state().cpu()], [env.obs.cpu().clone()]
+        states, obs, pictures = [env.get_state().cpu()], [env.obs.cpu().clone()], [pictures_of(env)]
         actions: list[torch.Tensor] = []
         outcomes: list[torch.Tensor] = []
         times: list[tuple[float, float, float]] = []  # action's time, duration of the policy's call, step's end
@@ -56,6 +63,7 @@ def policy_episodes(
             env.step()
             states.append(env.get_state().cpu())
             obs.append(env.final_obs.cpu().clone())
+            pictures.append(pictures_of(env))
             outcomes.append(torch.stack([env.reward, env.eval, env.success.float()]).cpu())
             times.append((applied - start, applied - called, time.perf_counter() - start))
             over = env.done.cpu() & (lengths == 0)
@@ -78,7 +86,7 @@ def policy_episodes(
                 plan_starts=applied_at - policy_times, plan_times=policy_times,
                 plan_failed=unknown, plan_effective=unknown,
                 timestep=env.timestep, period=env.timestep, wall_seconds=ends[-1].item(), mode="sync",
-                done_reason=int(reasons[world]), seed=seed,
+                done_reason=int(reasons[world]), seed=seed, pictures=stacked(pictures[: steps + 1], world),
                 controller=named | {"world": env.first_world + world, "episode": number},
                 **origin | {"params": origin["params"] | params},
             )  # fmt: skip

@@ -8,13 +8,11 @@ import torch
 
 from lyceum_warp.controllers.checked_controller import CheckedController
 from lyceum_warp.controllers.controller import Controller
-from lyceum_warp.controllers.trajectory import Trajectory, provenance
+from lyceum_warp.controllers.trajectory import Trajectory, pictures_of, provenance, stacked
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_kind, whole_number
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlProgress:
     """Progress of an episode after a step: the argument of ``on_step``."""
@@ -100,7 +98,7 @@ class EpisodeCollector:
         self.env, self.seed = env, seed
         self.mode, self.period = mode, period
         self.controller = controller.description()
-        self.states, self.obs = [env.get_state()[0]], [env.obs[0].clone()]
+        self.states, self.obs, self.pictures = [env.get_state()[0]], [env.obs[0].clone()], [pictures_of(env)]
         self.times: list[float] = []
         # tuples of action, plan, age, and whether the step was late
         self._applied: list[tuple[torch.Tensor, TimedPlan, float, bool]] = []
@@ -127,6 +125,7 @@ class EpisodeCollector:
         env = self.env
         self.states.append(env.get_state()[0])
         self.obs.append(env.final_obs[0].clone())
+        self.pictures.append(pictures_of(env))
         self._outcomes.append((env.reward.item(), env.eval.item(), bool(env.success.item())))
         if on_step is not None:
             step, outcome = len(self._outcomes), self._outcomes[-1]
@@ -153,5 +152,6 @@ class EpisodeCollector:
             plan_of=torch.tensor([plan.index for plan in plans]), plan_steps=torch.tensor(plan_steps),
             plan_starts=times[0], plan_times=times[1], plan_failed=times[2], plan_effective=times[3],
             timestep=self.env.timestep, period=self.period, wall_seconds=wall_seconds, mode=self.mode,
-            done_reason=done_reason, seed=self.seed, controller=self.controller, **provenance(self.env),
+            done_reason=done_reason, seed=self.seed, controller=self.controller,
+            pictures=stacked(self.pictures[: steps + 1], 0), **provenance(self.env),
         )  # fmt: skip

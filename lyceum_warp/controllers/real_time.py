@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Iterator
 from typing import TypeAlias
 
 import torch
@@ -19,6 +18,7 @@ from lyceum_warp.controllers.controller import Controller
 from lyceum_warp.controllers.episode_collector import EpisodeCollector, OnAbort, OnStep, TimedPlan, begin_episode
 from lyceum_warp.controllers.trajectory import Trajectory
 from lyceum_warp.env.env import Env
+from lyceum_warp.support.settings import temporarily
 from lyceum_warp.support.validate import check_flag, check_kind, positive_number
 
 # all in seconds
@@ -208,14 +208,9 @@ class Predictor:
         return None if env.done.item() else (env.get_state()[0], env.obs[0].clone())
 
 
-@contextlib.contextmanager
-def _frequent_thread_switches() -> Iterator[None]:
+def _frequent_thread_switches() -> contextlib.AbstractContextManager[None]:
     before = sys.getswitchinterval()
-    sys.setswitchinterval(min(before, _SWITCH_INTERVAL))
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
+    return temporarily(sys.setswitchinterval, min(before, _SWITCH_INTERVAL), before)
 
 
 class PlannerThread:

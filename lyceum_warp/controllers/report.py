@@ -11,13 +11,11 @@ import numpy as np
 import torch
 
 from lyceum_warp.controllers.trajectory import Trajectory
-from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.support.mappings import differing
 from lyceum_warp.support.validate import positive_number
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class ControlReport:
     """Statistics of a controller's episodes, computed by ``control_report``.
@@ -116,8 +114,7 @@ class ControlReport:
         """Write the report as JSON, atomically, and return the file's path."""
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(path) as temporary:
-            temporary.write_text(self.to_json() + "\n")
+        replace_text(path, self.to_json() + "\n")
         return path
 
     def rows(self) -> list[tuple[str, str]]:

@@ -23,7 +23,8 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
 
     Raises:
         FileNotFoundError: A file does not exist, or a folder holds no episode.
-        ValueError: A file is broken, comes from a newer release, or has a different task or model than the first file.
+        ValueError: A file is broken, comes from a newer release, or has a different task, model or pictures than the
+            first file.
     """
     episodes: dict[Path, Trajectory] = {}
     for path in _files([paths] if isinstance(paths, str | Path) else paths):
@@ -36,6 +37,9 @@ def load_episodes(paths: str | Path | Iterable[str | Path]) -> dict[Path, Trajec
             )
         if difference := _difference(first.state_parts, episode.state_parts):
             raise ValueError(f"{path} has a different model than {first_path}: its states have {difference}")
+        sizes, first_sizes = ({g: tuple(p.shape[1:]) for g, p in each.pictures.items()} for each in (episode, first))
+        if sizes != first_sizes:
+            raise ValueError(f"{path} has pictures {sizes}, but {first_path} has {first_sizes}: load them separately")
     if not episodes:
         raise ValueError("there is no episode to load: pass at least one file")
     return episodes

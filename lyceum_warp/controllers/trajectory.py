@@ -12,7 +12,6 @@ import torch
 from lyceum_warp.binding.registry import spelled_task
 from lyceum_warp.core.done import Done
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced, unknown_format
 from lyceum_warp.support.validate import first_sentence
 from lyceum_warp.support.versions import versions
@@ -37,7 +36,6 @@ _SCALARS: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
     """One episode of a controlled world, the plant. All tensors are on the CPU.
@@ -111,6 +109,8 @@ class Trajectory:
     """Columns [start, stop] of each part of an observation."""
     action_names: Sequence[str]
     """Names of the action columns."""
+    pictures: Mapping[str, torch.Tensor] = dataclasses.field(default_factory=dict)
+    """Pictures of the states by the cameras' groups, (steps + 1, height, width, channels); see ``lw.Camera``."""
     source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """The arguments of ``lw.make`` with which ``episode_env`` recreates the plant. ``task`` is a name or "file:class",
     or None for a task from a notebook or script. ``params`` lists the names of the given parameters, and ``options``
@@ -161,13 +161,14 @@ class Trajectory:
         """Write the trajectory to a file atomically, and return the file's path.
 
         The file is a compressed ``.npz`` that numpy reads without pickle. The array of each tensor has the same name as
-        the tensor. The 0-d array ``info`` is a string with a JSON object. The JSON object holds all other attributes of
-        the trajectory, and ``"format": 1``. For example, the positions are
-        ``states[:, slice(*info["state_parts"]["qpos"])]``.
+        the tensor, and the array of a camera's pictures is ``pictures.GROUP``. The 0-d array ``info`` is a string with
+        a JSON object. The JSON object holds all other attributes of the trajectory, and ``"format": 1``. For example,
+        the positions are ``states[:, slice(*info["state_parts"]["qpos"])]``.
         """
         path = Path(path)
-        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}}
+        info = {"format": FORMAT, **{name: getattr(self, name) for name in _SCALARS}, "pictures": [*self.pictures]}
         arrays: dict[str, Any] = {name: getattr(self, name).numpy() for name in _ARRAYS}
+        arrays |= {f"pictures.{group}": pictures.numpy() for group, pictures in self.pictures.items()}
         arrays["info"] = np.array(json.dumps(info))
         path.parent.mkdir(parents=True, exist_ok=True)
         # numpy appends .npz to a path, but not to an open file
@@ -189,10 +190,12 @@ class Trajectory:
                 info = json.loads(str(file["info"]))
                 if info["format"] <= FORMAT:
                     content: dict[str, Any] = {name: torch.from_numpy(file[name]) for name in _ARRAYS}
-                    _check(content)
+                    groups = info.get("pictures", ())  # earlier releases saved none
+                    pictures = {group: torch.from_numpy(file[f"pictures.{group}"]) for group in groups}
+                    _check(content, pictures)
                     scalars = {name: kind(info[name]) for name, kind in _SCALARS.items()}
                     _check_scalars(scalars, content)
-                    return cls(**content, **scalars)
+                    return cls(**content, **scalars, pictures=pictures)
         except Exception as error:  # numpy and zipfile raise many types of errors
             if isinstance(error, OSError) and error.filename is not None:
                 raise  # the file cannot be opened
@@ -201,7 +204,7 @@ class Trajectory:
         raise unknown_format(path, info["format"], FORMAT)
 
 
-def _check(arrays: Mapping[str, torch.Tensor]) -> None:
+def _check(arrays: Mapping[str, torch.Tensor], pictures: Mapping[str, torch.Tensor]) -> None:
     steps = len(arrays["actions"])
     lengths = {"steps": steps, "steps + 1": steps + 1, "plans": len(arrays["plan_times"])}
     for name, (dtype, axes) in _ARRAYS.items():
@@ -209,6 +212,9 @@ def _check(arrays: Mapping[str, torch.Tensor]) -> None:
         fits = array.ndim == len(axes) and array.dtype == dtype and len(array) == lengths[axes[0]]
         if not fits or not len(array):
             raise ValueError(f"{name} has type {array.dtype} and shape {tuple(array.shape)}")
+    for group, array in pictures.items():
+        if array.ndim != 4 or len(array) != steps + 1:
+            raise ValueError(f"the pictures {group!r} have the shape {tuple(array.shape)}")
     if not ((arrays["plan_of"] >= 0) & (arrays["plan_of"] < lengths["plans"])).all():
         raise ValueError(f"plan_of has indices outside the {lengths['plans']} plans")
 
@@ -225,6 +231,16 @@ def _check_scalars(scalars: Mapping[str, Any], arrays: Mapping[str, torch.Tensor
             raise ValueError(f"source has {source[name]!r} as its {name}")
     if missing := [name for name in source.get("params", ()) if name not in scalars["params"]]:
         raise ValueError(f"source names the parameter {missing[0]!r}, but params has no such key")
+
+
+def pictures_of(env: Env) -> dict[str, torch.Tensor]:
+    """Copy the pictures of all worlds to the CPU, by the cameras' groups."""
+    return {camera.group: env.obs_groups[camera.group].to("cpu", copy=True) for camera in env.task.cameras}
+
+
+def stacked(pictures: Sequence[Mapping[str, torch.Tensor]], world: int) -> dict[str, torch.Tensor]:
+    """Stack the pictures of a world that ``pictures_of`` has copied in each state of an episode."""
+    return {group: torch.stack([each[group][world] for each in pictures]) for group in pictures[0]}
 
 
 def provenance(env: Env) -> dict[str, Any]:
@@ -253,6 +269,8 @@ def source(env: Env) -> dict[str, Any]:
     """Collect the arguments that recreate an environment; see ``Trajectory.source``."""
     task = env.task.definition
     options = {name: value for name, value in env.options.given().items() if name not in _PLACEMENT}
+    if "cameras" in options:
+        options["cameras"] = [dataclasses.asdict(camera) for camera in options["cameras"]]
     model = options.pop("model", None)
     if isinstance(model, str | Path):
         options["model"] = str(Path(model).resolve()) if Path(model).is_file() else str(model)

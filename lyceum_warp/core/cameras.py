@@ -2,20 +2,23 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_kind, check_word, finite_number, whole_number
+from lyceum_warp.support.validate import Rule, check_fields, check_kind, finite_number
 
 Kind = Literal["rgb", "depth", "segmentation"]
 
+_RULES: dict[str, Rule] = {
+    **dict.fromkeys(("name", "group", "body"), "as Camera('fixed')"), "width": (1, 4096), "height": (1, 4096),
+    "fovy": (1.0, 179.0),
+}  # fmt: skip
+
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class Camera:
     """A camera whose pictures are a group of observations, ``env.obs_groups["camera"]``, (nworld, height, width, ...).
@@ -48,13 +51,9 @@ class Camera:
     """Vertical field of view of an added camera, in degrees."""
 
     def __post_init__(self) -> None:
-        for name in ("name", "group", "body"):
-            check_kind(name, getattr(self, name), str, "as Camera('fixed')")
-        for name in ("width", "height"):
-            object.__setattr__(self, name, whole_number(name, getattr(self, name), low=1, high=4096))
+        check_fields(self, _RULES)
         if self.width % 4:
             raise ValueError(f"width must be a multiple of 4, not {self.width}: use {self.width // 4 * 4 + 4}")
-        check_word("kind", self.kind, get_args(Kind))
         if (self.pos is None) is not (self.lookat is None):
             raise ValueError(f"an added camera needs both pos and lookat, not pos={self.pos} and lookat={self.lookat}")
         for name in ("pos", "lookat") if self.pos is not None else ():
@@ -62,7 +61,6 @@ class Camera:
             if len(point) != 3:
                 raise ValueError(f"{name} must have three coordinates, not {point}")
             object.__setattr__(self, name, point)
-        object.__setattr__(self, "fovy", finite_number("fovy", self.fovy, low=1.0, high=179.0))
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the camera to a model, if it is given by its pose."""

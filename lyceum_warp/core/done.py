@@ -7,10 +7,7 @@ world whose contacts did not fit reports an overflow.
 
 import enum
 
-from lyceum_warp.support.docstrings import document_attributes
 
-
-@document_attributes
 class Done(enum.IntFlag):
     """Reasons why an episode ended, as bits. ``env.done_reason`` has each world's bits."""
 

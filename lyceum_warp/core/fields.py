@@ -82,50 +82,38 @@ def element_type(shape: tuple[int, ...]) -> Any:
 
 _Kind = mujoco.mjtObj
 
-_KINDS = {
-    "actuator": _Kind.mjOBJ_ACTUATOR,
-    "body": _Kind.mjOBJ_BODY,
-    "cam": _Kind.mjOBJ_CAMERA,
-    "eq": _Kind.mjOBJ_EQUALITY,
-    "geom": _Kind.mjOBJ_GEOM,
-    "jnt": _Kind.mjOBJ_JOINT,
-    "light": _Kind.mjOBJ_LIGHT,
-    "mat": _Kind.mjOBJ_MATERIAL,
-    "pair": _Kind.mjOBJ_PAIR,
-    "sensor": _Kind.mjOBJ_SENSOR,
-    "site": _Kind.mjOBJ_SITE,
-    "ten": _Kind.mjOBJ_TENDON,
-    "tendon": _Kind.mjOBJ_TENDON,
-} | dict.fromkeys(
-    "xpos xquat xmat xipos ximat cvel cacc cinert crb cfrc_int cfrc_ext xfrc_applied subtree_com subtree_linvel "
-    "subtree_angmom".split(),
-    _Kind.mjOBJ_BODY,
-) | dict.fromkeys(("xanchor", "xaxis"), _Kind.mjOBJ_JOINT)  # fmt: skip
-"""Object types of the fields with one row per object, by the field's name or prefix."""
+_Rows = tuple[mujoco.mjtObj | None, str, str]
 
-_QPOS = (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq")
-_DOFS = (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv")
-_CONTROLS = (_Kind.mjOBJ_ACTUATOR, "actuator_ctrladr", "actuator_ctrlnum")
-_OUTPUTS = (_Kind.mjOBJ_ACTUATOR, "actuator_outadr", "actuator_outnum")
-_ACTIVATIONS = (_Kind.mjOBJ_ACTUATOR, "actuator_actadr", "actuator_actnum")
-_SENSORS = (_Kind.mjOBJ_SENSOR, "sensor_adr", "sensor_dim")
-_VERTICES = (_Kind.mjOBJ_FLEX, "flex_vertadr", "flex_vertnum")
-_EDGES = (_Kind.mjOBJ_FLEX, "flex_edgeadr", "flex_edgenum")
+_ACTIVATIONS: _Rows = (_Kind.mjOBJ_ACTUATOR, "actuator_actadr", "actuator_actnum")
 
-_RANGES = (
-    dict.fromkeys(("qpos", "qpos0", "qpos_spring"), _QPOS)
-    | dict.fromkeys(("qvel", "qacc", "cdof", "cdof_dot", "qacc_warmstart", "qacc_smooth", "qfrc", "dof"), _DOFS)
-    | dict.fromkeys(("ctrl", "actuator_ctrlrange", "actuator_ctrllimited"), _CONTROLS)
-    | dict.fromkeys(
-        ("actuator_length", "actuator_velocity", "actuator_force", "actuator_gear", "actuator_acc0",
-         "actuator_length0", "actuator_lengthrange"),
-        _OUTPUTS,
-    )
-    | dict.fromkeys(("act", "act_dot"), _ACTIVATIONS)
-    | {"sensordata": _SENSORS, "flexvert_xpos": _VERTICES}
-    | dict.fromkeys(("flexedge_length", "flexedge_velocity"), _EDGES)
-)  # fmt: skip
-"""Fields with several rows per object, by name or prefix."""
+_FIELDS: dict[_Rows, str] = {
+    (_Kind.mjOBJ_ACTUATOR, "", ""): "actuator",
+    (_Kind.mjOBJ_BODY, "", ""): "body xpos xquat xmat xipos ximat cvel cacc cinert crb cfrc_int cfrc_ext xfrc_applied "
+    "subtree_com subtree_linvel subtree_angmom",
+    (_Kind.mjOBJ_CAMERA, "", ""): "cam",
+    (_Kind.mjOBJ_EQUALITY, "", ""): "eq",
+    (_Kind.mjOBJ_GEOM, "", ""): "geom",
+    (_Kind.mjOBJ_JOINT, "", ""): "jnt xanchor xaxis",
+    (_Kind.mjOBJ_LIGHT, "", ""): "light",
+    (_Kind.mjOBJ_MATERIAL, "", ""): "mat",
+    (_Kind.mjOBJ_PAIR, "", ""): "pair",
+    (_Kind.mjOBJ_SENSOR, "", ""): "sensor",
+    (_Kind.mjOBJ_SITE, "", ""): "site",
+    (_Kind.mjOBJ_TENDON, "", ""): "ten tendon",
+    (_Kind.mjOBJ_JOINT, "jnt_qposadr", "nq"): "qpos qpos0 qpos_spring",
+    (_Kind.mjOBJ_JOINT, "jnt_dofadr", "nv"): "qvel qacc cdof cdof_dot qacc_warmstart qacc_smooth qfrc dof",
+    (_Kind.mjOBJ_ACTUATOR, "actuator_ctrladr", "actuator_ctrlnum"): "ctrl actuator_ctrlrange actuator_ctrllimited",
+    (_Kind.mjOBJ_ACTUATOR, "actuator_outadr", "actuator_outnum"): "actuator_length actuator_velocity actuator_force "
+    "actuator_gear actuator_acc0 actuator_length0 actuator_lengthrange",
+    _ACTIVATIONS: "act act_dot",
+    (_Kind.mjOBJ_SENSOR, "sensor_adr", "sensor_dim"): "sensordata",
+    (_Kind.mjOBJ_FLEX, "flex_vertadr", "flex_vertnum"): "flexvert_xpos",
+    (_Kind.mjOBJ_FLEX, "flex_edgeadr", "flex_edgenum"): "flexedge_length flexedge_velocity",
+}
+"""Names or prefixes of the fields of objects: the type of the objects and, if an object may have several rows, the
+fields with its first row and its number of rows."""
+
+_ROWS = {name: rows for rows, names in _FIELDS.items() for name in names.split()}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -244,27 +232,29 @@ def elements(model: mujoco.MjModel, name: str, element: str) -> slice:
         if i < 0:
             raise ValueError(f"the body {element!r} is not a mocap body, so it has no {name!r}")
         return slice(i, i + 1)
-    prefix = name.partition("_")[0]
-    if (place := _RANGES.get(name) or _RANGES.get(prefix)) is not None:
-        kind, starts, counts = place
-        i = _find(model, kind, element)
-        first = getattr(model, starts)
-        if counts in ("nq", "nv"):
-            end = first[i + 1] if i + 1 < len(first) else getattr(model, counts)
-        else:
-            end = first[i] + getattr(model, counts)[i]
-        if end == first[i] or first[i] < 0:
-            raise ValueError(f"the {_called(kind)} {element!r} has no {name!r}")
-        return slice(int(first[i]), int(end))
-    if (kind := _KINDS.get(name) or _KINDS.get(prefix)) is None:
+    kind, starts, counts = _rows(name)
+    if kind is None:
         raise ValueError(f"the field {name!r} has no named elements")
     i = _find(model, kind, element)
-    return slice(i, i + 1)
+    if not starts:
+        return slice(i, i + 1)
+    first = getattr(model, starts)
+    if counts in ("nq", "nv"):
+        end = first[i + 1] if i + 1 < len(first) else getattr(model, counts)
+    else:
+        end = first[i] + getattr(model, counts)[i]
+    if end == first[i] or first[i] < 0:
+        raise ValueError(f"the {_called(kind)} {element!r} has no {name!r}")
+    return slice(int(first[i]), int(end))
+
+
+def _rows(name: str) -> _Rows:
+    return _ROWS.get(name) or _ROWS.get(name.partition("_")[0]) or (None, "", "")
 
 
 def has_several_rows(name: str) -> bool:
     """Return whether an object may have several rows in a field, such as a ball joint in ``cdof``."""
-    return name in _RANGES or name.partition("_")[0] in _RANGES
+    return bool(_rows(name)[1])
 
 
 def rows(model: mujoco.MjModel, name: str) -> int:
@@ -275,12 +265,10 @@ def rows(model: mujoco.MjModel, name: str) -> int:
 
 def element_names(model: mujoco.MjModel, name: str) -> list[str]:
     """List the named elements of a field of MjData or MjModel, such as the joints of ``qvel``."""
-    prefix = name.partition("_")[0]
-    place = _RANGES.get(name) or _RANGES.get(prefix)
-    kind = place[0] if place is not None else _KINDS.get(name) or _KINDS.get(prefix)
+    kind = _rows(name)[0]
     known = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)] if kind is not None else []
     elements_of = [element for element in known if element]
-    if place is _ACTIVATIONS:
+    if _rows(name) == _ACTIVATIONS:
         return [element for element in elements_of if model.actuator(element).actadr[0] >= 0]
     return elements_of
 

@@ -6,10 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from lyceum_warp.support.docstrings import document_attributes
 
-
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class Limit:
     """The range of a measured number in which a policy passes."""
@@ -63,7 +60,6 @@ class Gate(abc.ABC):
         """
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Verdict:
     """The result of ``lw.gate``."""

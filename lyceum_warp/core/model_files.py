@@ -246,16 +246,18 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
     return found.spec() if isinstance(found, ModelFile) else read_spec(found)
 
 
+def declaring_folder(owner: type, attribute: str) -> Path:
+    """Return the folder of the class that declares an attribute, from which ``owner`` may inherit it."""
+    declares = next((kind for kind in owner.__mro__ if attribute in vars(kind)), owner)
+    return Path(getattr(sys.modules.get(declares.__module__), "__file__", None) or "").parent
+
+
 def find_model(source: str | Path, owner: type | None = None) -> Path | ModelFile:
     """Find a model's file from its path, or from the name of a gymnasium model; see ``load_spec``."""
     if isinstance(source, str) and source.lstrip().startswith("<"):
         start = textwrap.shorten(source, 24, placeholder=" ...")
         raise ValueError(f"the model {start!r} is XML, not a file: pass mujoco.MjSpec.from_string(...)")
-    folder = Path()
-    if owner is not None:  # the path may be inherited from a class in another folder
-        owner = next((kind for kind in owner.__mro__ if "model" in vars(kind)), owner)
-    if owner is not None and (file := getattr(sys.modules.get(owner.__module__), "__file__", None)):
-        folder = Path(file).parent
+    folder = Path() if owner is None else declaring_folder(owner, "model")
     path = (folder / os.path.expanduser(source)).absolute()
     if path.is_file():
         return path

@@ -1,14 +1,13 @@
 """Declare the models of an object, of which each world holds one."""
 
 import dataclasses
-import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import mujoco
 
-from lyceum_warp.core.model_files import ModelFile, package_model
+from lyceum_warp.core.model_files import ModelFile, declaring_folder, package_model
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import check_word, described
 
@@ -124,9 +123,7 @@ class Objects:
             return None
         if isinstance(geom.file, ModelFile):
             return geom.file.path()
-        owner = next((kind for kind in owner.__mro__ if vars(kind).get("objects") is self), owner)
-        folder = Path(getattr(sys.modules.get(owner.__module__), "__file__", None) or "").parent
-        return (folder / Path(geom.file).expanduser()).absolute()
+        return (declaring_folder(owner, "objects") / Path(geom.file).expanduser()).absolute()
 
 
 MYOSUITE = (

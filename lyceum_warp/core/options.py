@@ -13,30 +13,18 @@ import mujoco
 
 from lyceum_warp.core.cameras import Camera, cameras_of
 from lyceum_warp.core.model_files import ModelSource
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
-from lyceum_warp.support.validate import (
-    check_flag,
-    check_kind,
-    check_word,
-    described,
-    finite_number,
-    positive_number,
-    whole_number,
-)
+from lyceum_warp.support.validate import Rule, check_fields, check_kind, described, positive_number, whole_number
 
-CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
-INTEGRATORS = {
-    "euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "rk4": mujoco.mjtIntegrator.mjINT_RK4,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
-}
-JACOBIANS = {
-    "dense": mujoco.mjtJacobian.mjJAC_DENSE, "sparse": mujoco.mjtJacobian.mjJAC_SPARSE,
-    "auto": mujoco.mjtJacobian.mjJAC_AUTO,
-}  # fmt: skip
+
+def _members(kind: Any, prefix: str, *names: str) -> dict[str, Any]:
+    """Look up members of MuJoCo's enumeration, by their names in lower case and without the prefix."""
+    return {name: getattr(kind, f"{prefix}_{name.upper()}") for name in names}
+
+
+CONES = _members(mujoco.mjtCone, "mjCONE", "pyramidal", "elliptic")
+INTEGRATORS = _members(mujoco.mjtIntegrator, "mjINT", "euler", "rk4", "implicit", "implicitfast", "discrete")
+JACOBIANS = _members(mujoco.mjtJacobian, "mjJAC", "dense", "sparse", "auto")
 SOLVER_LIMITS = {"iterations": 1, "ls_iterations": 1, "noslip_iterations": 0}
 """Limits that the option ``solver`` may set, each with its smallest value."""
 
@@ -52,9 +40,13 @@ def given_values(options: Any) -> dict[str, Any]:
     return {name: value for name, (value, default) in values.items() if value is not default and value != default}
 
 
-def _whole(options: Any, name: str, low: int) -> None:
-    if (value := getattr(options, name)) is not None:
-        object.__setattr__(options, name, whole_number(name, value, low=low))
+_PHYSICS_RULES: dict[str, Rule] = {
+    "base": "the name of one of the task's physics, as 'exact'", "frame_skip": 1, "nconmax": 1, "njmax": 1,
+    "impratio": 1e-15, "cone": list(CONES), "integrator": list(INTEGRATORS), "jacobian": list(JACOBIANS),
+}  # fmt: skip
+_ENV_RULES: dict[str, Rule] = {
+    "nworld": 1, "nthread": 0, "seed": 0, "first_world": 0, "horizon": 0, "device": "as 'cpu' or 'cuda:0'",
+}  # fmt: skip
 
 
 def _checked_limits(solver: Any) -> dict[str, int]:
@@ -66,7 +58,6 @@ def _checked_limits(solver: Any) -> dict[str, int]:
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PhysicsOptions:
     """Options of the simulation. None means the setting of the task or the model.
@@ -110,19 +101,9 @@ class PhysicsOptions:
     reproducible run takes 5 to 18 times the usual time and 5 to 7 times the usual memory."""
 
     def __post_init__(self) -> None:
-        check_kind("base", self.base, str | None, "the name of one of the task's physics, as 'exact'")
-        for name, low in (("frame_skip", 1), ("nconmax", 1), ("njmax", 1)):
-            _whole(self, name, low)
+        check_fields(self, _PHYSICS_RULES)
         if self.timestep is not None:
             object.__setattr__(self, "timestep", positive_number("timestep", self.timestep, "seconds"))
-        if self.impratio is not None:
-            object.__setattr__(self, "impratio", finite_number("impratio", self.impratio, low=1e-15))
-        for name, known in (("cone", CONES), ("integrator", INTEGRATORS), ("jacobian", JACOBIANS)):
-            if getattr(self, name) is not None:
-                check_word(name, getattr(self, name), list(known))
-        for name in ("discardvisual", "deterministic"):
-            if (flag := getattr(self, name)) is not None:
-                check_flag(name, flag)
         # runs of earlier releases have False instead of None; with a base, False overrides the base's value
         if self.base is None:
             object.__setattr__(self, "deterministic", self.deterministic or None)
@@ -144,7 +125,6 @@ class PhysicsOptions:
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class EnvOptions:
     """Options of an environment: number of worlds, device, engine, start and end of episodes.
@@ -199,24 +179,18 @@ class EnvOptions:
     model."""
 
     def __post_init__(self) -> None:
-        for name, low in (("nworld", 1), ("nthread", 0), ("seed", 0), ("first_world", 0), ("horizon", 0)):
-            _whole(self, name, low)
-        check_kind("device", self.device, str | None, "as 'cpu' or 'cuda:0'")
+        check_fields(self, _ENV_RULES)
         if not isinstance(self.engine, str) and not callable(self.engine):
             raise ValueError(f"engine must be 'auto', 'mujoco', 'warp' or a callable, not {described(self.engine)}")
         # if the model is an MjModel, binding the task raises a more specific error
         if self.model is not None and not isinstance(self.model, mujoco.MjModel):
             check_kind("model", self.model, ModelSource, "a file or an MjSpec")
         object.__setattr__(self, "physics", _physics(self.physics))
-        check_flag("autoreset", self.autoreset)
-        check_flag("fitted_draws", self.fitted_draws)
         check_kind("fitted", self.fitted, str | Path | None, "the folder of a fit")
         if self.fitted is not None:
             object.__setattr__(self, "fitted", str(Path(self.fitted).expanduser().absolute()))
         elif self.fitted_draws:
             raise ValueError("fitted_draws=True needs a fit: pass its folder as fitted=...")
-        check_flag("graphs", self.graphs)
-        check_flag("final_pictures", self.final_pictures)
         if self.objects is not None:
             object.__setattr__(self, "objects", _names("objects", self.objects, "objects", "mug"))
             if len(set(self.objects)) < max(1, len(self.objects)):

@@ -113,7 +113,7 @@ def picture_space(camera: Camera) -> Space:
     """Make the space of a camera's pictures, of shape (height, width, channels)."""
     channels, dtype, bounds = _PIXELS[camera.kind]
     shape = camera.height, camera.width, channels
-    low, high = (np.full(shape, bound) for bound in bounds)
+    low, high = (np.full(shape, bound, str(dtype).removeprefix("torch.")) for bound in bounds)
     return Space.of({camera.group: int(np.prod(shape))}, dtype=dtype, low=low, high=high, picture=shape)
 
 

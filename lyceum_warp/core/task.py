@@ -13,7 +13,6 @@ from lyceum_warp.core.cameras import Camera
 from lyceum_warp.core.gate import Gate
 from lyceum_warp.core.objects import Objects
 from lyceum_warp.core.options import PhysicsOptions
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.upstream import extend_structs
 
 extend_structs()
@@ -233,7 +232,6 @@ def from_model(function: Callable[[mujoco.MjModel, Any], Any]) -> Any:
     return FromModel(function)
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Planning:
     """Settings of a task for MPPI: settings of the planner, and options and parameters of its worlds.
@@ -256,7 +254,6 @@ class Planning:
                 raise ValueError(f"{field.name} of lw.Planning must be a dict, not {part!r}")
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Training:
     """A task's settings for ``lyceum-warp train``. Flags override them.
@@ -282,7 +279,6 @@ class Training:
             raise ValueError(f"settings of lw.Training must be a dict, not {self.settings!r}")
 
 
-@document_attributes
 class Task:
     """Base class of tasks: a model, the fields that functions read, and functions that run in each world.
 

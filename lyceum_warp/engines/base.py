@@ -14,10 +14,8 @@ from lyceum_warp.core.model_fields import ModelField
 from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels.state import narrow, widen
 from lyceum_warp.support.arrays import flat, launch_rows
-from lyceum_warp.support.docstrings import document_attributes
 
 
-@document_attributes
 class Engine(abc.ABC):
     """Many worlds of one model, stepped together.
 

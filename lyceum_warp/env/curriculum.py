@@ -6,13 +6,11 @@ from collections.abc import Mapping
 import torch
 
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 
 _WORLDS = 256
 """Largest number of worlds whose lasting memory is saved."""
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Curriculum:
     """How far curricula have come: the memory that all worlds share, and the lasting memory of some worlds.

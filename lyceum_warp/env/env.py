@@ -32,7 +32,6 @@ from lyceum_warp.graphs.compilation import compile_ahead
 from lyceum_warp.kernels import shared_memory, step_types
 from lyceum_warp.support.arrays import torch_view
 from lyceum_warp.support.collection import without_collection
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.forks import call_once_gone, leave_in_parent
 from lyceum_warp.support.suggestions import Named, did_you_mean
 from lyceum_warp.support.tensors import check_tensor
@@ -94,7 +93,6 @@ def make(  # noqa: D417
     return Env(task, EnvOptions().changed(options), params)
 
 
-@document_attributes
 class Env:
     """One task in many worlds. Every array is allocated once and shared with torch.
 

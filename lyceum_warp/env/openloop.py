@@ -22,11 +22,9 @@ from lyceum_warp.support.arrays import (
     with_memory,
     zeros_of,
 )
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, whole_number
 
 
-@document_attributes
 class OpenLoop:
     """Rolls out an environment's worlds from one or more states under given actions.
 

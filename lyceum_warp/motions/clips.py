@@ -12,7 +12,6 @@ import warp as wp
 
 from lyceum_warp.motions import checks, kinematics, rotations
 from lyceum_warp.motions.readers import READERS, Motion, read_motion
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.files import replaced
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.suggestions import did_you_mean
@@ -22,7 +21,6 @@ from lyceum_warp.support.warp_log import start_warp
 log = logging.getLogger(__name__)
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Clips:
     """Reference motions of one robot at one rate, for the parameter ``clips`` of a tracking task.

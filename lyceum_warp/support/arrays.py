@@ -1,13 +1,15 @@
 """View Warp arrays as other arrays or as torch tensors, and launch kernels over worlds."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
+
+from lyceum_warp.support.settings import temporarily
 
 WORLDS_A_BLOCK = 32
 """Threads in a CUDA block, for kernels with one thread per world. Larger blocks would leave most multiprocessors
@@ -74,14 +76,9 @@ _PART: ContextVar[tuple[int, int]] = ContextVar("_PART", default=(0, 1))
 """The part of the worlds to which launches are restricted: the index of the part, and the number of parts."""
 
 
-@contextlib.contextmanager
-def part_of_worlds(part: int, parts: int) -> Iterator[None]:
+def part_of_worlds(part: int, parts: int) -> contextlib.AbstractContextManager[None]:
     """Restrict the launches of this module to one of several equal parts of the worlds."""
-    token = _PART.set((part, parts))
-    try:
-        yield
-    finally:
-        _PART.reset(token)
+    return temporarily(_PART.set, (part, parts), _PART.get())
 
 
 def _launch(kernel: wp.Kernel, dim: Sequence[int], axis: int, args: Sequence[Any], device: Any, **options: Any) -> None:
@@ -96,14 +93,9 @@ _AS_ON_CUDA: ContextVar[bool] = ContextVar("_AS_ON_CUDA", default=False)
 """Whether to launch on the CPU with the block sizes of a CUDA device."""
 
 
-@contextlib.contextmanager
-def launches_as_on_cuda() -> Iterator[None]:
+def launches_as_on_cuda() -> contextlib.AbstractContextManager[None]:
     """Give the launches of this module the block sizes of a CUDA device, to list the modules that they need there."""
-    token = _AS_ON_CUDA.set(True)
-    try:
-        yield
-    finally:
-        _AS_ON_CUDA.reset(token)
+    return temporarily(_AS_ON_CUDA.set, True, _AS_ON_CUDA.get())
 
 
 def _on_cuda(device: wp.Device | None) -> bool:

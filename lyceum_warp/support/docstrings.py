@@ -61,6 +61,8 @@ def listed(docs: Mapping[str, str]) -> str:
 def document_attributes(cls: Class) -> Class:
     """Append the docstrings of attributes, including those of parent dataclasses, to a class's docstring."""
     documented: Any = cls
+    if isinstance(vars(cls).get("__doc__"), _Doc):
+        return cls
     doc = _Doc(cls.__doc__)
     documented.__doc__ = doc if type(cls) is type else doc.__get__(None, cls)  # pydoc reads __doc__ past a metaclass
     return cls

@@ -3,11 +3,15 @@
 import ast
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 from lyceum_warp.support.collection import without_collection
+from lyceum_warp.support.docstrings import document_attributes
+
+_documented: set[str] = set()
+"""Modules whose classes list their attributes in ``help()``."""
 
 
 def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
@@ -24,12 +28,22 @@ def face(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], l
         source, attribute = names[name]
         with without_collection():
             value = importlib.import_module(source)
+        _document({source for source, _ in names.values()} & sys.modules.keys() - _documented)
         if attribute is not None:
             value = getattr(value, attribute)
         setattr(module, name, value)
         return value
 
     return load, lambda: sorted({*vars(module), *names}), sorted(names)
+
+
+def _document(modules: Iterable[str]) -> None:
+    """Let ``help()`` list the attributes of the modules' classes, also of those that no public name refers to."""
+    for name in modules:
+        _documented.add(name)
+        for value in list(vars(sys.modules[name]).values()):
+            if isinstance(value, type) and value.__module__ == name:
+                document_attributes(value)
 
 
 def sources(package: str) -> dict[str, tuple[str, str | None]]:

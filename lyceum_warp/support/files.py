@@ -41,6 +41,12 @@ def replaced(path: Path, *, durable: bool = False, previous: Path | None = None)
             temporary.unlink(missing_ok=True)
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Write a text to a file atomically, in UTF-8 and without changes to its line ends."""
+    with replaced(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="")
+
+
 def unknown_format(path: Path, number: Any, known: int) -> ValueError:
     """Return the error for a file of an unknown format."""
     return ValueError(

@@ -1,11 +1,18 @@
 """Check values that users pass."""
 
 import contextlib
+import dataclasses
 import math
 import numbers
 import sys
-from collections.abc import Iterable, Sequence
-from typing import Any
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal, TypeAlias
+
+Rule: TypeAlias = float | tuple[float, float] | str | list[str]
+"""What a field must be besides its type: a number with a minimum, or with a minimum and a maximum, or one of the words
+in a list. A text describes strings."""
 
 
 def whole_number(name: str, value: Any, *, low: int, high: int = 2**31 - 1) -> int:
@@ -87,3 +94,42 @@ def finite_number(name: str, value: Any, *, low: float = -math.inf, high: float 
                 return number
     bounds = f" from {low:g} to {high:g}" if high < math.inf else f" of at least {low:g}" if low > -math.inf else ""
     raise ValueError(f"{name} must be a finite number{bounds}, not {value!r}")
+
+
+def check_fields(config: Any, rules: Mapping[str, Rule]) -> None:
+    """Check the fields of a frozen dataclass, and convert numbers to their annotated types.
+
+    The function checks fields with rules, bools, ``Literal``, widths of hidden layers (``tuple[int, ...]``) and names
+    of observation groups (``tuple[str, ...]``). None needs no check if the annotation allows it.
+
+    Raises:
+        ValueError: A value is of the wrong type, out of range or not finite.
+    """
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        kinds = (field.type, *typing.get_args(field.type))
+        if value is not None or types.NoneType not in kinds:
+            object.__setattr__(config, field.name, _checked(field.name, value, kinds, rules.get(field.name)))
+
+
+def _checked(name: str, value: Any, kinds: tuple[Any, ...], rule: Rule | None) -> Any:
+    if isinstance(rule, int | float | tuple):
+        low, high = rule if isinstance(rule, tuple) else (rule, math.inf)
+        if int in kinds:
+            return whole_number(name, value, low=int(low), high=int(min(high, 2**31 - 1)))
+        return finite_number(name, value, low=low, high=high)
+    if tuple[int, ...] in kinds:
+        return tuple(layer_sizes(value, name))
+    if tuple[str, ...] in kinds:
+        if not isinstance(value, list | tuple) or not all(isinstance(word, str) for word in value):
+            raise ValueError(f"{name} must be names of groups of observations, as in ('camera',), not {value!r}")
+        return tuple(value)
+    if bool in kinds:
+        check_flag(name, value)
+    if isinstance(rule, str):
+        check_kind(name, value, str, rule)
+    words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
+    words += rule if isinstance(rule, list) else []
+    if words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type) and kind is not str)):
+        check_word(name, value, words)
+    return value

@@ -32,10 +32,11 @@ def check_truncation(ctx: Context) -> None:
             ctx.equal(truncated, steps >= horizon, f"truncated after {steps.tolist()} steps of an episode")
             going, state = ~a.done & ctx.calm(a), a.get_state()
             # automatic resets change no value before a world's first episode ends
-            for name, obs in a.obs_groups.items():
+            for name in a.worlds.obs_spaces:  # without pictures, which are rendered only where an episode ends
                 final = a.final_obs_groups[name]
                 ctx.equal(final[alive], b.final_obs_groups[name][alive], f"the final group {name} without resets")
-                ctx.equal(final[going], obs[going], f"the final group {name} of worlds that go on")
+                ctx.equal(final[going], a.obs_groups[name][going], f"the final group {name} of worlds that go on")
+            for name, obs in a.obs_groups.items():
                 ctx.equal(a.get_obs(state, group=name), obs, f"get_obs of the group {name} after automatic resets")
             ctx.equal(a.reward[alive], b.reward[alive], "reward against the one without automatic resets")
             for name in ("terminated", "truncated"):

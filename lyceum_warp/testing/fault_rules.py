@@ -15,7 +15,7 @@ def _check_fault(ctx: Context, part: str, value: float) -> None:
     for action in ctx.actions(5):
         a.step(action)
         b.step(action)
-    good = {name: obs[bad].clone() for name, obs in a.obs_groups.items()}
+    good = {name: a.obs_groups[name][bad].clone() for name in a.worlds.obs_spaces}
     counts, actions = a.fault_counts, ctx.actions(SHORT, 1)
     for env in (a, b):
         env.action.copy_(actions[0])

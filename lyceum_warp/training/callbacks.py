@@ -7,8 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lyceum_warp.algos import Iteration, Learner, evaluation_seed, transfer
-from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz import CameraChoice, NamedProgress, check_video, find_camera, one_line, policy_video
@@ -16,7 +15,6 @@ from lyceum_warp.viz import CameraChoice, NamedProgress, check_video, find_camer
 log = logging.getLogger(__name__)
 
 
-@document_attributes
 class Callback:
     """Base class of callbacks for ``lw.train``. Every method is optional.
 
@@ -118,5 +116,4 @@ class TransferTest(Callback):
         except Exception as error:  # an error must not discard the training
             log.warning("no verdict on transfer (%s)", one_line(error))
             return
-        with replaced(run.transfer) as temporary:
-            temporary.write_text(json.dumps({"iteration": learner.iteration, **verdict.to_dict()}, indent=2))
+        replace_text(run.transfer, json.dumps({"iteration": learner.iteration, **verdict.to_dict()}, indent=2))

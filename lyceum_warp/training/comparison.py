@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval
 from lyceum_warp.support.mappings import differing, flat_settings
@@ -29,7 +28,6 @@ _POINTS, _RESAMPLES = 200, 1000
 _EVENTS = "events.out.tfevents.*"
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class RunCurve:
     """The learning curve of a run, and what the run is."""

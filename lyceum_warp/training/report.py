@@ -12,7 +12,7 @@ from typing import Any
 from lyceum_warp.algos import EXACT, evaluation_worlds
 from lyceum_warp.controllers import episode_env, load_episodes, policy_episodes
 from lyceum_warp.engines import options_on_cores
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.support.mappings import flat_settings
 from lyceum_warp.training.comparison import read_curve
 from lyceum_warp.training.curve import RETURNS, Panel, curve_panels, draw_panel
@@ -68,8 +68,7 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, episode: 
 def html_page(out: Path, title: str, parts: Iterable[str]) -> Path:
     """Write parts of HTML as a page in the style of reports."""
     page = Path(__file__).with_suffix(".html").read_text()
-    with replaced(out) as temporary:
-        temporary.write_text(page.replace("TITLE", html.escape(title)).replace("BODY", "\n".join(parts), 1))
+    replace_text(out, page.replace("TITLE", html.escape(title)).replace("BODY", "\n".join(parts), 1))
     return out
 
 

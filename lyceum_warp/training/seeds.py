@@ -11,14 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.interrupts import postponed
 from lyceum_warp.support.validate import whole_number
 
 _POLL = 0.2  # seconds
 
 
-@document_attributes
 @dataclasses.dataclass
 class SeedRun:
     """The run of one seed."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lyceum_warp.env import Env
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.versions import versions
 from lyceum_warp.training import json_value, task_copy
@@ -55,8 +55,7 @@ class RowFile:
         """Append a row to the file, and return it as read from JSON."""
         self._lines.append(json.dumps({**row, "identity": self.identity}))
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        with replaced(self.path) as temporary:
-            temporary.write_text("".join(f"{line}\n" for line in self._lines))
+        replace_text(self.path, "".join(f"{line}\n" for line in self._lines))
         stored: dict[str, Any] = json.loads(self._lines[-1])
         self._rows[_key(row["physics"])] = stored
         return stored

@@ -10,7 +10,6 @@ from lyceum_warp.algos import check_sizes
 from lyceum_warp.binding import file_name, find_task, task_name
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_word, whole_number
 from lyceum_warp.training import Configuration, Run, load
 from lyceum_warp.tuning.candidates import Setting, candidates, combined, flags, task_line
@@ -25,7 +24,6 @@ NWORLD, GPU_NWORLD = 256, 4096
 Row = dict[str, Any]
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class Tuning:
     """Results of ``tune``."""

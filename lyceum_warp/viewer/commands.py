@@ -159,6 +159,11 @@ def set_video(stage: Stage, camera: dict[str, Any] | None) -> None:
     stage.videos.end() if camera is None else stage.videos.begin(camera)
 
 
+def set_pictures(stage: Stage, shown: bool) -> None:
+    """Show or hide the pictures that a policy sees."""
+    stage.pictures.shown = shown
+
+
 def take_picture(stage: Stage, camera: dict[str, Any]) -> None:
     """Write a picture of the scene."""
     stage.videos.picture(camera, stage.frame(news=False))

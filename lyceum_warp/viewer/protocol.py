@@ -45,6 +45,8 @@ class Scene:
     """The names of the curves: "reward", "eval" and the task's metrics."""
     speeds: Velocity | None = None
     """The velocities of the driving keys, or None if the robot cannot be driven. Sliders reach twice these values."""
+    sees: bool = False
+    """Whether cameras render pictures for a policy."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +123,8 @@ class Status:
     """The first and the last step on the slider."""
     text: tuple[tuple[str, str], ...] = ()
     """Additional lines of the panel. Each is a name with a value."""
+    pictures: bool = False
+    """Whether the pictures for a policy are shown."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +149,8 @@ class Frame:
     """Messages about ended episodes, faults and refused commands."""
     files: tuple[str, ...] = ()
     """Absolute paths of new videos, pages and pictures to offer for download."""
+    pictures: tuple[tuple[str, str], ...] | None = None
+    """Captions and data URLs of new pictures for a policy, or None to keep the last ones."""
 
 
 # messages of the window, besides its commands

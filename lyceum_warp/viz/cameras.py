@@ -9,12 +9,10 @@ from typing import Any, TypeAlias
 import mujoco
 import numpy as np
 
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import positive_number
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FreeCamera:
     """A camera that looks at a point or follows a body. The defaults are those of MuJoCo's free camera."""

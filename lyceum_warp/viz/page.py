@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from lyceum_warp.env import Env
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.viz.cameras import CameraChoice, camera_values
 from lyceum_warp.viz.video import check_states
 
@@ -111,8 +111,7 @@ def write_states(
         "indices": _packed(indices),
     }  # fmt: skip
     text = Path(__file__).with_name("page.html").read_text().replace("TITLE", html.escape(title), 1)
-    with replaced(Path(out)) as temporary:
-        Path(temporary).write_text(text.replace("DATA", json.dumps(content), 1))
+    replace_text(Path(out), text.replace("DATA", json.dumps(content), 1))
     return Path(out)
 
 

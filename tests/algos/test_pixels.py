@@ -1,3 +1,4 @@
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import torch
 import lyceum_warp as lw
 from lyceum_warp.algos import Team
 from lyceum_warp.algos.common.pictures import Stack, shift_pictures
+from lyceum_warp.controllers import policy_episodes
 from lyceum_warp.training import Configuration
 
 SIDE = [lw.Camera("side", 16, 16)]
@@ -75,6 +77,24 @@ def test_a_student_learns_from_pictures_what_its_teacher_reads_from_the_state(sh
     learner = lw.Distill(env, config=config, teacher=Teacher())
     losses = [next(learner).loss for _ in range(30)]
     assert losses[-1] < 0.1 * losses[0]
+
+
+def test_a_student_learns_from_the_pictures_of_saved_episodes(shared_env) -> None:
+    env = shared_env("cartpole", nworld=16, cameras=SIDE, horizon=40, reset_cart=1.0)
+    episodes = list(policy_episodes(env.replicate(autoreset=False), lambda obs: obs[:, :1].clamp(-1, 1), 16, seed=1))
+    given = lw.Demonstrations(episodes)
+    assert torch.equal(given.obs_groups["camera"][40:80], episodes[1].pictures["camera"][:40])
+    stored = lw.Demonstrations.like(given.shape)
+    stored.load_state_dict(given.state_dict())
+    config = lw.DistillConfig(**SMALL | {"num_steps": 12, "learning_rate": 2e-3})
+    learner = lw.Distill(env, config=config, teacher=stored)
+    losses = [next(learner).loss for _ in range(30)]
+    assert losses[-1] < 0.1 * losses[0]
+    for unfit in ([dataclasses.replace(each, pictures={}) for each in episodes], [
+        dataclasses.replace(each, pictures={"camera": each.pictures["camera"][:, :8]}) for each in episodes
+    ]):  # fmt: skip
+        with pytest.raises(ValueError, match=r"demonstrations have no pictures 'camera' of the shape \(16, 16, 3\)"):
+            lw.Distill(env, config=config, teacher=lw.Demonstrations(unfit))
 
 
 def test_a_run_with_cameras_resumes_to_the_bit_and_its_policy_acts_elsewhere(env: lw.Env, tmp_path: Path) -> None:

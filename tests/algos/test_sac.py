@@ -229,7 +229,7 @@ def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
 def test_non_finite_update_ends_learning(env: lw.Env) -> None:
     sac = made(env, learning_rate=1e30)
     assert math.isnan(next(sac).critic_loss)  # the first iteration is a warm-up, without updates
-    with pytest.raises(FloatingPointError, match="the updates of iteration 2 are not finite: make learning_rate, or"):
+    with pytest.raises(FloatingPointError, match="the update of iteration 2 is not finite: make learning_rate, or"):
         next(sac)
 
 

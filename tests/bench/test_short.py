@@ -57,7 +57,11 @@ def objects(*results: Result) -> None:
 
 
 def pictures(*results: Result) -> None:
-    assert len(results) == 2 and all(result["frames_per_second"] > 0.0 for result in results)
+    assert all(result["frames_per_second"] > 0.0 for result in results[:2])
+    own, *rendered = results[2:]  # without OpenGL, nothing else is rendered
+    assert own["differing"] == 0.0 and len(own["returns"]) == 2
+    for result in rendered:
+        assert 0.0 < result["differing"] < 0.5 and min(result["returns"]) > 0.0
 
 
 def policies(result: Result) -> None:

@@ -11,9 +11,8 @@ import torch
 from training_runs import TINY, interrupted, refused
 
 import lyceum_warp as lw
-from lyceum_warp import Trajectory, cli
+from lyceum_warp import Trajectory, cli, controllers
 from lyceum_warp.binding import find_task
-from lyceum_warp.cli import plan as plan_command
 from lyceum_warp.cli.plan import Settings
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.training import Run
@@ -85,7 +84,7 @@ def measured_by(microseconds: float) -> Any:
 def test_flag_real_time_leaves_given_settings_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan_command, "planning_time", measured_by(30.0))
+    monkeypatch.setattr(controllers, "planning_time", measured_by(30.0))
     for flags, samples in ((["--horizon", "10"], 32), (["--samples", "8", "--horizon", "10"], 8)):
         out = tmp_path / str(samples)
         assert (
@@ -100,7 +99,7 @@ def test_flag_real_time_leaves_given_settings_unchanged(
 def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(plan_command, "planning_time", measured_by(250.0))
+    monkeypatch.setattr(controllers, "planning_time", measured_by(250.0))
     out = tmp_path / "run"
     argv = ["plan", "reach", "--out", str(out), "--steps", "3", "--knots", "4", "--real-time", "--no-video"]
     assert cli.main(argv) == 0
@@ -110,7 +109,7 @@ def test_flag_real_time_shortens_the_horizon_and_plans_less_often(
     settings = find_task("humanoid_stand").planning.settings
     half = settings["horizon"] // 2
     argv = ["plan", "humanoid_stand", "--out", str(tmp_path / "knots"), "--steps", "2", "--real-time", "--no-video"]
-    monkeypatch.setattr(plan_command, "planning_time", measured_by(9000 / (16 * half)))
+    monkeypatch.setattr(controllers, "planning_time", measured_by(9000 / (16 * half)))
     assert cli.main(argv) == 0
     planner = json.loads((tmp_path / "knots" / "config.json").read_text())["planner"]
     assert (planner["horizon"], planner["knots"], planner["timestep"]) == (half, settings["knots"] // 2, 0.015)

@@ -1,10 +1,13 @@
+import dataclasses
+from pathlib import Path
+
 import pytest
 import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.algos import evaluation_seed
-from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.controllers import Trajectory, control, episode_env, load_episodes, policy_episodes
 from lyceum_warp.core import Done
 
 
@@ -49,6 +52,36 @@ def test_an_episode_can_be_replayed_bit_for_bit(env: lw.Env) -> None:
         one.step(action[None])
         assert torch.equal(one.get_state()[0], episode.states[k + 1])
         assert one.reward.item() == episode.rewards[k]
+
+
+def test_episodes_hold_the_pictures_of_their_states(shared_env: SharedEnv, tmp_path: Path) -> None:
+    cameras = [lw.Camera("side", 16, 12), lw.Camera("above", 8, 8, "depth", "above/1", pos=(0, 0, 4), lookat=(0, 0, 1))]
+    env = shared_env("cartpole", nworld=2, autoreset=False, horizon=40, cameras=cameras)
+    _, episode = policy_episodes(env, lambda obs: torch.ones(2, 1), 2, seed=0)
+    assert {group: tuple(seen.shape) for group, seen in episode.pictures.items()} == {
+        "camera": (41, 12, 16, 3), "above/1": (41, 8, 8, 1),
+    }  # fmt: skip
+    loaded = Trajectory.load(episode.save(tmp_path / "episode.npz"))
+    one = episode_env(loaded)  # has the same cameras
+    for k in (0, 20, 40):
+        one.set_state(loaded.states[k : k + 1])
+        for group, seen in loaded.pictures.items():
+            assert torch.equal(seen[k], one.obs_groups[group][0]), (k, group)
+    assert not torch.equal(loaded.pictures["camera"][0], loaded.pictures["camera"][40])
+    controlled = control(one, lambda state, obs: torch.ones(1), steps=3, seed=0)
+    assert controlled.pictures["camera"].shape == (4, 12, 16, 3)
+    dataclasses.replace(episode, pictures={}).save(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match=r"other.npz has pictures \{\}, but .*episode.npz has .*'camera'"):
+        load_episodes(tmp_path)
+    episode.pictures["camera"] = episode.pictures["camera"][:-1]
+    with pytest.raises(ValueError, match="pictures 'camera' have the shape"):
+        Trajectory.load(episode.save(tmp_path / "short.npz"))
+
+
+def test_episodes_whose_pictures_do_not_fit_into_memory_are_refused(shared_env: SharedEnv) -> None:
+    env = shared_env("cartpole", nworld=2, autoreset=False, horizon=10**9, cameras=[lw.Camera("side", 16, 12)])
+    with pytest.raises(ValueError, match="2 worlds of 1000000000 steps with pictures need about 1.15e"):
+        next(policy_episodes(env, lambda obs: torch.ones(2, 1), 2))
 
 
 def test_episode_has_the_parameters_of_its_own_world() -> None:

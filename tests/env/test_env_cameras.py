@@ -9,6 +9,7 @@ import torch
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.cartpole import Cartpole
+from lyceum_warp.testing import CHECKS, check_task
 
 KINDS = [lw.Camera("side", 32, 24), lw.Camera("side", 32, 24, "depth", "depth"),
          lw.Camera("side", 32, 24, "segmentation", "ids")]  # fmt: skip
@@ -175,3 +176,9 @@ def test_learners_and_planners_without_encoders_refuse_cameras(shared_env) -> No
             kind(env)
     with pytest.raises(ValueError, match="cameras"):
         lw.MPPI("cartpole", cameras=SIDE)
+
+
+def test_a_task_with_cameras_follows_the_rules() -> None:
+    rules = [check for check in CHECKS if check.__name__ in ("check_truncation", "check_bad_state")]
+    report = check_task("cartpole", nworld=2, cameras=SIDE, checks=rules)
+    assert "truncation" in str(report)

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from lyceum_warp.env import Env, Player, Policy
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind
 
 NEEDED = ("clips", "ranges", "start_clip", "start_frame", "randomness", "height_limit", "tilt_limit")
@@ -18,7 +17,6 @@ HEIGHT, TILT = 0.25, 0.8
 """Errors of the base's height (m) and tilt at which a clip has failed (SuperMimic, appendix F)."""
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ClipResults:
     """Results of clips. Every tensor has the shape (clips,) and is on the CPU."""

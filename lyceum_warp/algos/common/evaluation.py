@@ -10,7 +10,6 @@ import torch
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env import Curriculum, Env, Player, Policy, start_episodes
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, described, whole_number
 
 _MEAN_SEED = 2**31 - 1
@@ -22,7 +21,6 @@ def evaluation_seed(seed: int) -> int:
     return whole_number("seed", seed, low=0) ^ 0x5A17C3E9
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class Episodes:
     """Results of finished episodes. Every tensor has the shape (episodes,) and is on the CPU."""

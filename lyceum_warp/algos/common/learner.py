@@ -13,7 +13,6 @@ from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.replay import Replay
 from lyceum_warp.env.env import Env
 from lyceum_warp.kernels import collect, returns
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_kind, whole_number
 
 LEARNER_KERNELS = (collect.store_steps, returns.advantages)
@@ -25,7 +24,6 @@ METRIC_COLUMN, STEP_METRIC_COLUMN = "metrics/", "step_metrics/"
 NESTED = ("metrics", "step_metrics", "numbers")
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Iteration:
     """Statistics of one iteration of a learner. Numbers that a learner does not report are None.
@@ -83,7 +81,6 @@ class Iteration:
         return row | {prefix + name: mean for prefix, means in columns for name, mean in means.items()}
 
 
-@document_attributes
 class Learner(abc.ABC):
     """Base class of learning algorithms; a learner is an infinite iterator of ``Iteration``.
 

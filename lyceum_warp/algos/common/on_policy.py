@@ -7,36 +7,25 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.common.distributed import Team
-from lyceum_warp.algos.common.evaluation import MeanPolicyEvaluation
 from lyceum_warp.algos.common.hyperparameters import PictureConfig
-from lyceum_warp.algos.common.learner import Learner
 from lyceum_warp.algos.common.networks import LIMIT, initialize_as_torch, trainable
-from lyceum_warp.algos.common.pictures import picture_settings, policy_inputs
+from lyceum_warp.algos.common.pictures import policy_inputs, policy_settings
 from lyceum_warp.algos.common.policy import GaussianPolicy
 from lyceum_warp.algos.common.policy_check import check_policy, check_value
 from lyceum_warp.algos.common.rollout_buffer import Rollout
+from lyceum_warp.algos.common.sampling import SamplingLearner
 from lyceum_warp.algos.common.value import ValueFunction, value_group
 from lyceum_warp.env.env import Env
 from lyceum_warp.kernels import returns
-from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.validate import check_kind
 
 
-@document_attributes
-class OnPolicyLearner(Learner):
+class OnPolicyLearner(SamplingLearner):
     """Base class of NPG and PPO, which learn a Gaussian policy and a value function from a rollout."""
 
-    config_type: ClassVar[type]
     twice: ClassVar[bool]
     """Whether the policy must be twice differentiable."""
     policy: GaussianPolicy
     value: ValueFunction
-    generator: torch.Generator
-    """Random generator of the noise."""
-    rollout: Rollout
-    """The samples of the last iteration."""
-    count: int
-    """Samples per iteration, over all processes."""
 
     def __init__(
         self,
@@ -48,14 +37,11 @@ class OnPolicyLearner(Learner):
         seed: int,
         team: Team | None,
     ) -> None:
-        kind = self.config_type
-        check_kind(f"config of {type(self).__name__}", config, kind | None, f"as lw.{kind.__name__}(hidden=(64, 64))")
-        super().__init__(env, seed=seed, team=team)
+        super().__init__(env, config, seed=seed, team=team)
         if value is not None:
             check_value(trainable(value), env, memory=not self.twice)
         if policy is not None:
             check_policy(trainable(policy), env, twice=self.twice)
-        self.config = config or kind()
 
     def _make_networks(
         self,
@@ -98,7 +84,6 @@ class OnPolicyLearner(Learner):
         self.rollout = Rollout(self.env, steps, groups=list(groups), first_only=first_only)
         self._advantage = torch.empty_like(self.rollout.reward)
         self._return = torch.empty_like(self.rollout.reward)
-        self._evaluate_mean = MeanPolicyEvaluation(self.env, self.config, self.team)
 
     def _estimate(
         self, reward: torch.Tensor, value: torch.Tensor, next_value: torch.Tensor
@@ -111,24 +96,10 @@ class OnPolicyLearner(Learner):
 
     def settings(self) -> dict[str, Any]:
         """Return the hyperparameters and the networks' sizes for a run's config.json."""
-        policy, value = self.policy.shape, self.value.shape
-        settings = {name: policy.get(name) for name in ("hidden", "activation", "normalize")}
-        settings |= picture_settings(self.policy)
-        settings |= {f"value_{name}": value[name] for name in ("hidden", "activation")}
+        value = self.value.shape
+        settings = policy_settings(self.policy) | {f"value_{name}": value[name] for name in ("hidden", "activation")}
         settings["time_orders"] = value["time_orders"]
-        settings["recurrent"] = policy.get("recurrent", None if "own" in policy else 0)
         if self.config.value_group is not None or value["group"] != value_group(self.env, None):
             settings["value_group"] = value["group"]
-        fields = {
-            name: number for name, number in settings.items() if number is not None and hasattr(self.config, name)
-        }
+        fields = {name: settings[name] for name in settings if hasattr(self.config, name)}
         return dataclasses.asdict(dataclasses.replace(self.config, **fields))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Copy the complete state; see ``Learner``."""
-        return super().state_dict() | {"returns": self.team.gather(self.rollout.running_return).clone()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Resume from a result of ``state_dict``; see ``Learner``."""
-        super().load_state_dict(state)
-        self.rollout.running_return.copy_(state["returns"][self.own_worlds])

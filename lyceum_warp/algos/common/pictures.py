@@ -41,10 +41,13 @@ def policy_inputs(env: Env, config: PictureConfig) -> tuple[int, dict[str, Any]]
     return env.obs_space.size if "policy" in groups else 0, {"pictures": pictures, **arguments}
 
 
-def picture_settings(policy: Any) -> dict[str, Any]:
-    """Get the fields of ``PictureConfig`` that a policy determines."""
-    settings = {name: policy.shape.get(name) for name in ("channels", "spatial_softmax", "frames")}
-    return settings | {"policy_groups": policy.groups if policy.pictures else None}
+def policy_settings(policy: Any) -> dict[str, Any]:
+    """Get the hyperparameters that a policy determines."""
+    names = ("hidden", "activation", "normalize", "recurrent", "channels", "spatial_softmax", "frames")
+    settings = {name: policy.shape[name] for name in names if name in policy.shape}
+    if policy.pictures:
+        settings["policy_groups"] = policy.groups
+    return settings if "own" in policy.shape else {"recurrent": 0, **settings}
 
 
 def shift_pictures(pictures: torch.Tensor, limit: int, generator: torch.Generator) -> None:

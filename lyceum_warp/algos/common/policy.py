@@ -13,13 +13,11 @@ from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memo
 from lyceum_warp.algos.common.pictures import PictureNetwork, picture_network
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import described, finite_number, layer_sizes, whole_number
 
 _LARGEST = torch.finfo(torch.float32).max
 
 
-@document_attributes
 class GaussianPolicy(Normalized):
     """Samples actions from N(mean(obs), exp(log_std)^2), where log_std does not depend on the observation.
 

@@ -17,6 +17,7 @@ from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.files import replaced
+from lyceum_warp.support.settings import temporarily
 from lyceum_warp.support.tensors import repeatable
 from lyceum_warp.support.validate import described, first_sentence
 
@@ -167,10 +168,5 @@ def check_export(path: Path) -> None:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    finally:
-        logger.setLevel(level)
+    with temporarily(logger.setLevel, logging.ERROR, logger.level), warnings.catch_warnings(action="ignore"):
+        yield

@@ -6,7 +6,6 @@ import torch
 
 from lyceum_warp.engines.memory import check_fit
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import free_memory
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
@@ -18,7 +17,6 @@ _TRANSITIONS, _STEPS = 1_000_000, 1_024
 _SHARE = 0.3
 
 
-@document_attributes
 class Transitions(NamedTuple):
     """Sampled transitions. A learner's target is ``reward + discount * value(next_obs)``."""
 
@@ -34,7 +32,6 @@ class Transitions(NamedTuple):
     """Observations of each group after the last step and before any reset."""
 
 
-@document_attributes
 class Replay:
     """Ring buffer of the transitions of every world, on the device of the environment's observations.
 

@@ -1,6 +1,6 @@
 """Store the samples of a fixed number of steps in a preallocated buffer."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -15,14 +15,12 @@ from lyceum_warp.env.env import Env
 from lyceum_warp.graphs.capture import Graphs, Phase
 from lyceum_warp.kernels import collect
 from lyceum_warp.support.arrays import torch_view, words
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_flag, check_group, check_kind, whole_number
 
 _Pair: TypeAlias = tuple[Any, wp.array]
 """An array of an environment, and the buffer that stores it for each step."""
 
 
-@document_attributes
 class Rollout:
     """Preallocated buffer that holds the samples from a fixed number of steps in every world.
 
@@ -156,16 +154,21 @@ class Rollout:
             policy: The policy.
             noise: Standard normal numbers, (steps, nworld, nact).
         """
-        env = self.env
+        rows = iter(noise)
+        self.fill(lambda: policy.sample(self.env.obs, next(rows), out=self.env.action))
+
+    def fill(self, act: Callable[[], object], observe: Callable[[], object] = lambda: None) -> None:
+        """Fill the buffer in ``steps`` steps. ``act`` writes their actions, and ``observe`` runs after each step."""
         self.begin()
-        for t in range(self.steps):
-            policy.sample(env.obs, noise[t], out=env.action)
+        for _ in range(self.steps):
+            act()
             self.store_inputs()
-            env.step()
+            self.env.step()
             self.store_outputs()
+            observe()
 
     def begin(self) -> None:
-        """Prepare the buffer for a caller that steps the environment itself, without ``collect``."""
+        """Prepare the buffer for a caller that steps the environment itself, without ``fill``."""
         self._index.zero_()
         self._fault.zero_()
 

@@ -10,10 +10,8 @@ import torch
 from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.learner import METRIC_COLUMN, NESTED, STEP_METRIC_COLUMN, Iteration
 from lyceum_warp.algos.common.rollout_buffer import Rollout
-from lyceum_warp.support.docstrings import document_attributes
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SampledIteration(Iteration):
     """Statistics of one iteration of NPG, PPO, SAC or Distill.
@@ -36,7 +34,6 @@ class SampledIteration(Iteration):
         return {name: getattr(self, name) for name in names} | super().row()
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class OnPolicyIteration(SampledIteration):
     """Statistics of one iteration of NPG or PPO."""

@@ -10,14 +10,12 @@ from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.algos.common.networks import LIMIT, Normalized, check_memory, initialize_as_torch, mlp
 from lyceum_warp.algos.common.symmetry import PolicyMirror
 from lyceum_warp.core.mirror import Reflection
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import layer_sizes, whole_number
 
 _LOWEST, _HIGHEST = -5.0, 2.0
 """Bounds of the logarithm of the standard deviations."""
 
 
-@document_attributes
 class SquashedPolicy(Normalized):
     """Samples bounded actions: low + (high - low) (1 + tanh(u)) / 2 with u from N(mean(obs), std(obs)^2).
 

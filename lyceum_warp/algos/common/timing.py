@@ -1,7 +1,6 @@
 """Measure the duration of an iteration's phases, and control torch's threads on the CPU."""
 
 import contextlib
-import itertools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -9,50 +8,51 @@ from typing import Any, TypeVar
 
 import torch
 
+from lyceum_warp.support.settings import temporarily
+
 Result = TypeVar("Result")
 
 
 class PhaseTimer:
-    """Measures the seconds between calls of ``mark``, starting at construction.
+    """Measures the seconds of an iteration's phases, the first of which starts at construction.
 
     On a GPU, ``mark`` does not wait for the device.
     """
 
     def __init__(self, device: torch.device) -> None:
         self.device, self.cuda = device, device.type == "cuda"
-        self._marks: list[Any] = []  # times, or CUDA events
-        self.mark()
+        self._phases: list[tuple[str, Any, Any]] = []  # with their first and last times, or CUDA events
+        self._last = self._now()
 
-    def mark(self) -> None:
-        """End one phase and start the next."""
-        if self.cuda:
-            event = torch.cuda.Event(enable_timing=True)
-            event.record(torch.cuda.current_stream(self.device))
-            self._marks.append(event)
-        else:
-            self._marks.append(time.perf_counter())
-
-    def seconds(self) -> list[float]:
-        """Return the durations of the phases in seconds, after waiting for the device."""
-        phases = itertools.pairwise(self._marks)
+    def _now(self) -> Any:
         if not self.cuda:
-            return [end - start for start, end in phases]
-        self._marks[-1].synchronize()
-        return [start.elapsed_time(end) * 1e-3 for start, end in phases]
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record(torch.cuda.current_stream(self.device))
+        return event
+
+    def mark(self, phase: str = "") -> None:
+        """End one phase and start the next. ``seconds`` omits phases without a name."""
+        start, self._last = self._last, self._now()
+        self._phases.append((phase, start, self._last))
+
+    def seconds(self) -> dict[str, float]:
+        """Return the total seconds of each phase ``x`` as ``time_x``, after waiting for the device."""
+        if self.cuda:
+            self._last.synchronize()
+        seconds = {f"time_{phase}": 0.0 for phase, _, _ in self._phases if phase}
+        for phase, start, end in self._phases:
+            if phase:
+                seconds[f"time_{phase}"] += start.elapsed_time(end) * 1e-3 if self.cuda else end - start
+        return seconds
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread() -> contextlib.AbstractContextManager[None]:
     """Limit torch to one CPU thread, for operations too small to parallelise.
 
     On a busy machine, torch's threads would spend more time waiting for each other than computing.
     """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+    return temporarily(torch.set_num_threads, 1, torch.get_num_threads())
 
 
 @contextlib.contextmanager

@@ -13,14 +13,12 @@ from lyceum_warp.algos.common.evaluation import Episodes, evaluate, evaluation_w
 from lyceum_warp.core.options import PhysicsOptions
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Curriculum, Env, Policy
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.intervals import clear_losses, mean_interval, share_interval
 from lyceum_warp.support.validate import check_kind, finite_number, whole_number
 
 EXACT = "exact"
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Difference:
     """A quantity's means in two simulations, and the difference of the means with a 95 % confidence interval."""
@@ -56,7 +54,6 @@ class Difference:
         return f"{self.quantity} {0.5 * (self.low + self.high):+.3g} ± {0.5 * (self.high - self.low):.2g}"
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Comparison:
     """Differences between two simulations of the same episodes.
@@ -85,7 +82,6 @@ class Comparison:
         return "different" if "different" in verdicts else "same" if verdicts == {"same"} else "not shown"
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Transfer:
     """The result of ``transfer``: whether a policy's results depend on the engine or on physics options."""

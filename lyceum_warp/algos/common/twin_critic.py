@@ -14,11 +14,9 @@ from torch import nn
 
 from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.algos.common.networks import ACTIVATIONS, LIMIT, Normalized, check_memory
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_word, layer_sizes, whole_number
 
 
-@document_attributes
 class TwinCritic(Normalized):
     """Two independent networks of the same shape, evaluated together.
 

@@ -10,11 +10,9 @@ from lyceum_warp.algos.common.distributed import Team
 from lyceum_warp.algos.common.hyperparameters import Activation
 from lyceum_warp.algos.common.networks import GRU, LIMIT, Normalized, check_memory, mlp, unrolled
 from lyceum_warp.env.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import check_group, check_kind, finite_number, layer_sizes, whole_number
 
 
-@document_attributes
 class ValueFunction(Normalized):
     """A network that predicts discounted returns.
 

@@ -8,16 +8,14 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 import torch
 
-from lyceum_warp.algos.common.hyperparameters import Bound, check_fields
 from lyceum_warp.algos.planning.updates import PlanUpdate
 from lyceum_warp.core.spaces import Space
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.suggestions import suggest_arguments
-from lyceum_warp.support.validate import check_word
+from lyceum_warp.support.validate import Rule, check_fields, check_word
 
 Numbers: TypeAlias = float | Sequence[float] | Sequence[Sequence[float]] | np.ndarray | torch.Tensor
 
-_BOUNDS: dict[str, Bound] = {
+_RULES: dict[str, Rule] = {
     "horizon": 1, "samples": 1, "models": 1, "iterations": (1, 100_000), "elites": 1, "knots": 1,
     "discount": (0.0, 1.0),
     # the smallest normal float32, because kernels compute in float32
@@ -26,7 +24,6 @@ _BOUNDS: dict[str, Bound] = {
 
 
 @suggest_arguments
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MPPIConfig:
     """Settings of the planners MPPI, CEM and predictive sampling. Arrays and tensors are converted to tuples of floats.
@@ -94,7 +91,7 @@ class MPPIConfig:
         if not isinstance(self.update, PlanUpdate):
             updates = ("mppi", "cem", "predictive_sampling")
             check_word("update", self.update, updates, ", or an object of a subclass of lw.PlanUpdate")
-        check_fields(self, _BOUNDS)
+        check_fields(self, _RULES)
         object.__setattr__(self, "noise", _noise(self.noise))
         object.__setattr__(self, "smoothing", _smoothing(self.smoothing))
         if not isinstance(self.fill, str) or self.fill not in ("zero", "repeat"):

@@ -13,10 +13,8 @@ import torch
 import warp as wp
 
 from lyceum_warp.kernels import planning
-from lyceum_warp.support.docstrings import document_attributes
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True)
 class PlanSamples:
     """The samples of one planning iteration.
@@ -48,7 +46,6 @@ class PlanSamples:
     set, ``weigh`` must write this tensor."""
 
 
-@document_attributes
 class PlanUpdate(abc.ABC):
     """Base class of updates that turn samples into the next plan, as in ``lw.Planner(task, update=MyUpdate(...))``.
 

@@ -212,6 +212,6 @@ class Reorient(rotating.Rotate):
     cleared = ("actuator_force",)
     training = lw.Training(
         algorithm="ppo",
-        iterations=600,
+        iterations=1200,
         settings={"log_std": -0.7, "entropy_coef": 0.001},
     )

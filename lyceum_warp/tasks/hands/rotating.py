@@ -247,7 +247,7 @@ class Rotate(lw.Task):
     )
     training = lw.Training(
         algorithm="ppo",
-        iterations=300,
+        iterations=600,
         settings={"gamma": 0.97, "log_std": -0.7, "entropy_coef": 0.001},
     )
 

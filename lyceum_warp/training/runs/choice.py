@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from lyceum_warp.algos import evaluate, simulation
 from lyceum_warp.env import Env
-from lyceum_warp.support.files import replaced
+from lyceum_warp.support.files import replace_text
 from lyceum_warp.training.runs.checkpoints import read_checkpoint
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum
 
@@ -85,8 +85,8 @@ def choose_policy(
         entries = {which: dataclasses.asdict(score) for which, score in scores.items()}
         content = {"episodes": EPISODES, "seed": seed, "simulation": simulation(env), "policies": entries}
         content["line"] = f"{_choice(scores).text}, on the {content['simulation']}"
-        with contextlib.suppress(OSError), replaced(run.evaluation) as temporary:  # the folder may be read-only
-            temporary.write_text(json.dumps(content, indent=2))
+        with contextlib.suppress(OSError):  # the folder may be read-only
+            replace_text(run.evaluation, json.dumps(content, indent=2))
     return _choice(scores)
 
 

@@ -16,7 +16,6 @@ from lyceum_warp.binding import class_in_file, class_sources, made_in_file, spel
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
-from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.machine import cpu_cores
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.training.runs.checkpoints import network_of, read_checkpoint
@@ -84,7 +83,6 @@ def describe(learner: Learner) -> dict[str, Any]:
     }
 
 
-@document_attributes
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Configuration:
     """Configuration of a run: the task, the environment's options, and the algorithm with its hyperparameters."""

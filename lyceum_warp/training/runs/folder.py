@@ -15,8 +15,7 @@ from torch import nn
 from lyceum_warp.algos import GaussianPolicy
 from lyceum_warp.binding import file_name, made_in_file
 from lyceum_warp.env import Curriculum
-from lyceum_warp.support.docstrings import document_attributes
-from lyceum_warp.support.files import replaced, unknown_format
+from lyceum_warp.support.files import replace_text, replaced, unknown_format
 from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.support.versions import versions
@@ -54,7 +53,6 @@ _ENTRIES: dict[str, Any] = {
 log = logging.getLogger(__name__)
 
 
-@document_attributes
 class Run:
     """The folder of a training run."""
 
@@ -212,8 +210,7 @@ class Run:
     def amend(self, **changes: Any) -> None:
         """Change entries of the configuration, in memory and in the file."""
         self.config = {**self.config, **changes}
-        with replaced(self.folder / CONFIG) as temporary:
-            temporary.write_text(json.dumps(self.config, indent=2))
+        replace_text(self.folder / CONFIG, json.dumps(self.config, indent=2))
 
     def note_settings(self, error: Exception) -> None:
         """Add the path of ``config.json`` to an error that one of its settings may have caused."""
@@ -268,8 +265,7 @@ class Run:
         with self.metrics.open(newline="") as file:
             lines = [line for line in file if line.strip()]
         if len(lines) > count + 1:
-            with replaced(self.metrics) as temporary:
-                temporary.write_text("".join(lines[: count + 1]), newline="")
+            replace_text(self.metrics, "".join(lines[: count + 1]))
 
     # policies
 

@@ -26,6 +26,7 @@ from lyceum_warp.viewer.session.live_settings import (
     rebuilt_planner,
     task_numbers,
 )
+from lyceum_warp.viewer.session.pictures import PictureMaker
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
 from lyceum_warp.viewer.session.videos import VideoTaker
@@ -71,9 +72,11 @@ class Stage:
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics), speeds=self.driving.limits,
+            sees=bool(env.task.cameras),
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
+        self.pictures = PictureMaker({camera.group: camera for camera in env.task.cameras})
         self.steps = 0
         self.progress: deque[tuple[float, int]] = deque(maxlen=64)
         self.select(modes[0], next(iter(self.controllers), None))
@@ -265,8 +268,16 @@ class Stage:
         if news:
             files = tuple(str(file.absolute()) for file in self.videos.files)
             self.videos.files.clear()
-            frame = dataclasses.replace(frame, files=files, **self.frames.news())
+            pictures = self.pictures.due(self._picture)
+            frame = dataclasses.replace(frame, files=files, pictures=pictures, **self.frames.news())
         return frame
+
+    def _picture(self, group: str) -> torch.Tensor:
+        """Return the picture of a group of observations in the displayed state, (height, width, channels)."""
+        if self.mode != "playback":
+            return self.live.env.obs_groups[group][self.live.world]
+        states = torch.as_tensor(self.playback.state).expand(self.env.nworld, -1).to(self.env.obs.device)
+        return self.env.get_obs(states.contiguous(), group=group)[0]
 
     def _traces(self) -> Traces | None:
         """Return the newest traces and request new ones, unless traces are off."""
@@ -292,6 +303,7 @@ class Stage:
             episode=self.playback.index if self.mode == "playback" else None, paused=self.paused, speed=self.speed,
             measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
             ghosts=self.frames.ghosts, driven=self.driving.velocity is not None,
+            pictures=self.pictures.shown,
             planner=planner_numbers(getattr(self.control, "controller", None)), params=task_numbers(self.env),
             plan_ms=1000 * self.control.seconds if self.control else math.nan, **fields,
         )  # fmt: skip

@@ -139,6 +139,9 @@ class Actions:
             toggles["ghosts"] = ghosts.worlds > 0, lambda: self.set_ghosts(worlds=0 if ghosts.worlds else most)
         if self.status.planner:
             toggles["plan"] = ghosts.plan, lambda: self.set_ghosts(plan=not ghosts.plan)
+        if self.scene.sees:
+            shown = self.status.pictures
+            toggles["pictures"] = shown, lambda: self.do(commands.set_pictures, not shown)
         return toggles
 
     def toggle_video(self) -> None:
@@ -189,12 +192,15 @@ ACTIONS = {
 }
 """The actions by their keys. Browsers pass all of these keys on to the page."""
 
-OTHER_KEYS = (
-    ("0 to 5", "groups of geoms, with Shift groups of sites"),
-    ("letters", "MuJoCo's flags, such as T transparent, C contacts, F forces, J joints, M centre of mass"),
+MOUSE = (
     ("left, right button", "drag to rotate or move the camera; the wheel zooms"),
     ("double-click left", "choose a body"),
     ("Ctrl + right, left button", "drag to push or twist that body; while paused, to place or turn it"),
     ("double-click right", "look at a point, with Ctrl follow the body"),
 )
-"""The keys and mouse actions that studio handles."""
+OTHER_KEYS = (
+    ("0 to 5", "groups of geoms, with Shift groups of sites"),
+    ("letters", "MuJoCo's flags, such as T transparent, C contacts, F forces, J joints, M centre of mass"),
+)
+HELP = (*MOUSE, *((key, action.what) for key, action in ACTIONS.items()), *OTHER_KEYS)
+"""What the mouse and all keys do. Studio handles the mouse and ``OTHER_KEYS``."""

@@ -1,5 +1,5 @@
 // Adapts studio's page: adds the secret path to its absolute paths, gives control to the visible tab, shows links to new
-// files, and sends a gamepad's axes.
+// files and what a policy sees, and sends a gamepad's axes.
 {
   const path = location.pathname;
   const below = (address) => {
@@ -27,9 +27,10 @@
         if (typeof event.data !== "string") return;
         if (visible() && event.data.includes("role=spectator;queue_pos=0")) say("request_control");
         const [kind, text] = event.data.split(/=(.*)/s);
-        if (kind !== "saved" && kind !== "copy") return;
+        if (kind !== "saved" && kind !== "copy" && kind !== "pictures") return;
         event.stopImmediatePropagation();
-        if (kind === "saved") offer("\u2b07 " + text, {href: "saved/" + text, download: text});
+        if (kind === "pictures") show(JSON.parse(text));
+        else if (kind === "saved") offer("\u2b07 " + text, {href: "saved/" + text, download: text});
         else offer("copy: " + text, {href: "#", onclick: () => navigator.clipboard.writeText(text) && false});
       });
     }
@@ -43,6 +44,21 @@
     link.style = "display:block;color:#06c";
     box.append(link);
     while (box.children.length > 4) box.firstChild.remove();
+  };
+
+  // what a policy sees
+  const show = (pictures) => {
+    const box = document.getElementById("pictures") ?? document.body.appendChild(document.createElement("div"));
+    box.id = "pictures";
+    box.style = "position:fixed;top:60px;left:50%;transform:translateX(-50%);display:flex;gap:8px;pointer-events:none";
+    box.replaceChildren(...pictures.map(([caption, src]) => {
+      const figure = document.createElement("figure");
+      figure.style = "margin:0;padding:4px;width:min-content;background:#fffd;color:#000;font:12px sans-serif";
+      const style = "display:block;height:min(20vh,160px);image-rendering:pixelated";
+      const image = Object.assign(new Image(), {src, style});
+      figure.append(image, caption);
+      return figure;
+    }));
   };
 
   // a gamepad's left stick moves a walking robot, and its right stick turns it

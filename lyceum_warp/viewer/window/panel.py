@@ -1,5 +1,6 @@
 """Connect studio with the session: show frames, and send the user's commands."""
 
+import json
 import time
 
 import mujoco
@@ -122,6 +123,8 @@ class Panel(studio.Plugin):  # type: ignore[misc]  # studio has no types
             self._server.offer(file)
         if frame.messages:
             self.actions.say(*frame.messages)
+        if frame.pictures is not None:
+            self._server.tell(f"pictures={json.dumps(frame.pictures)}")
         # if the state is not finite, keep the previous pose; the session reports the fault
         if np.isfinite(frame.state).all():
             mujoco.mj_setState(model, data, frame.state, mujoco.mjtState.mjSTATE_INTEGRATION)

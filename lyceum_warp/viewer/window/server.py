@@ -33,8 +33,8 @@ from websockets.http11 import Request, Response
 
 FIRST_PORT, PORTS = 8080, 20
 """By default, these ports are tried before any free port."""
-HEAD_SECONDS = 10.0
-"""Timeout in seconds for a request's headers."""
+RESPONSE_SECONDS = 300.0
+"""Timeout in seconds for a request and its response. Models with many meshes have tens of megabytes."""
 PING_SECONDS = 30.0
 """Seconds between pings, which detect a lost browser."""
 MESSAGE_BYTES = 2**20
@@ -189,8 +189,8 @@ class PageServer:
 
         options |= {
             "sock": self._sockets[0], "create_connection": Tab, "process_request": answer,
-            "process_response": self._completed, "max_size": MESSAGE_BYTES, "open_timeout": HEAD_SECONDS,
-            "close_timeout": HEAD_SECONDS, "ping_interval": PING_SECONDS, "ping_timeout": PING_SECONDS,
+            "process_response": self._completed, "max_size": MESSAGE_BYTES, "open_timeout": RESPONSE_SECONDS,
+            "close_timeout": RESPONSE_SECONDS, "ping_interval": PING_SECONDS, "ping_timeout": PING_SECONDS,
             "logger": logging.Logger("viewer", logging.CRITICAL),  # do not log malformed requests
             "compression": "deflate",  # windows with changed numbers shrink to a sixth
         }  # fmt: skip
@@ -217,7 +217,7 @@ class PageServer:
             response.body = page.replace("<head>", f'<head><script src="{SCRIPT.name}"></script>', 1).encode()
         if response.body:
             if "gzip" in request.headers.get("Accept-Encoding", ""):
-                response.body = await asyncio.to_thread(gzip.compress, response.body, 4)
+                response.body = await asyncio.to_thread(gzip.compress, response.body, 1)
                 headers["Content-Encoding"] = "gzip"
             headers.pop("Content-Length", None)
             headers["Content-Length"] = str(len(response.body))

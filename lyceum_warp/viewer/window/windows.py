@@ -2,14 +2,14 @@
 
 import textwrap
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from lyceum_warp.viewer import commands
 from lyceum_warp.viewer.protocol import BEST_COLOUR, MAX_POINTS, MOST_BURST, MOST_GHOSTS, TRACE_COLOUR, Frame, Owner
-from lyceum_warp.viewer.window.actions import ACTIONS, OTHER_KEYS, SPEEDS, Actions
+from lyceum_warp.viewer.window.actions import ACTIONS, HELP, SPEEDS, Actions
 from lyceum_warp.viewer.window.studio import imgui, implot, ux
 
 PLOT_POINTS = 120
@@ -119,9 +119,7 @@ class Windows:
             if colour is not None:
                 imgui.ColorButton(f"##{text}", imgui.Vec4(*colour[:3], 1.0), 0, imgui.Vec2(14, 14))
                 imgui.SameLine()
-            # ImGui would break lines within words
-            columns = int(len(text) * (room - 40) / max(imgui.CalcTextSize(text).x, 1.0))
-            imgui.TextUnformatted(textwrap.fill(text, max(columns, 20)))
+            imgui.TextUnformatted(wrapped(text, room - 40))
         imgui.End()
 
     def _window(
@@ -440,7 +438,7 @@ class Windows:
             self._actions.do(commands.perturb, forces, qpos=viewer.data.qpos.copy())
 
     def _help(self) -> None:
-        two_columns("##keys", [*((key, action.what) for key, action in ACTIONS.items()), *OTHER_KEYS])
+        two_columns("##keys", HELP)
 
 
 # helpers
@@ -464,14 +462,20 @@ def highlighted_button(label: str, on: bool) -> bool:
     return bool(pressed)
 
 
-def two_columns(label: str, rows: list[tuple[str, str]]) -> None:
+def wrapped(text: str, room: float) -> str:
+    """Wrap a text to a width in pixels. ImGui would break lines within words."""
+    columns = int(len(text) * room / max(imgui.CalcTextSize(text).x, 1.0))
+    return textwrap.fill(text, max(columns, 20))
+
+
+def two_columns(label: str, rows: Sequence[tuple[str, str]]) -> None:
     """Show names and values in two columns."""
     if imgui.BeginTable(label, 2):
         for name, value in rows:
             imgui.TableNextColumn()
             imgui.TextDisabled(name)
             imgui.TableNextColumn()
-            imgui.TextWrapped(value)
+            imgui.TextUnformatted(wrapped(value, imgui.GetContentRegionAvail().x - 20))
         imgui.EndTable()
 
 

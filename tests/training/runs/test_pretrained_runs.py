@@ -48,7 +48,7 @@ def test_pretrained_policies_are_small_and_contain_no_code() -> None:
         content = torch.load(folder / "policy.pt", weights_only=True)
         assert content.keys() == {"lyceum_warp", "iteration", "policy"}
         assert lw.load(folder).training is False
-    assert size < 5e6
+    assert size < 8e6  # the wheel stays below 10 MB
 
 
 def test_task_name_in_place_of_a_run_names_the_pretrained_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

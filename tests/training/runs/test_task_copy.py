@@ -263,6 +263,7 @@ def reading(folder: Path) -> Path:
     (mine / "slide_data.py").write_text(
         "import os\n\nwith open(os.path.join(os.path.dirname(__file__), 'offset.csv')) as file:\n"
         "    OFFSET = float(file.read())\n"
+        "if os.path.exists('/proc/meminfo'):\n    open('/proc/meminfo').close()\n"  # a file of the kernel is no data
     )
     (mine / "clips").mkdir()
     np.save(mine / "clips" / "scale.npy", 2.0)

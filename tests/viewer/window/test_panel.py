@@ -13,6 +13,7 @@ from lyceum_warp.viewer.commands import (
     set_ghosts,
     set_mode,
     set_paused,
+    set_pictures,
     set_speed,
     set_video,
     set_watched,
@@ -21,7 +22,7 @@ from lyceum_warp.viewer.commands import (
 )
 from lyceum_warp.viewer.protocol import Arrow, Frame, Ghost, Ghosts, Opened
 from lyceum_warp.viewer.window import panel, studio
-from lyceum_warp.viewer.window.actions import ACTIONS
+from lyceum_warp.viewer.window.actions import ACTIONS, HELP, MOUSE
 from lyceum_warp.viewer.window.studio import imgui
 from lyceum_warp.viewer.window.windows import WINDOWS, legend
 
@@ -78,6 +79,18 @@ def test_panel_draws_ghosts_and_traces(bench: Bench) -> None:
     assert len(bench.viewer.extra_geoms) == 9
 
 
+def test_button_asks_for_the_pictures_of_cameras_and_the_page_gets_them(bench: Bench) -> None:
+    bench.show(status_of())
+    assert "pictures" not in bench.panel.actions.toggles()
+    seeing = Bench(bench.model, scene_of(bench.model, sees=True))
+    seeing.show(status_of(pictures=False))
+    seeing.panel.actions.toggles()["pictures"][1]()
+    assert seeing.sent == [command(set_pictures, True)]
+    seeing.draw(frame_of(seeing.model, seeing.data, status_of(pictures=True), pictures=(("camera", "data:,1"),)))
+    seeing.draw(frame_of(seeing.model, seeing.data, status_of(pictures=True)))
+    assert seeing.told == ['pictures=[["camera", "data:,1"]]']
+
+
 # keys
 
 
@@ -107,6 +120,25 @@ def test_every_key_is_accepted_in_every_mode(bench: Bench, mode: str) -> None:
     for name in ACTIONS:
         pressed(bench, name, mode=mode)
         bench.draw()
+
+
+def test_table_of_keys_begins_with_the_mouse_and_breaks_lines_between_words(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cells: list[str] = []
+
+    def write(text: str) -> None:
+        assert imgui.CalcTextSize(text).x <= imgui.GetContentRegionAvail().x
+        cells.append(text)
+
+    bench.panel.actions.windows = {"keys"}
+    bench.show(status_of())
+    monkeypatch.setattr(imgui, "TextUnformatted", write)
+    bench.draw()
+    texts = [" ".join(cell.split("\n")) for cell in cells]
+    first = texts.index(MOUSE[0][1])
+    assert texts[first : first + len(HELP)] == [what for _, what in HELP]
+    assert any("\n" in cell for cell in cells)
 
 
 # cameras and videos
