@@ -113,7 +113,9 @@ def learning_curve(run: str | Path | Run) -> Path:
         ImportError: matplotlib is not installed.
     """
     run = run if isinstance(run, Run) else Run.open(run)
-    first, *others = [panel for panel in curve_panels(run) if panel.group != LEARNING]
+    panels = curve_panels(run)
+    # a student that was not evaluated has learning signals only
+    first, *others = [panel for panel in panels if panel.group != LEARNING] or panels
     columns = min(4, max(1, len(others)))
     height = 1 + math.ceil(len(others) / columns) if others else 1
     figure = new_figure("a learning curve", 7.5 if columns < 4 else 10.0, 3.0 + 1.8 * (height - 1))

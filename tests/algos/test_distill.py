@@ -133,6 +133,9 @@ def test_run_imitates_the_episodes_of_a_file(tmp_path: Path, capsys: pytest.Capt
         episode.save(tmp_path / "episodes" / f"{number}.npz")
     words = ["train", "point_mass", "--horizon", "8", *TINY, "--demonstrations", str(tmp_path / "episodes")]
     assert cli.main([*words, "--iterations", "2", "--out", str(tmp_path / "run")]) == 0
+    # without an evaluation, the curve shows the loss
+    assert cli.main([*words, "--mean-every", "0", "--iterations", "1", "--out", str(tmp_path / "short"), "--plot"]) == 0
+    assert (tmp_path / "short" / "curve.png").exists()
     shutil.rmtree(tmp_path / "episodes")
     assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "3", *QUIET]) == 0
     assert len(metrics(tmp_path / "run")) == 3 and "loss" in capsys.readouterr().out
