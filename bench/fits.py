@@ -132,7 +132,7 @@ def cases(options: Options) -> list[Case]:
     )
     seconds, count, plants = (3.0, 1, 1) if options.short else (options.seconds, options.robots, PLANTS)
     training = (2, 32, 4) if options.short else (options.iterations, options.nworld, options.episodes)
-    found = [
+    every = [
         Case(part, robot, kind(seed), contestant, seed, seconds)
         for part in parts if part in ("hanging", "ground")
         for robot in robots if part == "hanging" or robot == "go1"
@@ -145,7 +145,7 @@ def cases(options: Options) -> list[Case]:
         Case("policies", "go1", kind(seed) if policy == "fit" else "all", policy, seed, min(seconds, 15.0), training)
         for policy in POLICIES if "policies" in parts for seed in range(plants if policy == "fit" else 1)
     ]  # fmt: skip
-    return [case for case in found if case.contestant in options.contestants or not options.contestants]
+    return [case for case in every if case.contestant in options.contestants or not options.contestants]
 
 
 class Plant:
@@ -299,16 +299,21 @@ def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, 
     feet = task_spec(find_task("go1_velocity")).geom("FR_foot").friction
     same = dict(zip(("sliding_friction", "spinning_friction", "rolling_friction"), ([f, f] for f in feet), strict=True))
     known: dict[str, Any] = {"trunk_offset": [0.0, 0.0, 0.0]}
-    given: dict[str, Any] = {"fit": known, "wide": {}, "nominal": known | same | {"encoder_bias": 0.0}}
+    params_of: dict[str, Any] = {"fit": known, "wide": {}, "nominal": known | same | {"encoder_bias": 0.0}}
     began = time.perf_counter()
     if case.contestant == "fit":
         plant = Plant("go1", case.seed, ground=True, kind=case.plant)
         folder = options.fits / f"go1-{case.seed}"
         lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **settings)
-        given["fit"] = known | {"fitted": folder, "fitted_draws": True}
+        params_of["fit"] = known | {"fitted": folder, "fitted_draws": True}
     fitted = time.perf_counter()
     env = lw.make(
-        "go1_velocity", nworld=nworld, device=options.device, physics="coarse", seed=case.seed, **given[case.contestant]
+        "go1_velocity",
+        nworld=nworld,
+        device=options.device,
+        physics="coarse",
+        seed=case.seed,
+        **params_of[case.contestant],
     )
     learner = lw.PPO(env, config=lw.PPOConfig(symmetry="exact", mean_every=0), seed=case.seed)
     while learner.iteration < iterations:
@@ -359,7 +364,7 @@ def wrong_logs() -> dict[str, str]:
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    found = []
+    listed = []
     for part, robot, title in (
         ("hanging", "go1", "Go1s that hang in a frame: 30 parameters. " + SECONDS),
         ("hanging", "g1", "G1s that hang in a frame: 30 parameters. " + SECONDS),
@@ -370,13 +375,13 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         header = ["plant", "robot", "fitted by", "log, s", "seconds", "CPU s", "largest error", "median error",
                   "below 2 %", "determined to 2 %", "of these below 2 %", "undetermined", "median half width",
                   "covered", "held out, nominal", "fitted"]  # fmt: skip
-        found += [Table(title, header, [line(row.case, row.result) for row in chosen])] if chosen else []
+        listed += [Table(title, header, [line(row.case, row.result) for row in chosen])] if chosen else []
     lines = [[row.case["plant"], *(f"{1e3 * row.result['errors'][name]:.2f}" for name in ("ideal", "delayed"))]
              for row in rows if row.case["part"] == "actuators"]  # fmt: skip
     title = "Errors of joint positions in windows held back, in mrad (noise: 2): a log of an actuator in two models."
-    found += [Table(title, ["log", "model without delay", "with delay"], lines)] if lines else []
+    listed += [Table(title, ["log", "model without delay", "with delay"], lines)] if lines else []
     answers = [list(pair) for row in rows if row.case["part"] == "wrong" for pair in row.result["answers"].items()]
-    found += [Table("Answers to wrong logs.", ["log", "answer"], answers)] if answers else []
+    listed += [Table("Answers to wrong logs.", ["log", "answer"], answers)] if answers else []
     lines = policy_lines([row for row in rows if row.case["part"] == "policies"])
     title = (
         "Policies on hidden Go1s, with noise and pushes. They learned from draws around the fit of the same Go1, from "
@@ -385,7 +390,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     )
     header = ["plant", "robot", "learned from", "velocity error, m/s", "difference", "falls", "difference",
               "training, s"]  # fmt: skip
-    return [*found, *([Table(title, header, lines)] if lines else [])]
+    return [*listed, *([Table(title, header, lines)] if lines else [])]
 
 
 def line(case: dict[str, Any], result: dict[str, Any]) -> list[str]:

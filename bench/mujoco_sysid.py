@@ -66,13 +66,13 @@ def fit(
         return np.clip((state[:, 1 : 1 + len(noise)] - measured.data[1:]) / noise, -1e4, 1e4), measured, measured
 
     def residual(x: np.ndarray, params: Any) -> tuple[list[np.ndarray], None, None]:
-        found, _, _ = sysid.model_residual(
+        residuals, _, _ = sysid.model_residual(
             x, params, lambda params: bound.model(params.as_vector()), starts, errors, rolled, threads,
             resample_true=False,
         )  # fmt: skip
         if x.ndim == 2:  # one column for each roll-out of each hypothesis
-            found = found.reshape(-1, x.shape[1], len(starts)).transpose(2, 0, 1).reshape(-1, x.shape[1])
-        return [np.nan_to_num(found, nan=1e4)], None, None
+            residuals = residuals.reshape(-1, x.shape[1], len(starts)).transpose(2, 0, 1).reshape(-1, x.shape[1])
+        return [np.nan_to_num(residuals, nan=1e4)], None, None
 
     params = sysid.ParameterDict()
     low, high = np.maximum(bound.low, -WIDEST), np.minimum(bound.high, WIDEST)

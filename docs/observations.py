@@ -54,18 +54,18 @@ def sources(name: str) -> Sources:
             kinds[first + i] = "m"
             names[first + i] += f", {axis}"
             names[first + 3 + i] += f", about {axis}"
-    found: Sources = {}
+    indexed: Sources = {}
     for group in env.task.layouts.obs:
         obs = env.get_obs(group=group)
         slopes = (obs[1:] - obs[:1]).double().numpy() / STEP
         changed = np.abs(slopes) > 1e-3
-        found[group] = {}
+        indexed[group] = {}
         for index in np.flatnonzero(changed.sum(axis=0) == 1):
             row = int(changed[:, index].argmax())
             unit = kinds[row % nv] + ("/s" if row >= nv else "")
             is_value = abs(abs(slopes[row, index]) - 1) < 1e-2
-            found[group][str(index)] = [names[row % nv], unit if is_value else ""]
-    return found
+            indexed[group][str(index)] = [names[row % nv], unit if is_value else ""]
+    return indexed
 
 
 if __name__ == "__main__":

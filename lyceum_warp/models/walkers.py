@@ -108,7 +108,7 @@ def home_height(model: mujoco.MjModel, p: Any) -> float:
 
 
 def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Add the ranges of commands to ``servo_metadata``, for ``lw.Task.deployment`` of velocity tasks.
+    """Add the ranges of commands to ``base_metadata``, for ``lw.Task.deployment`` of velocity tasks.
 
     The ranges cover the curriculum's stages that training has reached.
     """
@@ -121,20 +121,15 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
         "lateral_velocity": [-lateral, lateral],
         "yaw_rate": [-yaw, yaw],
     }
-    return clock | servo_metadata(model, p) | {"commands": commands}
+    return clock | base_metadata(model, p) | {"commands": commands}
 
 
 def servo_metadata(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
-    """Collect the names, gains and poses that a robot needs to run a policy. Lists are in the order of ``joints``.
-
-    A robot with the parameter ``imu`` has a floating base.
-    """
+    """Collect the names, gains and poses that a robot needs to run a policy. Lists are in the order of ``joints``."""
     actuators = servos(model, p)
     # the joint's own damping adds to the servo's damping
     damping = model.dof_damping[joint_dof(model, p)].reshape(len(actuators), -1)[:, 0]
-    imu = {"base": model.body(base(model)).name, "velocimeter": np.asarray(p.imu).tolist()} if hasattr(p, "imu") else {}
     return {
-        **imu,  # the velocimeter's position on the base, in m
         "joints": [model.joint(joint).name for joint in p.joints],
         "default_pose": np.asarray(p.default_pose).tolist(),
         "action_scale": np.asarray(p.action_scale).tolist(),
@@ -142,6 +137,12 @@ def servo_metadata(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
         "damping": (damping - model.actuator_biasprm[actuators, 2]).tolist(),
         "force_limit": force_limits(model, p).tolist(),
     }
+
+
+def base_metadata(model: mujoco.MjModel, p: Any) -> dict[str, Any]:
+    """Add the floating base, and the velocimeter's position on it, in m, to ``servo_metadata``."""
+    base_and_imu = {"base": model.body(base(model)).name, "velocimeter": np.asarray(p.imu).tolist()}
+    return base_and_imu | servo_metadata(model, p)
 
 
 def mirror(model: mujoco.MjModel, p: Any) -> Mirror:

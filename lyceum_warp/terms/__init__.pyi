@@ -67,6 +67,7 @@ from lyceum_warp.terms.joints import (
     joint_velocity_l2 as joint_velocity_l2,
     pose as pose,
     pose_l1 as pose_l1,
+    pose_l2 as pose_l2,
     posture as posture,
     power as power,
     sum_squares_at as sum_squares_at,

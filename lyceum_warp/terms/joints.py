@@ -75,6 +75,16 @@ def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[
 
 
 @wp.func
+def pose_l2(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]) -> float:
+    """Return the sum of (q - q_0)^2 over the joints, rad^2."""
+    total = float(0.0)
+    for j in range(joint_qpos.shape[0]):
+        error = qpos[joint_qpos[j]] - default_pose[j]
+        total += error * error
+    return total
+
+
+@wp.func
 def joint_limits(
     qpos: Row[float], joint_qpos: wp.array[int], jnt_range: Row[wp.vec2], joints: wp.array[int], soft_limit: float
 ) -> float:

@@ -1,6 +1,8 @@
 """Compare the LEAP hand's tasks with MuJoCo Playground's formulas, computed anew from MuJoCo's own quantities."""
 
+import functools
 import itertools
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -9,7 +11,7 @@ import torch
 from conftest import SharedEnv
 
 import lyceum_warp as lw
-from lyceum_warp.tasks.hands.leap import LeapReorient
+from lyceum_warp.tasks.hands import gates
 from lyceum_warp.testing import check_task
 from lyceum_warp.testing.fault_rules import check_bad_state
 
@@ -73,8 +75,8 @@ def test_reorientation_rewards_equal_playgrounds_formulas(
         }
         for name, value in expected.items():
             assert env.metrics[name].item() == pytest.approx(params["dt"] * value, abs=2e-5), name
-        energy = (env.field("qvel")[0, :16] * env.field("actuator_force")[0]).abs().sum().item()
-        assert env.metrics["energy"].item() == pytest.approx(-1e-4 * params["dt"] * energy, abs=1e-6)
+        power = (env.field("qvel")[0, :16] * env.field("qfrc_actuator")[0, :16]).abs().sum().item()
+        assert env.metrics["absolute_power"].item() == pytest.approx(-1e-4 * params["dt"] * power, abs=1e-6)
 
 
 def test_reorientation_observes_the_object_relative_to_the_goal(
@@ -162,11 +164,20 @@ def test_worlds_differ_in_friction_gains_and_mass(shared_env: SharedEnv) -> None
     assert torch.allclose(gain, -bias) and ((gain > 2.39) & (gain < 3.61)).all()
 
 
-def test_gate_counts_goals_and_drops() -> None:
-    gate, env = LeapReorient.gate, lw.make("leap_reorient", engine="mujoco")
-    assert gate is not None
-    verdict = lw.gate(env, lambda obs: torch.zeros(len(obs), 16), quick=True)
-    assert verdict.numbers["first"] < 1.0 and not verdict.passed
+def test_gate_counts_goals_and_drops(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, number in {"WORLDS": 2, "STEPS": 20, "PART": 5}.items():
+        monkeypatch.setattr(gates, name, number)
+
+    def numbers(**params: Any) -> dict[str, float]:
+        gate = gates.Turns("success", "goals", least=1.0, drops=1.0, **params)
+        worlds = functools.partial(lw.make, "leap_reorient", engine="mujoco", horizon=0)
+        first, last = gate.measure(lambda n, **own: worlds(nworld=n, **own), lambda obs: torch.zeros(len(obs), 16))
+        return first | last
+
+    # every orientation counts as the goal, or every height as a drop
+    assert numbers(goal_angle=[3.2, 3.2]) == {"first": 5.0, "success": 20.0, "drops": 0.0}
+    dropped = numbers(goal_angle=[1e-6, 1e-6], drop_height=1.0)
+    assert dropped["success"] == 0.0 and dropped["drops"] == pytest.approx(3600.0 / 0.05)
 
 
 def test_hand_holds_other_objects(shared_env: SharedEnv) -> None:

@@ -164,6 +164,7 @@ FORMULAS: dict[str, Callable[..., Any]] = {
         gait_std(command, standing_pose_std, walking_pose_std, running_pose_std, least_command, running_command),
     ),
     "pose_l1": lambda qpos, joint_qpos, default_pose: total(np.abs(qpos[:, joint_qpos] - default_pose)),
+    "pose_l2": lambda qpos, joint_qpos, default_pose: total((qpos[:, joint_qpos] - default_pose) ** 2),
     "joint_limits": limits,
     "sum_squares_at": lambda row, indices: total(row[:, indices] ** 2),
     "joint_velocity_l2": lambda qvel, joint_dof: total(qvel[:, joint_dof] ** 2),

@@ -12,7 +12,7 @@ import warp as wp
 
 import lyceum_warp as lw
 from lyceum_warp import Row, terms
-from lyceum_warp.terms import alive, base_height, gravity, joint_velocity_l2, too_low  # noqa: F401
+from lyceum_warp.terms import alive, base_height, gravity, joint_velocity_l2, pose_l2, too_low  # noqa: F401
 
 
 @wp.struct
@@ -85,15 +85,6 @@ def capture_l2(velocity: wp.vec2, s1: World, p: Params) -> float:
     line = wp.vec2(b[0] - a[0], b[1] - a[1])
     share = wp.clamp(wp.dot(point, line) / (wp.length_sq(line) + 1e-6), 0.2, 0.8)
     return wp.min(wp.length_sq(point - share * line), 1.0)
-
-
-@wp.func
-def pose_l2(s1: World, p: Params) -> float:
-    total = float(0.0)
-    for j in range(p.joint_qpos.shape[0]):
-        error = s1.qpos[p.joint_qpos[j]] - p.default_pose[j]
-        total += error * error
-    return total
 
 
 @wp.func

@@ -25,7 +25,7 @@ class Turns(lw.Gate):
         self.metric, self.params = metric, params
         self.limits = {
             "drops": lw.Limit("drops per hour", high=drops),
-            "first": lw.Limit(f"{text} in the first 10 s", low=0.2 * 0.5 * least),
+            "first": lw.Limit(f"{text} in the first 10 s", low=0.1 * least),
             metric: lw.Limit(f"{text} in 50 s", low=least),
         }
 

@@ -10,11 +10,12 @@ import lyceum_warp as lw
 from lyceum_warp import Row, terms
 from lyceum_warp.tasks.hands import gates, rotating
 from lyceum_warp.tasks.hands.rotating import position, put_axes, rotation
+from lyceum_warp.terms import absolute_power, pose_l2  # noqa: F401
 
 
 @wp.struct
 class World(rotating.World):
-    actuator_force: Row[float]
+    qfrc_actuator: Row[float]
     mocap_quat: Row[lw.quat]
     target: Row[float] = lw.memory("joints")  # of the servos, rad
     goal_spin: Row[wp.vec3] = lw.memory()  # angular velocity of the goal in its own axes, rad/s
@@ -160,27 +161,10 @@ def goals(s: World, p: Params) -> float:
 
 
 @wp.func
-def pose_l2(s: World, p: Params) -> float:
-    total = float(0.0)
-    for j in range(p.joints.shape[0]):
-        error = s.qpos[p.joint_qpos[j]] - p.default_pose[j]
-        total += error * error
-    return total
-
-
-@wp.func
 def action_rate(s0: World, action: Row[float]) -> float:
     return terms.action_rate_l2(action, s0.last_action) + terms.action_acceleration_l2(
         action, s0.last_action, s0.previous_action
     )
-
-
-@wp.func
-def energy(s: World, p: Params) -> float:  # W
-    total = float(0.0)
-    for j in range(p.joints.shape[0]):
-        total += wp.abs(s.qvel[p.joint_dof[j]] * s.actuator_force[p.servos[j]])
-    return total
 
 
 @wp.func
@@ -201,7 +185,7 @@ class Reorient(rotating.Rotate):
         "drop": -10.0,
         "pose_l2": -0.05,
         "action_rate": -1e-4,
-        "energy": -1e-4,
+        "absolute_power": -1e-4,
         "excess_l2": -0.1,
     }
     metrics = ("success",)
@@ -209,7 +193,7 @@ class Reorient(rotating.Rotate):
         settings={"horizon": 12, "samples": 128, "temperature": 0.05, "noise": 0.3},
         params={"goal_angle": [0.1, 0.1], "drop": -2000.0, "centred": 2.0},
     )
-    cleared = ("actuator_force",)
+    cleared = ("qfrc_actuator",)
     training = lw.Training(
         algorithm="ppo",
         iterations=1200,

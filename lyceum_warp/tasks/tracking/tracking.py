@@ -580,7 +580,7 @@ def prepare(
 
 def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Collect what a robot needs to follow a clip, or a stream of reference frames."""
-    return walkers.servo_metadata(model, p) | {
+    return walkers.base_metadata(model, p) | {
         "reference_share": float(p.reference_share),
         "anchor": model.body(p.bodies[0]).name,
         "bodies": [model.body(body).name for body in p.bodies],
