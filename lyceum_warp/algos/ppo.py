@@ -19,7 +19,7 @@ from lyceum_warp.algos.common.adam import Adam
 from lyceum_warp.algos.common.distributed import Branch, Captured, Team
 from lyceum_warp.algos.common.hyperparameters import GROUP, PICTURE_RULES, Activation, PictureConfig
 from lyceum_warp.algos.common.minibatches import Minibatches, Samples, precision
-from lyceum_warp.algos.common.networks import LIMIT, MLP
+from lyceum_warp.algos.common.networks import LIMIT, MLP, OUTLIER
 from lyceum_warp.algos.common.on_policy import OnPolicyLearner
 from lyceum_warp.algos.common.pictures import PictureNetwork, shift_pictures
 from lyceum_warp.algos.common.policy import GaussianPolicy, divergence, log_density
@@ -230,7 +230,7 @@ class PPO(OnPolicyLearner):
         config, team, device = self.config, self.team, env.obs.device
         steps, nworld = config.num_steps, env.nworld * team.size
         # with a last layer near zero, as in NPG, the adaptive learning rate would be much too high at first
-        limit = math.inf if config.normalize else LIMIT
+        limit = OUTLIER if config.normalize else LIMIT  # float16 overflows in a layer from about 1,000 deviations
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._recurrent = self.policy.state_size + self.value.state_size > 0
         if self._recurrent and config.symmetry != "none":

@@ -99,6 +99,15 @@ def test_every_step_updates_the_statistics_of_observations(env: lw.Env) -> None:
     torch.testing.assert_close(1.0 / normalizer.scale.double(), seen.std((0, 1), correction=0) + 0.01)
 
 
+def test_networks_do_not_see_how_absurd_an_observation_is(env: lw.Env) -> None:
+    ppo = made(env)
+    next(ppo)
+    obs = torch.tensor([[1e4], [1e9]])
+    assert ppo.policy(obs)[0].equal(ppo.policy(obs)[1])
+    both = ppo.value.normalizer(obs.repeat(1, 2))
+    assert both[0].equal(both[1])
+
+
 @pytest.mark.parametrize("changes, rate", [
     ({"desired_kl": 1e-9}, 1e-5), ({"desired_kl": 1e6}, 1e-2), ({"schedule": "fixed", "desired_kl": 1e-9}, 1e-3),
 ])  # fmt: skip

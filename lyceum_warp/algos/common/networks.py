@@ -144,7 +144,7 @@ def initialize_as_torch(network: nn.Module, generator: torch.Generator | None) -
 
 LIMIT = 10.0
 
-_OUTLIER = 100.0
+OUTLIER = 100.0
 """Limit of observations in updates of a normaliser, in standard deviations from the mean of all earlier observations.
 Values rarer than 1 in 10,000 (the square) thus hardly change the standard deviation; more frequent values do."""
 
@@ -162,7 +162,7 @@ class Normalizer(nn.Module):
     """Normalises observations by their running mean and variance, and clips them to [-limit, limit].
 
     Before the first update, observations are not scaled. Outliers, such as the absurd observation of a single world,
-    hardly change mean and variance (see ``_OUTLIER``).
+    hardly change mean and variance (see ``OUTLIER``).
     """
 
     count: torch.Tensor
@@ -213,7 +213,7 @@ class Normalizer(nn.Module):
             high = team.sum(ordered[last - trimmed].clone()) / team.size
             count = torch.full_like(count, len(obs))
             mean, square = (low + high) / 2.0, count * ((high - low) / 4.0).square()
-        reach = _OUTLIER * ((square + _PRIOR) * (1.0 / (count + _PRIOR))).sqrt()
+        reach = OUTLIER * ((square + _PRIOR) * (1.0 / (count + _PRIOR))).sqrt()
         return mean - reach, mean + reach
 
     def _load_from_state_dict(self, *args: Any) -> None:
