@@ -42,8 +42,7 @@ def learner_classes(algorithm: str) -> tuple[Any, Any]:
     if algorithm in ALGORITHMS:
         return ALGORITHMS[algorithm]
     if ".py:" not in algorithm:
-        names = ", ".join(ALGORITHMS)
-        raise ValueError(f"there is no algorithm {algorithm!r}: use {names}, or --algorithm path/to/file.py:Class")
+        raise ValueError(f"there is no algorithm {algorithm!r}: use {', '.join(ALGORITHMS)} or path/to/file.py:Class")
     kind = class_in_file(algorithm, Learner)
     hint = typing.get_type_hints(kind.__init__).get("config")
     return kind, next(filter(dataclasses.is_dataclass, (hint, *typing.get_args(hint))), None)
