@@ -82,8 +82,8 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         ImportError: pandas or pyarrow is not installed.
     """
     first, folder = _first(episodes), Path(folder)
-    for group, rows in first.pictures.items():
-        if rows.dtype != torch.uint8:
+    for group, pictures in first.pictures.items():
+        if pictures.dtype != torch.uint8:
             raise ValueError(
                 f"LeRobot's images are colours, unlike the pictures {group!r}: omit them, as in "
                 "[dataclasses.replace(episode, pictures={}) for episode in episodes]"
@@ -106,33 +106,28 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     }  # fmt: skip
     observed = [f"{part}_{k}" for part, (start, stop) in first.obs_parts.items() for k in range(stop - start)]
     names = {"observation.state": observed, "action": list(first.action_names)}
-    info: dict[str, Any] = {
+    for group in first.pictures:
+        columns[name := f"observation.images.{group}"] = np.concatenate([e.pictures[group][:-1] for e in episodes])
+        names[name] = ["height", "width", "channels"]
+    features, stats, frames = {}, {}, {}
+    for name, rows in columns.items():
+        picture = rows.ndim == 4
+        kind, axes, shape = ("image", (0, 1, 2), (3, 1, 1)) if picture else (str(rows.dtype), 0, (-1,))
+        features[name] = {"dtype": kind, "shape": [*rows.shape[1:]] or [1], "names": names.get(name)}
+        stats[name] = {
+            key: (getattr(rows, key)(axis=axes) / (255 if picture else 1)).reshape(shape).tolist()
+            for key in ("min", "max", "mean", "std")
+        } | {"count": [len(rows)]}
+        # LeRobot reads columns of the shape [1] as numbers
+        cells = [{"bytes": png(each), "path": None} for each in rows] if picture else rows
+        frames[name] = list(rows[:, 0] if rows.shape[1:] == (1,) else cells)
+    info = {
         "codebase_version": "v3.0", "robot_type": first.task, "total_episodes": len(episodes),
         "total_frames": len(frame), "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200, "fps": round(rate) if abs(rate - round(rate)) < 1e-6 else rate,
-        "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": None,
-        "features": {
-            name: {"dtype": str(rows.dtype), "shape": [*rows.shape[1:]] or [1], "names": names.get(name)}
-            for name, rows in columns.items()
-        },
+        "splits": {"train": f"0:{len(episodes)}"}, "features": features, "video_path": None,
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
     }  # fmt: skip
-    stats = {
-        name: {key: np.atleast_1d(getattr(rows, key)(axis=0)).tolist() for key in ("min", "max", "mean", "std")}
-        | {"count": [len(rows)]}
-        for name, rows in columns.items()
-    }
-    images: dict[str, list[Any]] = {}
-    for group, rows in first.pictures.items():
-        pictures = np.concatenate([episode.pictures[group][:-1].numpy() for episode in episodes])
-        images[name := f"observation.images.{group}"] = [{"bytes": png(each), "path": None} for each in pictures]
-        info["features"][name] = {
-            "dtype": "image", "shape": [*rows.shape[1:]], "names": ["height", "width", "channels"],
-        }  # fmt: skip
-        stats[name] = {"count": [len(pictures)]} | {
-            key: (getattr(pictures, key)(axis=(0, 1, 2)) / 255).reshape(3, 1, 1).tolist()
-            for key in ("min", "max", "mean", "std")
-        }
     words = instruction or first.task
     table = pandas.DataFrame({
         "episode_index": range(len(episodes)), "tasks": [[words]] * len(episodes), "length": lengths,
@@ -142,9 +137,7 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
     folder.mkdir(parents=True)
     for file in (_DATA, _EPISODES):
         (folder / file).parent.mkdir(parents=True)
-    # LeRobot reads columns of the shape [1] as numbers
-    frames = {name: list(rows[:, 0] if rows.shape[1:] == (1,) else rows) for name, rows in columns.items()}
-    pandas.DataFrame(frames | images).to_parquet(folder / _DATA)
+    pandas.DataFrame(frames).to_parquet(folder / _DATA)
     table.to_parquet(folder / _EPISODES)
     pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")
     for file, content in (("info.json", info), ("stats.json", stats)):

@@ -52,15 +52,14 @@ def print_groups(groups: "list[training.RunGroup]") -> None:
     for group in groups:
         summary, known = group.summary(), [run for run in group.runs if len(run.returns)]
         samples = sorted({run.samples[-1] for run in known})
-        tested = [run.gate for run in group.runs if run.gate]
-        passed = sum(text.startswith("passed") for text in tested)
+        tested = [run.gate.startswith("passed") for run in group.runs if run.gate]
         rows.append({
             "task": group.task, "settings": group.label, "runs": str(len(group.runs)),
             "samples": " to ".join(f"{number:,.0f}" for number in (*samples[:1], *samples[1:][-1:])),
             "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in known})),
             "final return\n[95 %, t]": _interval(summary, "mean"),
             "interquartile mean\n[95 %, bootstrap]": _interval(summary, "interquartile_mean"),
-            "gate": f"{passed} of {len(tested)} passed" if tested else "",
+            "gate": f"{sum(tested)} of {len(tested)} passed" if tested else "",
             "transfer": "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
         })  # fmt: skip
     columns = {name: [row[name] for row in rows] for name in rows[0]}
@@ -68,20 +67,18 @@ def print_groups(groups: "list[training.RunGroup]") -> None:
 
 
 def _interval(summary: dict[str, Any], name: str) -> str:
-    if name not in summary:
-        return ""
-    interval = [f"{end:.5g}" for end in summary.get(f"{name}_interval", ())]
-    return f"{summary[name]:.5g}" + (f" [{', '.join(interval)}]" if interval else "")
+    ends = ", ".join(f"{end:.5g}" for end in summary.get(f"{name}_interval", ()))
+    return (f"{summary[name]:.5g}" if name in summary else "") + (f" [{ends}]" if ends else "")
 
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:
     """Print the settings and the versions in which groups differ, one group a column."""
-    entries = []
-    for settings, versions in ((group.runs[0].settings, group.runs[0].versions) for group in groups):
+    entries = {}
+    for k, group in enumerate(groups, 1):
+        settings, versions = group.runs[0].settings, group.runs[0].versions
         # without prefixes, a hyperparameter of two algorithms is in one row
-        own = f"{settings['algorithm']}."
-        entries.append({**{name.removeprefix(own): value for name, value in settings.items()}, **versions})
-    if names := differing(entries):
-        cells = [[str(each.get(name, "")) for name in names] for each in entries]
-        headings = [f"{k}: {group.label}" for k, group in enumerate(groups, 1)]
-        console.print(table({"difference": names, **dict(zip(headings, cells, strict=True))}))
+        own = {name.removeprefix(f"{settings['algorithm']}."): value for name, value in settings.items()}
+        entries[f"{k}: {group.label}"] = {**own, **versions}
+    if names := differing([*entries.values()]):
+        cells = {heading: [str(each.get(name, "")) for name in names] for heading, each in entries.items()}
+        console.print(table({"difference": names, **cells}))

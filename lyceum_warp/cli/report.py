@@ -24,9 +24,7 @@ class Report:
     """The folder of a training run, or of a planner's episodes."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """The file; by default report.html in the folder."""
-    episode: bool = True
-    """Whether to play an episode of the last policy for the page."""
 
     def run(self) -> None:
-        path = training.write_report(self.folder, self.out, episode=self.episode)
+        path = training.write_report(self.folder, self.out)
         say_entries(report=path, next="open the file in a browser, or send it: it needs no other file")

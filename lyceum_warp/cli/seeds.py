@@ -1,7 +1,7 @@
 """Show the runs of several seeds while they train, and summarise them: lyceum-warp train --seeds."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,9 @@ _NUMBERS = {"iteration": ",.0f", "samples": ",.0f", "return_mean": ".5g", "mean_
 """Columns of metrics.csv whose last values the table shows, with their formats."""
 
 
-def train_and_show(task: str, folder: Path, seeds: Sequence[int], jobs: int, settings: Mapping[str, Any]) -> int:
+def train_and_show(task: str, folder: Path, seeds: int | Sequence[int], jobs: int, settings: dict[str, Any]) -> int:
     """Train several seeds, and print a summary. The exit code is 1 if a run has failed."""
-    say(f"{task}: seeds {', '.join(map(str, seeds))} in {folder}, each with a log; if interrupted, the same command "
-        f"with --out {folder} continues them")  # fmt: skip
+    say(f"{task}: runs in {folder}, each with a log; if interrupted, the same command with --out {folder} continues")
     with Live(console=console, refresh_per_second=2) as live:
         runs = training.train_seeds(
             task, folder, seeds, jobs=jobs, watch=lambda runs: live.update(_progress(runs)), **settings

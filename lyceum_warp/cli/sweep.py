@@ -2,11 +2,12 @@
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import tomllib
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,9 +16,10 @@ import tyro
 from lyceum_warp import binding, training, viz
 from lyceum_warp.cli.display import say, say_entries
 from lyceum_warp.cli.parsing import parse
+from lyceum_warp.cli.train import Train
 from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.interrupts import Interrupted
-from lyceum_warp.support.validate import check_kind, whole_number
+from lyceum_warp.support.validate import check_kind
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -45,7 +47,7 @@ class Sweep:
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The TOML file. Its optional keys: objective ("return", the default; "gate", the seconds of training until a
-    policy passes; or path/to/file.py:function of a lw.Run), direction, storage (a URL of Optuna; by default an SQLite
+    policy passes; or path/to/file.py:function of a lw.Run), direction, storage (a database's URL; by default an SQLite
     file in out), sampler and pruner (names of Optuna's classes), and heartbeat (60 seconds)."""
 
     def run(self) -> None:
@@ -55,22 +57,24 @@ class Sweep:
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)  # heartbeats are experimental
-        search = read_search(self.file)
-        out, done = Path(search.out), (TrialState.COMPLETE, TrialState.PRUNED)
+        done = (TrialState.COMPLETE, TrialState.PRUNED)
         try:
-            objective = _objective(search)
+            search = Search(**tomllib.loads(self.file.read_text()))
             check_search(search)
             study = _study(search, self.file.stem)
             if len(study.get_trials(deepcopy=False, states=done)) < search.trials:
                 enough = optuna.study.MaxTrialsCallback(search.trials, states=done)
-                study.optimize(objective, callbacks=[_say_trial, enough])
+                study.optimize(functools.partial(_objective, search), callbacks=[_say_trial, enough])
+            if not study.get_trials(deepcopy=False, states=done[:1]):
+                raise ValueError("all trials were pruned: none has passed the gate, or all have diverged")
             best = study.best_trial
         except Exception as error:  # Optuna and databases raise many types of errors
-            raise ValueError(f"{self.file}: {viz.one_line(error)}") from error
+            text = viz.one_line(error).removeprefix("Search.__init__() ")
+            raise ValueError(f"{self.file}: {text}") from error
         words = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
         say_entries(
             best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
-            next=f"lyceum-warp train {words} --seeds 5, or lyceum-warp plot {out}",
+            next=f"lyceum-warp train {words} --seeds 5, or lyceum-warp plot {search.out}",
         )
 
 
@@ -93,27 +97,23 @@ class Search:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             check_kind(field.name, getattr(self, field.name), field.type, "see lyceum-warp sweep --help")
-        whole_number("heartbeat", self.heartbeat, low=1)
-
-
-def read_search(file: Path) -> Search:
-    """Read a sweep's file."""
-    try:
-        return Search(**tomllib.loads(file.read_text()))
-    except (ValueError, TypeError) as error:  # a name is missing or unknown
-        raise ValueError(f"{file}: {str(error).removeprefix('Search.__init__() ')}") from error
 
 
 def check_search(search: Search) -> None:
-    """Check the ranges, and the settings at their ends, before anything is written."""
+    """Check the ranges, and make the learners of their ends, before anything is written."""
     import optuna
 
+    if search.objective not in ("return", "gate"):
+        binding.object_in_file(search.objective)
     trial_settings(search, optuna.create_study().ask())
     ends = {name: list(_by_word(entry["choices"])) if "choices" in entry else [entry["low"], entry["high"]]
             for name, entry in search.ranges.items()}  # fmt: skip
     for k in range(max(map(len, ends.values()), default=1)):
         trial = optuna.trial.FixedTrial({name: values[k % len(values)] for name, values in ends.items()})
-        _command(search, trial_settings(search, trial)).check()
+        settings = trial_settings(search, trial)
+        if search.objective == "gate" and not (settings.get("gate_every") and binding.find_task(search.task).gate):
+            raise ValueError('the objective "gate" needs a task with a gate, and gate_every in settings')
+        _command(search, settings).check()
 
 
 def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
@@ -139,11 +139,10 @@ def _by_word(choices: Sequence[Any]) -> dict[Any, Any]:
     return {json.dumps(choice) if isinstance(choice, list) else choice: choice for choice in choices}
 
 
-def _command(search: Search, settings: Mapping[str, Any], *more: str) -> Any:
+def _command(search: Search, settings: Mapping[str, Any], *more: str) -> Train:
     """Make the command that trains a trial."""
-    from lyceum_warp.cli.train import Train  # its imports take a second
-
-    return parse(Train, "lyceum-warp train", [search.task, *training.flag_words(settings), *more])
+    command: Train = parse(Train, "lyceum-warp train", [search.task, *training.flag_words(settings), *more])
+    return command
 
 
 def _study(search: Search, name: str) -> Any:
@@ -168,46 +167,37 @@ def _say_trial(study: Any, trial: Any) -> None:
     say(f"trial {trial.number}: {trial.state.name.lower()} {value} {trial.params}")
 
 
-def _objective(search: Search) -> Callable[[Any], float]:
+def _objective(search: Search, trial: Any) -> float:
+    """Train a trial, and return the number by which it is judged."""
     import optuna
 
-    judge = {"return": _best_return, "gate": _gate_seconds}.get(search.objective)
-    judge = judge or binding.object_in_file(search.objective)
+    settings, by_return = trial_settings(search, trial), search.objective == "return"
+    # a trial that was killed goes on
+    folder = Path(trial.user_attrs.get("run", Path(search.out, f"trial-{trial.number:04d}")))
+    trial.set_user_attr("run", str(folder))
+    trial.set_user_attr("settings", settings)
 
-    def objective(trial: Any) -> float:
-        settings = trial_settings(search, trial)
-        # a trial that was killed goes on
-        folder = Path(trial.user_attrs.get("run", Path(search.out, f"trial-{trial.number:04d}")))
-        trial.set_user_attr("run", str(folder))
-        trial.set_user_attr("settings", settings)
+    def report(iteration: Any) -> None:
+        value = iteration.return_mean if iteration.mean_return is None else iteration.mean_return
+        if value is not None and math.isfinite(value):
+            trial.report(value, iteration.iteration)
+            if trial.should_prune():
+                raise optuna.TrialPruned
 
-        def report(iteration: Any) -> None:
-            value = iteration.return_mean if iteration.mean_return is None else iteration.mean_return
-            if value is not None and math.isfinite(value):
-                trial.report(value, iteration.iteration)
-                if trial.should_prune():
-                    raise optuna.TrialPruned
-
-        by_return = search.objective == "return"
-        command = _command(search, settings, *["--evaluate"] * by_return, "--continue", "--out", str(folder))
-        with folder.with_suffix(".log").open("a") as log, contextlib.redirect_stdout(log):
-            try:
-                code = command.run([report] * by_return)
-            except FloatingPointError as error:
-                raise optuna.TrialPruned from error
-        if code >= 128:
-            raise Interrupted(code - 128)  # the trial stays open until its heartbeat is missed
-        return float(judge(training.Run.open(folder)))
-
-    return objective
-
-
-def _best_return(run: Any) -> float:
-    """Return the mean return of the better policy in new episodes, which ``train --evaluate`` has stored."""
-    return max(score.mean for score in training.stored_scores(run).values())
-
-
-def _gate_seconds(run: Any) -> float:
-    """Return the seconds of sampling and updates until the gate was passed; infinity if it was not."""
-    passed = run.config.get("passed")
-    return math.inf if passed is None else sum(map(training.row_seconds, run.rows()[: passed["iteration"]]))
+    # a worker on another host, whose trial Optuna has released, has left its lock
+    words = [*["--evaluate"] * by_return, "--continue", "--take-over", "--out", str(folder)]
+    with folder.with_suffix(".log").open("a") as log, contextlib.redirect_stdout(log):
+        try:
+            code = _command(search, settings, *words).run([report] * by_return)
+        except FloatingPointError as error:
+            raise optuna.TrialPruned from error
+    if code >= 128:
+        raise Interrupted(code - 128)  # the trial stays open until its heartbeat is missed
+    run = training.Run.open(folder)
+    if by_return:  # of the better policy in new episodes, as train --evaluate has stored it
+        return max(score.mean for score in training.stored_scores(run).values())
+    if search.objective != "gate":
+        return float(binding.object_in_file(search.objective)(run))
+    if "passed" not in run.config:
+        raise optuna.TrialPruned
+    return sum(map(training.row_seconds, run.rows()[: run.config["passed"]["iteration"]]))

@@ -29,7 +29,6 @@ from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.outlines import outline
-from lyceum_warp.support.validate import whole_number
 
 _CONFIGS = {
     name.removesuffix("Config").lower(): outline("lyceum_warp.algos", name)
@@ -237,23 +236,17 @@ class Train:
             return self._run(source, team, callbacks)
 
     def check(self) -> None:
-        """Check the settings of a new run with a TASK, without worlds and networks."""
+        """Check the settings of a new run, which make a learner or raise an error."""
         self._check_flags()
-        assert self.task is not None
-        source = None if self.from_run is None else training.Run.open(self.from_run)
-        chosen, task = self.configuration(source, algos.Team()), binding.find_task(self.task)
-        model, physics = chosen.options.model, chosen.options.physics.resolved(task.physics)
-        binding.BoundTask(task, chosen.options.nworld, model=model, physics=physics, params=chosen.params)
+        source, team = None if self.from_run is None else training.Run.open(self.from_run), algos.Team()
+        self._learner(self.configuration(source, team), source, team)
+        self._callbacks(self._settings({}))
 
     def _run_seeds(self) -> int:
         from lyceum_warp.cli.seeds import train_and_show
 
         assert self.task is not None
-        seeds = self.seeds
-        if len(seeds) == 1:
-            seeds = tuple(range(whole_number("--seeds", seeds[0], low=1, high=1000)))
         folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
-        self.check()
         own = {"task", "seeds", "jobs", "out", "go_on", "verbose", "env", "physics", "hyperparameters"}
         settings = {
             name.removesuffix("_run"): value
@@ -261,6 +254,7 @@ class Train:
             for name, value in core.given_values(part).items()
             if name not in own
         }
+        seeds = self.seeds[0] if len(self.seeds) == 1 else self.seeds
         return train_and_show(self.task, folder, seeds, self.jobs, settings)
 
     def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:
@@ -304,9 +298,7 @@ class Train:
         elif self.from_run is None and not self.task:
             raise ValueError(f"train needs a task: one of {', '.join(binding.task_names())}, or path/to/file.py")
         if self.seeds and (self.resume is not None or self.seed is not None or not self.task):
-            raise ValueError(
-                "--seeds takes a task, and neither --seed nor --resume: the same command continues its runs"
-            )
+            raise ValueError("--seeds needs a task, and replaces --seed and --resume: omit these")
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
         if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
@@ -372,12 +364,6 @@ class Train:
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
         base = self._suggestion(team) if source is None else training.Configuration.of(source)
         algorithm = self.algorithm or base.algorithm
-        if source is not None and self.algorithm is None and algorithm not in training.ALGORITHMS:
-            raise ValueError(
-                f"the run in {source.folder} was trained by {algorithm!r}, which is not part of this package: name its "
-                "class, as in --algorithm path/to/file.py:Class, or begin a new run from its policy by --from and "
-                "--algorithm"
-            )
         if algorithm == "sac" and self.network is not None:
             raise ValueError("sac takes no --network: omit it, or use --algorithm ppo or npg")
         flags = self._given("nworld", "seed") | given(self.env) | given(self.physics)

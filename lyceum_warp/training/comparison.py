@@ -110,12 +110,12 @@ def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
 def read_curve(run: Run) -> RunCurve:
     """Read the curve of a run. Iterations without a return are left out."""
     rows = run.rows() if run.metrics.exists() else []
-    table = {name: np.array([row.get(name) for row in rows], dtype=float) for name in (rows[0] if rows else ())}
-    nothing = np.full(len(rows), math.nan)
-    seconds = np.cumsum([row_seconds(row) for row in rows])
-    evaluated = bool(np.isfinite(means := table.get("mean_return", nothing)).any())
-    returns = means if evaluated else table.get("return_mean", nothing)
-    known = np.isfinite(returns)
+    seconds = list(itertools.accumulate(map(row_seconds, rows)))
+    for column in ("mean_return", "return_mean"):
+        table = [(row["samples"], second, row.get(column)) for row, second in zip(rows, seconds, strict=True)]
+        points = np.array(table, float).reshape(-1, 3)
+        if len(points := points[np.isfinite(points[:, 2])]):
+            break
     config, passed = run.config, run.config.get("passed")
     settings = flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))})
     gate = "not passed" if (run.folder / "gate.jsonl").exists() else ""
@@ -124,8 +124,8 @@ def read_curve(run: Run) -> RunCurve:
         task=run.task_name,
         settings={name: value for name, value in settings.items() if not name.endswith(_EVALUATION)},
         versions={**config.get("versions", {}), "task source": run.manifest.get("source_hash", "")[:12]},
-        samples=table.get("samples", nothing)[known], seconds=seconds[known], returns=returns[known],
-        evaluated=evaluated, gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
+        samples=points[:, 0], seconds=points[:, 1], returns=points[:, 2], evaluated=column == "mean_return",
+        gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
         transfer=json.loads(run.transfer.read_text()).get("line", "") if run.transfer.is_file() else "",
     )  # fmt: skip
 
@@ -164,21 +164,18 @@ def _read_events(folder: Path) -> RunCurve:
 def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
     """Group runs by task and settings. A group's label names the settings that differ from other groups'."""
     tasks = list(dict.fromkeys(curve.task for curve in curves if curve.task)) or [""]
-    kinds: dict[str, dict[str, list[RunCurve]]] = {task: {} for task in tasks}
+    kinds: dict[tuple[str, str], list[RunCurve]] = {}
     for curve in curves:
         if not curve.task and len(tasks) > 1:
             raise ValueError(f"{curve.folder} names no task: compare it with runs of one task")
         key = json.dumps(curve.settings, sort_keys=True, default=str)
-        kinds[curve.task or tasks[0]].setdefault(key, []).append(curve)
-    groups: list[RunGroup] = []
-    for task, members in kinds.items():
-        settings = [runs[0].settings for runs in members.values()]
+        kinds.setdefault((curve.task or tasks[0], key), []).append(curve)
+    groups = []
+    for (task, _), runs in kinds.items():
+        settings = [others[0].settings for (other, _), others in kinds.items() if other == task]
         varied = [name for name in differing(settings) if all(name in each for each in settings)]
-        for values, runs in zip(settings, members.values(), strict=True):
-            words = [f"{name.rpartition('.')[2]} {values[name]}" for name in varied if name != "algorithm"]
-            if "algorithm" in varied or not varied:
-                words.insert(0, str(values.get("algorithm", "")))
-            groups.append(RunGroup(task, ", ".join(words), runs))
+        words = [f"{name.rpartition('.')[2]} {runs[0].settings[name]}" for name in varied or ["algorithm"]]
+        groups.append(RunGroup(task, ", ".join(words).removeprefix("algorithm "), runs))
     return groups
 
 
@@ -209,10 +206,9 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
                 axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
         evaluated = all(run.evaluated for group in shown for run in group.runs)
         panels[0].set_title(task, loc="left")
-        panels[0].set_ylabel("return of the mean policy" if evaluated else "return")
+        panels[0].set(xlabel="samples", ylabel="return of the mean policy" if evaluated else "return")
         small = {"fontsize": "small", "title_fontsize": "small"}
         panels[0].legend(title="mean, 95 % interval", frameon=False, loc="best", **small)
-        panels[0].set_xlabel("samples")
         panels[1].set_xlabel("seconds of sampling and updates")
         panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
         finish_axes(panels)

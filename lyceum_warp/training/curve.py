@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,39 +49,38 @@ def curve_panels(run: Run) -> list[Panel]:
     if not rows:
         raise ValueError(f"{run.folder} has no complete iteration to plot: continue its training")
 
-    def panel(group: str, title: str, unit: str, **columns: str) -> Iterator[Panel]:
+    terms = run.config.get("terms", {})
+    weights, ends = terms.get("rewards", {}), terms.get("ends", [])
+    panels: list[Panel] = []
+
+    def add(group: str, title: str, unit: str, columns: Mapping[str, str]) -> None:
         curves = {}
         for name, column in columns.items():
             values = [(row["samples"] or 0.0, row.get(column)) for row in rows]
             points = [(x, y) for x, y in values if y is not None and math.isfinite(y)]
             if points and (group != FAULTS or any(y for _, y in points)):
-                curves[name.replace("_", " ")] = points
+                curves[name] = points
         if curves:
-            yield Panel(group, title, unit, curves)
+            panels.append(Panel(group, title, unit, curves))
 
-    terms = run.config.get("terms", {})
-    weights, ends = terms.get("rewards", {}), terms.get("ends", [])
-    panels: list[Panel] = []
     for title, (unit, sampled, mean) in _RETURNS.items():
-        panels += panel(RETURNS, title, unit, stochastic_policy=sampled, mean_policy=mean)
+        add(RETURNS, title, unit, {_SAMPLED: sampled, _MEAN: mean})
     if not any(each.title == "return" for each in panels):  # no episode has ended yet
-        panels[:0] = panel(RETURNS, "reward", "of a step", stochastic_policy="reward_mean")
+        add(RETURNS, "reward", "of a step", {_SAMPLED: "reward_mean"})
+    known = {field.name for field in dataclasses.fields(Iteration)} | {"samples_per_second"}
     for column in rows[0]:
         name = column.removeprefix(METRIC_COLUMN)
-        if name == column:
-            continue
-        if name in weights:
-            panels += panel(TERMS, name, f"weight {weights[name]:g}, sum of an episode", term=column)
+        if column in _FAULTS:
+            add(FAULTS, name.replace("_", " "), "per iteration", {"count": column})
+        elif name == column:
+            if column not in known and "/" not in column and not column.startswith("time_"):
+                add(LEARNING, name.replace("_", " "), "", {"value": column})
+        elif name in weights:
+            add(TERMS, name, f"weight {weights[name]:g}, sum of an episode", {"term": column})
         elif name in ends:
-            panels += panel(ENDS, name, "fraction of episodes", end=column)
+            add(ENDS, name, "fraction of episodes", {"end": column})
         else:
-            panels += panel(METRICS, name, "mean of a step", metric=STEP_METRIC_COLUMN + name)
-    for name in _FAULTS:
-        panels += panel(FAULTS, name.replace("_", " "), "per iteration", count=name)
-    known = {field.name for field in dataclasses.fields(Iteration)} | {*_FAULTS, "samples_per_second"}
-    for column in rows[0]:
-        if column not in known and "/" not in column and not column.startswith("time_"):
-            panels += panel(LEARNING, column.replace("_", " "), "", value=column)
+            add(METRICS, name, "mean of a step", {"metric": STEP_METRIC_COLUMN + name})
     return sorted(panels, key=lambda each: GROUPS.index(each.group))
 
 
@@ -130,8 +129,7 @@ def learning_curve(run: str | Path | Run) -> Path:
         axes.tick_params(labelsize="small")
         all_axes.append(axes)
     all_axes[0].set_title(f"{run.task_name}, seed {run.config['seed']}", loc="left")
-    all_axes[0].set_ylabel(f"{first.title}, {first.unit}")
+    all_axes[0].set(xlabel="samples", ylabel=f"{first.title}, {first.unit}")
     all_axes[0].legend(frameon=False, loc="best")
-    all_axes[0].set_xlabel("samples")
     finish_axes(all_axes)
     return save_figure(figure, run.folder / "curve.png")

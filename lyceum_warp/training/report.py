@@ -34,7 +34,7 @@ _COLOURS = {LINE: "one", ACCENT: "two", GRID: "line", "#000000": "soft"}
 _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
-def write_report(folder: str | Path, out: str | Path | None = None, *, episode: bool = True) -> Path:
+def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     """Write one self-contained HTML page on a run, or on the episodes of a planner.
 
     The page needs no network and no other file, and has no absolute paths, user names or host names.
@@ -42,7 +42,6 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, episode: 
     Args:
         folder: The folder of a run, or one that ``lyceum-warp plan`` has written.
         out: The file; by default ``report.html`` in the folder.
-        episode: Whether to play an episode of the last policy under exact physics on the C engine, and to show it.
 
     Raises:
         FileNotFoundError: The folder has no run.
@@ -56,12 +55,11 @@ def write_report(folder: str | Path, out: str | Path | None = None, *, episode: 
         run = Run.open(folder)
         config = run.config
         title, body = f"{run.task_name}, {config['algorithm']}, seed {config['seed']}", _run_parts(run)
-    parts = list(body)
-    if episode:
-        parts.insert(1, _episode(folder, planned=planned))
     settings = {name: config[name] for name in (*_SETTINGS, config["algorithm"]) if name in config}
-    parts += _section("Settings", _table(flat_settings(settings)))
-    parts += _section("Machine and versions", _table(config.get("versions", {})))
+    parts = [
+        next(body), _episode(folder, planned=planned), *body, _section("Settings", _table(flat_settings(settings))),
+        _section("Machine and versions", _table(config.get("versions", {}))),
+    ]  # fmt: skip
     return html_page(Path(out or folder / "report.html"), title, parts)
 
 
@@ -87,13 +85,13 @@ def _run_parts(run: Run) -> Iterator[str]:
         keys = '<p class="soft"><span class="key">stochastic policy</span><span class="key">mean policy</span></p>'
         figures = "\n".join(map(_figure, members))
         title = {RETURNS: "Curves over samples"}.get(group, group.capitalize())
-        yield from _section(title, f'{keys if group == RETURNS else ""}<div class="grid">{figures}</div>')
+        yield _section(title, f'{keys if group == RETURNS else ""}<div class="grid">{figures}</div>')
 
 
 def _planner_parts(folder: Path) -> Iterator[str]:
     report = json.loads((folder / "report.json").read_text())
     yield "<p>a planner's episodes</p>"
-    yield from _section("Report", _table(flat_settings(report if isinstance(report, dict) else {"report": report})))
+    yield _section("Report", _table(flat_settings(report if isinstance(report, dict) else {"report": report})))
 
 
 def _episode(folder: Path, *, planned: bool) -> str:
@@ -113,11 +111,11 @@ def _episode(folder: Path, *, planned: bool) -> str:
     except Exception as error:  # a report without an episode is worth having
         reason = re.sub(r"/\S*/", "", one_line(error))  # without folders
         return f'<p class="soft">no episode: {html.escape(reason)}</p>'
-    return "\n".join(_section("Episode", f'<iframe title="an episode" srcdoc="{html.escape(text)}"></iframe>'))
+    return _section("Episode", f'<iframe title="an episode" srcdoc="{html.escape(text)}"></iframe>')
 
 
-def _section(title: str, content: str) -> list[str]:
-    return [f"<h2>{html.escape(title)}</h2>", content]
+def _section(title: str, content: str) -> str:
+    return f"<h2>{html.escape(title)}</h2>\n{content}"
 
 
 def _table(entries: Mapping[str, Any]) -> str:

@@ -1,5 +1,6 @@
 """Train a task with several seeds, each in a process of its own."""
 
+import contextlib
 import ctypes
 import dataclasses
 import os
@@ -73,7 +74,7 @@ def train_seeds(
             several values by name: ``param={"ctrl_cost_weight": 0.05}``.
 
     Raises:
-        ValueError: An argument is out of range, or a run fails before its first iteration.
+        ValueError: An argument is out of range, or is refused by the first run. Nothing is written then.
     """
     numbers = range(whole_number("seeds", seeds, low=1, high=1000)) if isinstance(seeds, int) else sorted(set(seeds))
     runs = [SeedRun(seed, Path(folder, f"seed-{whole_number('a seed', seed, low=0)}")) for seed in numbers]
@@ -174,5 +175,8 @@ def _conclude(run: SeedRun, code: int) -> None:
         run.state = "failed"
         lines = run.log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
-        if not run.begun:
-            raise ValueError(f"{run.error} (seed {run.seed}; see {run.log})")
+        if code == 2 and not run.begun:  # it was refused, and this line says everything
+            run.log.unlink()
+            with contextlib.suppress(OSError):
+                run.folder.parent.rmdir()
+            raise ValueError(run.error)

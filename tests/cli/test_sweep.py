@@ -4,7 +4,9 @@ import pytest
 from training_runs import refused
 
 from lyceum_warp import cli
-from lyceum_warp.training import Run
+from lyceum_warp.training import Run, row_seconds
+
+GATED = Path(__file__).parents[1] / "training" / "gated_tasks.py"
 
 SWEEP = """
 task = "point_mass"
@@ -37,6 +39,23 @@ def test_sweep_continues_and_names_its_best_run(
     assert cli.main(["sweep", "other.toml"]) == 0
 
 
+def test_a_trial_that_does_not_pass_the_gate_is_pruned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna")
+    monkeypatch.chdir(tmp_path)
+    text = SWEEP.format(trials=1, objective="gate").replace("iterations = 1", "iterations = 4, gate_every = 2")
+    Path("sweep.toml").write_text(text.replace("point_mass", f"{GATED}:Impossible"))
+    assert cli.main(["sweep", "sweep.toml"]) == 2
+    shown = capsys.readouterr()
+    assert "trial 0: pruned" in shown.out and "none has passed the gate" in shown.err
+    Path("sweep.toml").write_text(text.replace("point_mass", f"{GATED}:Easy").replace('"sweep"', '"easy"'))
+    assert cli.main(["sweep", "sweep.toml"]) == 0
+    run, shown = Run.open("easy/trial-0000"), capsys.readouterr()
+    seconds = sum(map(row_seconds, run.rows()[: run.config["passed"]["iteration"]]))
+    assert f"trial 0: complete {seconds:.6g} " in shown.out and seconds > 0
+
+
 def test_sweep_with_a_wrong_key_or_range_prints_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -51,6 +70,8 @@ def test_sweep_with_a_wrong_key_or_range_prints_an_error(
         (text.replace("low", "lo"), "the range gamma = "),
         (text.replace("0.99 ", "1.5 "), "gamma must be"),
         (text.replace("gamma", "gama"), "gama"),
+        (text.replace("[[8]", "[[0]"), "hidden"),
+        (text.replace('"return"', '"gate"'), "needs a task with a gate, and gate_every in settings"),
     ]:
         Path("sweep.toml").write_text(wrong)
         assert cli.main(["sweep", "sweep.toml"]) == 2

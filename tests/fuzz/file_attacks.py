@@ -11,6 +11,7 @@ import io
 import json
 import re
 import shutil
+import tomllib
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -30,7 +31,7 @@ import lyceum_warp as lw
 import lyceum_warp.cli.view
 from lyceum_warp import cli
 from lyceum_warp.cli.parsing import parse
-from lyceum_warp.cli.sweep import read_search, trial_settings
+from lyceum_warp.cli.sweep import Search, trial_settings
 from lyceum_warp.cli.train import Train
 from lyceum_warp.controllers import episode_env, load_episodes
 from lyceum_warp.training import Run, flag_words
@@ -131,7 +132,10 @@ def _sweep(file: Path) -> None:
     """Read a sweep's file and the options of its first trial, without training."""
     import optuna
 
-    search, trial = read_search(file), optuna.create_study().ask()
+    try:
+        search, trial = Search(**tomllib.loads(file.read_text())), optuna.create_study().ask()
+    except (TypeError, ValueError) as error:  # as the command does
+        raise ValueError(f"{file}: {error}") from error
     parse(Train, "lyceum-warp train", [search.task, *flag_words(trial_settings(search, trial))])
 
 

@@ -129,8 +129,7 @@ class Run:
         """
         if (folder / "checkpoint.pt").exists() or (folder / "previous.pt").exists():
             return True
-        left = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if CONFIG in left and "metrics.csv" not in left:
+        if (folder / CONFIG).exists() and not (folder / "metrics.csv").exists():
             Run.open(folder)  # raises an error in a planner's folder
             shutil.rmtree(folder)
         return False
