@@ -54,6 +54,31 @@ def check_truncation(ctx: Context) -> None:
             ctx.equal(count, steps.to(count.dtype), "the state's step counter")
 
 
+def check_noise(ctx: Context) -> None:
+    """Equal states give equal noise. Worlds, episodes and steps have different noise."""
+    env = ctx.a
+    if not env.task.noisy_groups:
+        return
+    env.step(ctx.actions(1)[0])
+    state = env.get_state()
+    ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
+    parts = env.state_space.parts
+    # these states differ only in their random streams
+    same = state[:1].expand_as(state).contiguous()
+    changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
+    for name in ("episode", "step"):
+        changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
+    differ = {}
+    for name, values in changes.items():
+        moved = same.clone()
+        moved[:, parts[name]] = values
+        shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
+        differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
+    if any(differ.values()):  # a task's noise may have scale 0
+        for name, found in differ.items():
+            ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
+
+
 def check_metrics(ctx: Context) -> None:
     """``episode_metrics`` are sums of ``metrics`` over an episode without faults. They are part of the state."""
     a, b, horizon = ctx.a, ctx.b, 4
@@ -173,5 +198,13 @@ def check_rejection(ctx: Context) -> None:
             ctx.equal(b.get_state()[alone], a.get_state()[alone], f"the state of world {i % a.nworld}, reset alone")
 
 
-CHECKS = (*RULES, check_truncation, check_metrics, check_success_steps, check_lasting_memory, check_rejection)
+CHECKS = (
+    *RULES,
+    check_truncation,
+    check_noise,
+    check_metrics,
+    check_success_steps,
+    check_lasting_memory,
+    check_rejection,
+)
 """The rules of ``check_task``, and those of this module."""

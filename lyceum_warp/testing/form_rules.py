@@ -1,4 +1,4 @@
-"""Check the optional parts of a task: noise, events and substeps."""
+"""Check the optional parts of a task: events and substeps."""
 
 import torch
 
@@ -6,31 +6,6 @@ from lyceum_warp.env import memory_columns
 from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
-
-
-def check_noise(ctx: Context) -> None:
-    """Equal states give equal noise. Worlds, episodes and steps have different noise."""
-    env = ctx.a
-    if not env.task.noisy_groups:
-        return
-    env.step(ctx.actions(1)[0])
-    state = env.get_state()
-    ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
-    parts = env.state_space.parts
-    # these states differ only in their random streams
-    same = state[:1].expand_as(state).contiguous()
-    changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
-    for name in ("episode", "step"):
-        changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
-    differ = {}
-    for name, values in changes.items():
-        moved = same.clone()
-        moved[:, parts[name]] = values
-        shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
-        differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
-    if any(differ.values()):  # a task's noise may have scale 0
-        for name, found in differ.items():
-            ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
 
 
 def check_events(ctx: Context) -> None:
