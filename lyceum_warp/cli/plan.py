@@ -4,7 +4,6 @@ import dataclasses
 import datetime
 import functools
 import math
-import os
 import signal
 import time
 from collections.abc import Callable
@@ -27,8 +26,8 @@ from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number, whole_number
 
 
-class Settings(arguments.OptionFlags, options=[MPPIConfig]):
-    """Settings of the planner. The defaults come from the task."""
+class Settings(arguments.OptionFlags, options=[MPPIConfig], omit=["fill"]):
+    """Settings of the planner. The defaults come from the task. The setting ``fill`` has no flag."""
 
     update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling|FILE")] = None
     """How to compute the new plan: mppi (the default), cem (the cross-entropy method), predictive_sampling, or
@@ -37,7 +36,6 @@ class Settings(arguments.OptionFlags, options=[MPPIConfig]):
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
     The Python API also accepts a covariance matrix."""
-    fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
@@ -45,8 +43,6 @@ class Settings(arguments.OptionFlags, options=[MPPIConfig]):
         settings = arguments.given(self)
         if ".py:" in settings.get("update", ""):
             settings["update"] = made_in_file(settings["update"], PlanUpdate)
-        if self.fill is not None:
-            settings["fill"] = _fill(self.fill)
         for name in ("noise", "min_noise"):
             if name in settings and len(settings[name]) == 1:
                 settings[name] = settings[name][0]
@@ -104,8 +100,6 @@ class Plan:
     param: arguments.ParamWords = ()
     planner_param: arguments.Repeated = ()
     """A parameter of the task that only the planner's worlds use. The flag may be repeated."""
-    planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The planner's model, if it differs from the controlled world's."""
     video: bool = True
     """Whether to make a video of the first episode."""
     camera: arguments.CameraWords = ()
@@ -156,7 +150,6 @@ class Plan:
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.definition), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
-            "planner_model": self.planner_model and str(Path(os.path.expanduser(self.planner_model)).resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "device": self.planner.device or "cpu",
             "episodes": self.episodes, "steps": self.steps,
@@ -182,8 +175,6 @@ def _worlds(
     task = plant.task.definition
     value = None if options.value is None else training.load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    if options.planner_model is not None:
-        planner_options["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 
     def make(setting: controllers.RealTimeSetting | None) -> MPPI:
         changes: dict[str, Any] = {}
@@ -237,14 +228,6 @@ def _choice(
 
 def _suggested_physics(task: type[Task]) -> str | None:
     return EnvOptions().changed(task.planning.options).physics.base
-
-
-def _fill(texts: tuple[str, ...]) -> Any:
-    try:
-        numbers = [float(text) for text in texts]
-    except ValueError:
-        return " ".join(texts)  # MPPIConfig raises an error for unknown words
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _run(run: training.Run, plant: Env, planner: MPPI, options: Plan) -> None:
