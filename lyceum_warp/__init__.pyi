@@ -115,12 +115,10 @@ from lyceum_warp.kernels.rewards import (
     tolerance as tolerance,
 )
 from lyceum_warp.kernels.rotations import (
-    angle_between as angle_between,
     quat_angle as quat_angle,
     quat_difference as quat_difference,
     quat_from_axis_angle as quat_from_axis_angle,
     quat_from_euler as quat_from_euler,
-    quat_from_mat as quat_from_mat,
     quat_from_rotvec as quat_from_rotvec,
     quat_inverse as quat_inverse,
     quat_mul as quat_mul,
@@ -131,7 +129,7 @@ from lyceum_warp.kernels.rotations import (
     quat_to_mat as quat_to_mat,
     quat_to_rotvec as quat_to_rotvec,
 )
-from lyceum_warp.kernels.velocities import body_velocity as body_velocity, local_velocity as local_velocity
+from lyceum_warp.kernels.velocities import body_velocity as body_velocity
 from lyceum_warp.models.actuators import follow_velocity as follow_velocity
 from lyceum_warp.models.terrain import Terrain as Terrain, height_field as height_field, scan_grid as scan_grid
 from lyceum_warp.motions.clips import Clips as Clips, load_clips as load_clips

@@ -1,10 +1,6 @@
 """Define XML models with every kind of element."""
 
-from lyceum_warp.testing import (
-    episode_rules as episodes,
-    fault_rules as faults,
-    state_rules as state,
-)
+from lyceum_warp.testing import fault_rules as faults, state_rules as state
 
 # the checks that depend on the model; slow engines and models run only these
 MODEL_CHECKS = (
@@ -12,7 +8,7 @@ MODEL_CHECKS = (
     state.check_masked_restoring,
     state.check_purity,
     state.check_masked_reset,
-    episodes.check_graphs,
+    state.check_graphs,
     faults.check_bad_state,
 )
 

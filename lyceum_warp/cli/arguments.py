@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from lyceum_warp import viz
 from lyceum_warp.core import OPTIONS, Camera, EnvOptions, PhysicsOptions, given_values
 from lyceum_warp.support.docstrings import attribute_docs
 
@@ -164,6 +165,20 @@ def parameter(text: str) -> tuple[str, Any]:
         return name, str(Path(os.path.expanduser(value)).resolve())
     values = [_value(part, text) for part in parts]
     return name, values[0] if len(values) == 1 else values
+
+
+def video_camera(words: Sequence[str]) -> "str | viz.FreeCamera | None":
+    """Parse the camera of a video: nothing, a name, an index, or parts of a free camera's pose as NAME=VALUE."""
+    if len(words) < 2 and "=" not in "".join(words):
+        return words[0] if words else None
+    pose: dict[str, Any] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if name not in viz.FreeCamera.__dataclass_fields__:
+            parts = ", ".join(f"{part}=..." for part in viz.FreeCamera.__dataclass_fields__)
+            raise ValueError(f"a camera is a name, an index, or a pose of {parts}, not {word!r}")
+        pose[name] = value if name == "track" else parameter(word)[1]
+    return viz.FreeCamera(**pose)
 
 
 _CAMERA = re.compile(r"([^:]+)(?::(\d+)x(\d+))?(?::([a-z]+))?")

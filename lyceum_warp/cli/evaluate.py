@@ -9,7 +9,7 @@ import torch
 import tyro
 
 from lyceum_warp import algos, binding, controllers, training, viz
-from lyceum_warp.cli.arguments import CameraWords, EnvFlags, ParamWords, Physics, given, parameter, parameters
+from lyceum_warp.cli import arguments
 from lyceum_warp.cli.clips import print_clips
 from lyceum_warp.cli.display import console, say, say_entries, table, tried
 from lyceum_warp.core import EnvOptions
@@ -49,7 +49,7 @@ class Eval:
     """The name or file of a task to use instead of the run's task. A different task has its own physics and parameters,
     and observations and actions of the same sizes.
     """
-    param: ParamWords = ()
+    param: arguments.ParamWords = ()
     episodes: int = 32
     """Number of episodes."""
     seed: int = 1
@@ -64,7 +64,7 @@ class Eval:
     """Whether curricula begin anew, as in a new run."""
     video: bool = False
     """Whether to write a video of one episode: eval.mp4 in the run's folder, or TASK.mp4 with --pretrained."""
-    camera: CameraWords = ()
+    camera: arguments.CameraWords = ()
     transfer: bool = False
     """Whether to play the episodes on both engines and under each set of physics options that the task defines. The
     command then prints the differences and a verdict. The Warp engine runs on --device, by default on a GPU if there is
@@ -77,14 +77,14 @@ class Eval:
     """
     episodes_to: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER")] = None
     """A new or empty folder for the episodes. Each episode is one file, such as episode-000.npz."""
-    env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
-    physics: Physics = Physics()
+    env: Annotated[arguments.EnvFlags, tyro.conf.arg(name="world")] = arguments.EnvFlags()
+    physics: arguments.Physics = arguments.Physics()
 
     def run(self) -> None:
         whole_number("episodes", self.episodes, low=1)
         if self.transfer and self.env.engine is not None:
             raise ValueError("--transfer plays episodes on both engines: omit --engine")
-        camera = viz.parsed_camera(self.camera)
+        camera = arguments.video_camera(self.camera)
         if self.video:
             viz.check_video()
         elif camera is not None:
@@ -93,8 +93,8 @@ class Eval:
             training.Run.check_free(self.episodes_to)
         run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
         nworld = min(self.nworld, self.episodes)
-        options = given(self.env) | given(self.physics)
-        env = run_worlds(run, options, parameters(self.param), nworld=nworld, task=self.task)
+        options = arguments.given(self.env) | arguments.given(self.physics)
+        env = run_worlds(run, options, arguments.parameters(self.param), nworld=nworld, task=self.task)
         viz.find_camera(env.model, camera)
         origin = _source(env, run)
         if env.horizon == 0:
@@ -153,7 +153,7 @@ class Eval:
                 return [saved], "the run's"
             return [Curriculum(shared={name: memory * 0.0 for name, memory in env.shared.items()})], "new"
         curricula = [Curriculum()]
-        for name, value in map(parameter, self.memory):
+        for name, value in map(arguments.parameter, self.memory):
             values = torch.tensor(value, dtype=torch.float32).reshape(-1)
             if name in env.shared:
                 curricula = [dataclasses.replace(one, shared={**one.shared, name: values}) for one in curricula]

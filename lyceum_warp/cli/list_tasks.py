@@ -1,21 +1,18 @@
 """List the tasks: lyceum-warp tasks.
 
 The command reads a stored list, because loading all tasks and their models takes seconds. After a change of the
-package's tasks, ``python -m lyceum_warp.cli.list_tasks`` stores a new list.
+package's tasks, ``python docs/task_list.py`` stores a new list.
 """
 
 import dataclasses
 import importlib.util
-import inspect
 import json
-import sys
 import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
-from lyceum_warp import binding, core
 from lyceum_warp.cli.display import console
 
 LIST = Path(__file__).resolve().parents[1] / "tasks" / "list.json"
@@ -68,43 +65,3 @@ def _missing(packages: list[str], install: str) -> str:
     if not packages or any(map(importlib.util.find_spec, packages)):
         return ""
     return f"the model comes with the package {packages[0].replace('_', '-')}: pip install '{install}'"
-
-
-def read_task(name: str) -> dict[str, Any]:
-    """Make the row of a task from its class and its model."""
-    task = binding.find_task(name)
-    source, spec = binding.TaskSource(task), binding.task_spec(task)
-    params = binding.defaults(source.params, source.defaults)
-    (obs, _), actions = binding.observation_layouts(source, params), binding.action_sizes(source, params)
-    model: Any = task.model() if callable(task.model) else task.model
-    file: Any = core.find_model(model, task) if isinstance(model, str | Path) else model
-    known, made_in = isinstance(file, core.ModelFile), task.__module__.rpartition(".")[2]
-    return {
-        "obs": sum(obs["policy"].values()),
-        "act": len(spec.actuators) if actions is None else sum(actions.values()),
-        "skip": task.frame_skip,
-        "dt": float(f"{spec.option.timestep * task.frame_skip:g}"),
-        "horizon": task.horizon,
-        "model": _model(file) if known or isinstance(file, Path) else f"made in {made_in}.py",
-        "about": _description(task),
-        "files": {"packages": file.packages if known else [], "install": file.install if known else ""},
-    }
-
-
-def _model(file: Any) -> str:
-    if isinstance(file, Path):
-        return file.name
-    extra = file.install.partition("[")[2].partition("]")[0]
-    return f"{file.source} [{extra}]" if extra else f"{file.source}: {Path(file.file).name}"
-
-
-def _description(task: Any) -> str:
-    text = vars(task).get("__doc__") or inspect.getdoc(sys.modules[task.__module__]) or ""
-    line = text.partition("\n")[0].rstrip(".")
-    physics = f" (physics: {', '.join(task.physics)})" if task.physics else ""
-    return f"{line.partition(': ')[2] or line}{physics}"
-
-
-if __name__ == "__main__":
-    lines = (f'"{name}": {json.dumps(read_task(name), ensure_ascii=False)}' for name in binding.package_task_names())
-    LIST.write_text("{\n" + ",\n".join(sorted(lines)) + "\n}\n", "utf-8")

@@ -4,7 +4,6 @@ import dataclasses
 import datetime
 import functools
 import math
-import os
 import signal
 import time
 from collections.abc import Callable
@@ -18,17 +17,7 @@ from rich.markup import escape
 from lyceum_warp import controllers, training, viz
 from lyceum_warp.algos import MPPI, MPPIConfig, PlanUpdate, task_config
 from lyceum_warp.binding import file_name, find_task, made_in_file, spelled_task, task_name
-from lyceum_warp.cli.arguments import (
-    CameraWords,
-    OptionFlags,
-    ParamWords,
-    Physics,
-    Placement,
-    Repeated,
-    TaskWord,
-    given,
-    parameters,
-)
+from lyceum_warp.cli import arguments
 from lyceum_warp.cli.display import console, counted, episode_result, say, say_entries, tried
 from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.env import Env
@@ -37,8 +26,8 @@ from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.validate import positive_number, whole_number
 
 
-class Settings(OptionFlags, options=[MPPIConfig]):
-    """Settings of the planner. The defaults come from the task."""
+class Settings(arguments.OptionFlags, options=[MPPIConfig], omit=["fill"]):
+    """Settings of the planner. The defaults come from the task. The setting ``fill`` has no flag."""
 
     update: Annotated[str | None, tyro.conf.arg(metavar="mppi|cem|predictive_sampling|FILE")] = None
     """How to compute the new plan: mppi (the default), cem (the cross-entropy method), predictive_sampling, or
@@ -47,16 +36,13 @@ class Settings(OptionFlags, options=[MPPIConfig]):
     noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
     """Standard deviation of the noise around the plan, in units of the action: one number, or one for each action.
     The Python API also accepts a covariance matrix."""
-    fill: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="WORD|FLOAT ...")] = None
     min_noise: Annotated[tuple[float, ...] | None, tyro.conf.arg(metavar="FLOAT ...")] = None
 
     def on_top_of(self, config: MPPIConfig) -> MPPIConfig:
         """Override a configuration's settings with the given flags."""
-        settings = given(self)
+        settings = arguments.given(self)
         if ".py:" in settings.get("update", ""):
             settings["update"] = made_in_file(settings["update"], PlanUpdate)
-        if self.fill is not None:
-            settings["fill"] = _fill(self.fill)
         for name in ("noise", "min_noise"):
             if name in settings and len(settings[name]) == 1:
                 settings[name] = settings[name][0]
@@ -90,7 +76,7 @@ class Plan:
 
     USUAL = ("episodes", "steps", "seed", "real_time", "out", "param", "device", "horizon", "samples", "physics")
 
-    task: TaskWord
+    task: arguments.TaskWord
     episodes: int = 1
     """Number of episodes."""
     minutes: float | None = None
@@ -111,19 +97,17 @@ class Plan:
     """The folder of an NPG or PPO run of the same task. The planner evaluates the run's value function at each
     sample's final state, and adds this value to the sample's return.
     """
-    param: ParamWords = ()
-    planner_param: Repeated = ()
+    param: arguments.ParamWords = ()
+    planner_param: arguments.Repeated = ()
     """A parameter of the task that only the planner's worlds use. The flag may be repeated."""
-    planner_model: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The planner's model, if it differs from the controlled world's."""
     video: bool = True
     """Whether to make a video of the first episode."""
-    camera: CameraWords = ()
-    planner: Placement = Placement()
+    camera: arguments.CameraWords = ()
+    planner: arguments.Placement = arguments.Placement()
     """The engine and the device of the planner's worlds. The controlled world runs in one thread of the mujoco
     engine, and has the cameras."""
     mppi: Settings = Settings()
-    planner_physics: Physics = Physics()
+    planner_physics: arguments.Physics = arguments.Physics()
 
     def run(self) -> None:
         # check all options before the folder is created
@@ -139,7 +123,7 @@ class Plan:
                 f"--replan-every {every} has no effect with --real-time, where plans follow one another without a "
                 "break: omit one of them"
             )
-        camera = viz.parsed_camera(self.camera)
+        camera = arguments.video_camera(self.camera)
         if camera is not None and not self.video:
             raise ValueError("--camera has no effect with --no-video: omit one of them")
         task = task_name(find_task(self.task))
@@ -153,8 +137,8 @@ class Plan:
         out = self.out or Path("runs", f"plan-{file_name(task)}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
         training.Run.check_free(out)
         torch.set_num_threads(1)
-        params = parameters(self.param)
-        planner_params = parameters(self.planner_param)
+        params = arguments.parameters(self.param)
+        planner_params = arguments.parameters(self.planner_param)
         plant, make_planner = _worlds(self, params, planner_params)
         viz.find_camera(plant.model, camera)
         choice = _choice(self, plant, make_planner) if self.real_time else None
@@ -166,7 +150,6 @@ class Plan:
         config = {
             "algorithm": planner.settings["update"], "task": spelled_task(plant.task.definition), "params": params,
             "planner": planner.settings, "planner_params": planner_params,
-            "planner_model": self.planner_model and str(Path(os.path.expanduser(self.planner_model)).resolve()),
             "value": self.value and str(self.value.resolve()), **vars(self.planner),
             "engine": planner.env.engine.name, "device": self.planner.device or "cpu",
             "episodes": self.episodes, "steps": self.steps,
@@ -183,7 +166,7 @@ def _worlds(
 
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
-    planner_options = given(options.planner) | given(options.planner_physics)
+    planner_options = arguments.given(options.planner) | arguments.given(options.planner_physics)
     own: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
     own |= {"objects": planner_options.get("objects"), "cameras": planner_options.pop("cameras", None)}
     plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **own), params)
@@ -192,8 +175,6 @@ def _worlds(
     task = plant.task.definition
     value = None if options.value is None else training.load_value(options.value)
     config = options.mppi.on_top_of(task_config(task, value))
-    if options.planner_model is not None:
-        planner_options["model"] = Path(os.path.expanduser(options.planner_model)).resolve()
 
     def make(setting: controllers.RealTimeSetting | None) -> MPPI:
         changes: dict[str, Any] = {}
@@ -221,7 +202,7 @@ def _choice(
     A plan must be ready within one step of the controlled world. If no setting is fast enough, a plan may take as long
     as one step of the planner's worlds.
     """
-    task, flags = plant.task.definition, given(options.mppi)
+    task, flags = plant.task.definition, arguments.given(options.mppi)
     config = options.mppi.on_top_of(task_config(task))
     samples = [config.samples]
     if not {"samples", "elites"} & flags.keys():
@@ -230,7 +211,7 @@ def _choice(
     if config.horizon > 1 and not {"horizon", "knots"} & flags.keys():
         horizons.append(config.horizon // 2)
     physics = [options.planner_physics.physics]
-    if not given(options.planner_physics):
+    if not arguments.given(options.planner_physics):
         physics = list(dict.fromkeys((_suggested_physics(task), *task.physics)))
     if len(samples) == len(horizons) == len(physics) == 1:
         return None
@@ -247,14 +228,6 @@ def _choice(
 
 def _suggested_physics(task: type[Task]) -> str | None:
     return EnvOptions().changed(task.planning.options).physics.base
-
-
-def _fill(texts: tuple[str, ...]) -> Any:
-    try:
-        numbers = [float(text) for text in texts]
-    except ValueError:
-        return " ".join(texts)  # MPPIConfig raises an error for unknown words
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _run(run: training.Run, plant: Env, planner: MPPI, options: Plan) -> None:
@@ -306,7 +279,7 @@ def _run(run: training.Run, plant: Env, planner: MPPI, options: Plan) -> None:
             say(f"  {label:<30}{text}")
     paths = {"episodes": str(run.folder / "episode-*.npz"), "report": str(run.folder / "report.json")}
     if options.video:
-        camera = viz.parsed_camera(options.camera)
+        camera = arguments.video_camera(options.camera)
         paths["video"] = tried(viz.write_video, plant, complete[0].states, run.folder / "video.mp4", camera=camera)
     paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"
     say_entries(**paths)

@@ -13,17 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from lyceum_warp import algos, binding, controllers, core, engines, training, viz  # each name loads at its first use
-from lyceum_warp.cli.arguments import (
-    CameraWords,
-    EnvFlags,
-    OptionFlags,
-    ParamWords,
-    Physics,
-    Repeated,
-    given,
-    parameter,
-    parameters,
-)
+from lyceum_warp.cli import arguments
 from lyceum_warp.cli.display import console, curve_table, note, say, say_entries, tried
 from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
@@ -62,13 +52,13 @@ def _default_texts() -> dict[str, str]:
     return {name: f"({', '.join(each)})" for name, each in texts.items()}
 
 
-class Hyperparameters(OptionFlags, options=[*_CONFIGS.values()], defaults=_default_texts()):
+class Hyperparameters(arguments.OptionFlags, options=[*_CONFIGS.values()], defaults=_default_texts()):
     """Hyperparameters. For each flag, the help lists the algorithms that have the flag, with their defaults."""
 
     def on_top_of(self, config: Any, algorithm: str) -> Any:
         """Override a configuration's hyperparameters with the given flags."""
         kind = training.learner_classes(algorithm)[1]
-        flags = given(self)
+        flags = arguments.given(self)
         owners = {
             name: [key for key, config in _CONFIGS.items() if name in config.__dataclass_fields__] for name in flags
         }
@@ -130,7 +120,7 @@ class Train:
     network: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """A network of your own, path/to/file.py:Class: a torch module, made by Class(observations, actions), that computes
     the mean actions of npg, ppo and distill. The run's folder has a copy of the file."""
-    setting: Repeated = ()
+    setting: arguments.Repeated = ()
     """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
@@ -190,7 +180,7 @@ class Train:
     Runs are identical bit for bit only with the same number of threads. --nthread sets the threads of the mujoco
     engine.
     """
-    param: ParamWords = ()
+    param: arguments.ParamWords = ()
     clips: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")] = ()
     """Motions for a task that tracks clips, such as g1_tracking: files and folders of the formats that lw.load_clips
     reads. The run's folder has a copy."""
@@ -199,7 +189,7 @@ class Train:
     video_every: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 0)")] = None
     """Number of iterations between two videos of the mean policy, such as videos/000100.mp4 in the run's folder. 0
     writes no videos."""
-    camera: CameraWords = ()
+    camera: arguments.CameraWords = ()
     transfer: bool = False
     """Whether to compare the policy's returns between the engines, and between the task's sets of physics options, at
     the end, and write transfer.json. Compiling the kernels of the Warp engine for a CPU may take minutes.
@@ -216,8 +206,8 @@ class Train:
     """Whether to plot the learning curve at the end."""
     require_return: float | None = None
     """Exit with code 1 unless the return of the trained mean policy exceeds this number."""
-    env: Annotated[EnvFlags, tyro.conf.arg(name="world")] = EnvFlags()
-    physics: Physics = Physics()
+    env: Annotated[arguments.EnvFlags, tyro.conf.arg(name="world")] = arguments.EnvFlags()
+    physics: arguments.Physics = arguments.Physics()
     hyperparameters: Annotated[Hyperparameters, tyro.conf.arg(name="hyperparameter")] = Hyperparameters()
 
     def run(self, callbacks: Sequence[Callable[[Any], object]] = ()) -> int:
@@ -259,7 +249,7 @@ class Train:
 
     def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:
         settings = self._settings({} if source is None else source.config)
-        camera = viz.parsed_camera(self.camera)
+        camera = arguments.video_camera(self.camera)
         if camera is not None and not (self.video or settings["video_every"]):
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         with team.together():  # check all options before the folder is created
@@ -301,7 +291,7 @@ class Train:
             raise ValueError("--seeds needs a task, and replaces --seed and --resume: omit these")
         if self.jobs != 1 and not self.seeds:
             raise ValueError("--jobs has no effect without --seeds: add --seeds 5, or omit --jobs")
-        if self.network is not None and (self.from_run or given(self.hyperparameters).keys() & _SIZES):
+        if self.network is not None and (self.from_run or arguments.given(self.hyperparameters).keys() & _SIZES):
             raise ValueError("--network replaces --from, --hidden, --activation and --recurrent: omit these")
         if self.go_on and self.out is None:
             raise ValueError("--continue needs the run's folder: add --out FOLDER")
@@ -347,7 +337,7 @@ class Train:
         if settings["target_return"] is not None:
             callbacks.insert(0, training.TargetReturn(settings["target_return"]))
         if every := settings["video_every"]:
-            callbacks.append(training.Videos(every, camera=viz.parsed_camera(self.camera), progress=display.work))
+            callbacks.append(training.Videos(every, camera=arguments.video_camera(self.camera), progress=display.work))
         if settings["tensorboard"]:
             callbacks.append(training.TensorBoard())
         if settings["wandb"] is not None:
@@ -366,10 +356,10 @@ class Train:
         algorithm = self.algorithm or base.algorithm
         if algorithm == "sac" and self.network is not None:
             raise ValueError("sac takes no --network: omit it, or use --algorithm ppo or npg")
-        flags = self._given("nworld", "seed") | given(self.env) | given(self.physics)
+        flags = self._given("nworld", "seed") | arguments.given(self.env) | arguments.given(self.physics)
         if "solver" in flags:
             flags["solver"] = {**(base.options.physics.solver or {}), **flags["solver"]}
-        options, params = base.options.changed(flags), parameters(self.param)
+        options, params = base.options.changed(flags), arguments.parameters(self.param)
         if self.clips:
             from lyceum_warp.cli.clips import clips_of_task
 
@@ -396,7 +386,7 @@ class Train:
             raise ValueError(f"--setting has no effect with {algorithm}: use the flags of its hyperparameters")
         saved = {} if source is None or source.config["algorithm"] != kind.algorithm else source.config[kind.algorithm]
         try:
-            return None if config is None else config(**{**saved, **dict(map(parameter, self.setting))})
+            return None if config is None else config(**{**saved, **dict(map(arguments.parameter, self.setting))})
         except TypeError as error:
             raise ValueError(f"--setting {' '.join(self.setting)}: {error}") from error
 
@@ -459,7 +449,7 @@ class Train:
             entries["teacher"] = [str(Path(word).resolve()) if Path(word).exists() else word for word in words]
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
-            for name, value in given(self.hyperparameters).items():
+            for name, value in arguments.given(self.hyperparameters).items():
                 if (fitted_value := getattr(fitted, name)) != value:
                     raise ValueError(
                         f"the networks in {self.from_run or self.resume} have {name} {fitted_value}, not {value}: omit "
@@ -507,7 +497,7 @@ class Train:
         if self.plot:
             paths["curve"] = tried(training.learning_curve, run)
         if self.video and choice is not None:
-            camera, path = viz.parsed_camera(self.camera), run.folder / "video.mp4"
+            camera, path = arguments.video_camera(self.camera), run.folder / "video.mp4"
             policy, seed = training.load(run, which=choice.which), algos.evaluation_seed(env.options.seed + 1)
             paths["video"] = tried(viz.policy_video, env, policy, path, seed, camera=camera)
         paths["next"] = f"lyceum-warp view {run.folder}, or lyceum-warp report {run.folder}"

@@ -9,16 +9,8 @@ import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
 from lyceum_warp.binding.parts import sizes
+from lyceum_warp.core import spaces
 from lyceum_warp.core.done import FAULTS
-from lyceum_warp.core.spaces import (
-    OWN_PARTS,
-    Space,
-    action_space,
-    control_ranges,
-    control_scale,
-    picture_space,
-    state_space,
-)
 from lyceum_warp.core.task import MEMORIES
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.kernels import state, step_types, transitions
@@ -29,7 +21,7 @@ from lyceum_warp.support.tensors import check_tensor
 def own_bytes_per_world(task: BoundTask) -> int:
     """Estimate the bytes that each world needs outside the engine's arrays."""
     own, snapshots = own_parts(task), [field for field in task.fields if field.snapshot]
-    state_size = state_space(task.model, snapshots, task.dynamics, own).size
+    state_size = spaces.state_space(task.model, snapshots, task.dynamics, own).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
     total = 4 * copies + 8 * state_size + 8 * observations + 300
@@ -49,7 +41,7 @@ def own_parts(task: BoundTask) -> dict[str, int]:
     return found | {name: size for name, size in own.items() if size}
 
 
-def memory_columns(task: BoundTask, space: Space) -> dict[str, slice]:
+def memory_columns(task: BoundTask, space: spaces.Space) -> dict[str, slice]:
     """Get the columns of ``memory`` and ``lasting_memory`` in a state."""
     ends = {name: [space.parts[part] for part in layout] for name, layout in task.layouts.memory.items() if layout}
     return {name: slice(parts[0].start, parts[-1].stop) for name, parts in ends.items()}
@@ -78,7 +70,7 @@ class WorldArrays:
     def _allocate_pictures(self, final: bool) -> None:
         self.pictures, self._final_pictures = None, list[tuple[Any, Any]]()
         self.picture_groups, self.final_picture_groups = {}, {}
-        self.picture_spaces = {camera.group: picture_space(camera) for camera in self.task.cameras}
+        self.picture_spaces = {camera.group: spaces.picture_space(camera) for camera in self.task.cameras}
         if not self.task.cameras:
             return
         from lyceum_warp.engines.pictures import Pictures  # loads MuJoCo Warp
@@ -128,9 +120,9 @@ class WorldArrays:
         self.params = self.task.parameters.array(self.device)
         self.weights = self.task.parameters.weights(self.device)
         self.transition.params, self.transition.weights = self.params, self.weights
-        self.action_space = action_space(model, task.action_range, self.task.layouts.actions)
-        self.obs_spaces = {group: Space.of(layout) for group, layout in self.task.layouts.obs.items()}
-        self.state_space = state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
+        self.action_space = spaces.action_space(model, task.action_range, self.task.layouts.actions)
+        self.obs_spaces = {group: spaces.Space.of(layout) for group, layout in self.task.layouts.obs.items()}
+        self.state_space = spaces.state_space(model, self.engine.snapshots, self.task.dynamics, own_parts(self.task))
 
     def _allocate_shared(self) -> None:
         layouts = self.task.layouts.shared
@@ -168,9 +160,9 @@ class WorldArrays:
         self.action, self.safe_action = wp.zeros((n, naction), dtype=float), wp.zeros((n, naction), dtype=float)
         self.transition.action = self.safe_action
         self.buffers["action"] = torch_view(self.action)
-        ranges, scale = control_ranges(model), np.zeros((model.nu, 2))
+        ranges, scale = spaces.control_ranges(model), np.zeros((model.nu, 2))
         if self.task.functions["control"] is None:
-            scale = control_scale(model, task.action_range)
+            scale = spaces.control_scale(model, task.action_range)
         self.ranges: wp.array = wp.array(ranges, dtype=float)
         self.scale: wp.array = wp.array(scale, dtype=float)
 
@@ -223,7 +215,7 @@ class WorldArrays:
 
     def _own_parts(self) -> Iterator[tuple[wp.array, wp.array]]:
         columns = memory_columns(self.task, self.state_space)
-        columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in OWN_PARTS}
+        columns |= {name: self.state_space.parts[name] for name in own_parts(self.task) if name in spaces.OWN_PARTS}
         for name, place in columns.items():
             yield self._clearable[name], self.state[:, place]
 

@@ -112,37 +112,6 @@ def quat_to_mat(q: wp.vec4) -> wp.mat33:
 
 
 @wp.func
-def quat_from_mat(m: wp.mat33) -> wp.vec4:
-    """Convert a rotation matrix, such as a row of ``site_xmat``, to a quaternion.
-
-    The result may have the opposite sign of mju_mat2Quat's result. The trace and the diagonal show which of w, x, y, z
-    is large enough to divide by (Shepperd 1978, "Quaternion from rotation matrix").
-    """
-    q = wp.vec4()
-    if m[0, 0] + m[1, 1] + m[2, 2] > 0.0:
-        q[0] = 0.5 * wp.sqrt(1.0 + m[0, 0] + m[1, 1] + m[2, 2])
-        q[1] = 0.25 * (m[2, 1] - m[1, 2]) / q[0]
-        q[2] = 0.25 * (m[0, 2] - m[2, 0]) / q[0]
-        q[3] = 0.25 * (m[1, 0] - m[0, 1]) / q[0]
-    elif m[0, 0] > m[1, 1] and m[0, 0] > m[2, 2]:
-        q[1] = 0.5 * wp.sqrt(1.0 + m[0, 0] - m[1, 1] - m[2, 2])
-        q[0] = 0.25 * (m[2, 1] - m[1, 2]) / q[1]
-        q[2] = 0.25 * (m[0, 1] + m[1, 0]) / q[1]
-        q[3] = 0.25 * (m[0, 2] + m[2, 0]) / q[1]
-    elif m[1, 1] > m[2, 2]:
-        q[2] = 0.5 * wp.sqrt(1.0 - m[0, 0] + m[1, 1] - m[2, 2])
-        q[0] = 0.25 * (m[0, 2] - m[2, 0]) / q[2]
-        q[1] = 0.25 * (m[0, 1] + m[1, 0]) / q[2]
-        q[3] = 0.25 * (m[1, 2] + m[2, 1]) / q[2]
-    else:
-        q[3] = 0.5 * wp.sqrt(1.0 - m[0, 0] - m[1, 1] + m[2, 2])
-        q[0] = 0.25 * (m[1, 0] - m[0, 1]) / q[3]
-        q[1] = 0.25 * (m[0, 2] + m[2, 0]) / q[3]
-        q[2] = 0.25 * (m[1, 2] + m[2, 1]) / q[3]
-    return q
-
-
-@wp.func
 def quat_from_euler(angles: wp.vec3) -> wp.vec4:
     """Make the rotation by three angles, in rad: about x, then about the new y, then about the new z.
 
@@ -183,9 +152,3 @@ def quat_random(rng: wp.array[wp.uint32]) -> wp.vec4:
     s = uniform(rng, 0.0, 2.0 * wp.pi)
     a, b = wp.sqrt(1.0 - u), wp.sqrt(u)
     return wp.vec4(a * wp.sin(t), a * wp.cos(t), b * wp.sin(s), b * wp.cos(s))
-
-
-@wp.func
-def angle_between(a: wp.vec3, b: wp.vec3) -> float:
-    """Return the angle between two vectors that are not zero, from 0 to pi rad: atan2(|a x b|, a . b)."""
-    return wp.atan2(wp.length(wp.cross(a, b)), wp.dot(a, b))

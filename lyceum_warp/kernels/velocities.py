@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from lyceum_warp.kernels.rotations import quat_rotate_inverse
-
 
 @wp.func
 def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.spatial_vector:
@@ -18,21 +16,3 @@ def body_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3) -> wp.s
     """
     w = wp.spatial_top(cvel)
     return wp.spatial_vector(w, wp.spatial_bottom(cvel) + wp.cross(w, point - com))
-
-
-@wp.func
-def local_velocity(cvel: wp.spatial_vector, com: wp.vec3, point: wp.vec3, quat: wp.vec4) -> wp.spatial_vector:
-    """Return a body's velocity at a point, as (angular, linear) in the axes of a frame, in rad/s and m/s.
-
-    The result equals mj_objectVelocity's with flg_local = 1.
-
-    Args:
-        cvel: See ``body_velocity``.
-        com: See ``body_velocity``.
-        point: See ``body_velocity``.
-        quat: The orientation of the frame (w, x, y, z), such as the body's row of ``xquat``.
-    """
-    v = body_velocity(cvel, com, point)
-    return wp.spatial_vector(
-        quat_rotate_inverse(quat, wp.spatial_top(v)), quat_rotate_inverse(quat, wp.spatial_bottom(v))
-    )

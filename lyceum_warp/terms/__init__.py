@@ -13,7 +13,6 @@ argument's name has the same meaning in all functions:
     angular_velocity: angular velocity of the base in the base's axes (rad/s)
     angular_velocity_variance: squared error at which the term is 1 / e (rad^2/s^2)
     at: index of the first number
-    base: index of the base's body
     base_height: height of the base's origin in the world (m)
     bodies: array of Params: indices of bodies
     body: index of a body
@@ -37,7 +36,6 @@ argument's name has the same meaning in all functions:
     feet: array of Params: indices of the feet's sites
     flag: row of memory with 1 number, which is 1 or 0
     foot: index of a foot, from 0
-    foot_contacts: array of Params: indices in ``sensordata`` of a contact or touch sensor of each foot
     foot_forces: array of Params: indices in ``sensordata`` of the contact force on each foot (N)
     foot_height: height of a foot above the ground (m)
     foot_velocities: array of Params: indices in ``sensordata`` of each foot's velocity in the world's axes (m/s)
@@ -67,7 +65,6 @@ argument's name has the same meaning in all functions:
     kp: stiffness of a servo (N m/rad)
     kp_scale: range of the factors of kp
     least: smallest integer
-    least_air_time: shortest air time for which a foot counts (s)
     least_command: ``command_size`` above which the robot should move
     least_forward_velocity: smallest velocity of a command to walk straight ahead (m/s)
     least_height: least height of the base (m)
@@ -75,7 +72,6 @@ argument's name has the same meaning in all functions:
     linear_velocity_variance: squared error at which the term is 1 / e (m^2/s^2)
     low: lower end of the range
     most: largest integer
-    most_air_time: longest air time for which a foot counts (s)
     noise: bound of uniform noise, or standard deviation of normal noise
     offset: bounds of the offset (m)
     peak_height: row of memory: greatest height of each foot since its last landing (m)
@@ -90,8 +86,6 @@ argument's name has the same meaning in all functions:
     rng: the world's random stream
     rolling_friction: range of the rolling friction
     row: the row
-    running_command: smallest ``command_size`` at which the robot should run
-    running_pose_std: array of Params: standard deviation of each joint while running (rad)
     saturation_torque: torque of a motor at rest (N m)
     scale: range of the factors
     seconds: range of the duration (s)
@@ -105,10 +99,8 @@ argument's name has the same meaning in all functions:
     standing: row of memory with 1 number, which is 1 if the robot should stand
     standing_pose_std: array of Params: standard deviation of each joint while standing (rad)
     substep_dt: seconds in a substep
-    subtree_angmom: the field
     swing_height: row of memory: greatest height of each foot in its last swing (m)
     swing_target: desired height of a foot in its swing (m)
-    swing_time: row of memory: duration of each foot's last swing (s)
     target: the row to write
     target_heading: the commanded heading (rad)
     target_height: desired height of the base (m)
@@ -120,7 +112,6 @@ argument's name has the same meaning in all functions:
     velocity: velocity in the world's axes (m/s)
     velocity_limit: no-load speed of a motor (rad/s)
     walking_pose_std: array of Params: standard deviation of each joint while walking (rad)
-    wanted_air_time: shortest duration of a rewarded swing (s)
     width: number of elements of one value in a history
 """
 

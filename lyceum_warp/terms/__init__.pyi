@@ -4,7 +4,6 @@ from lyceum_warp.terms.action_changes import (
 )
 from lyceum_warp.terms.base_motion import (
     alive as alive,
-    angular_momentum_l2 as angular_momentum_l2,
     angular_velocity as angular_velocity,
     base_height as base_height,
     base_height_l2 as base_height_l2,
@@ -18,8 +17,6 @@ from lyceum_warp.terms.base_motion import (
     too_low as too_low,
     track_angular_velocity as track_angular_velocity,
     track_linear_velocity as track_linear_velocity,
-    track_planar_velocity as track_planar_velocity,
-    track_yaw_rate as track_yaw_rate,
     upright as upright,
     velocity_error as velocity_error,
     vertical_velocity_l2 as vertical_velocity_l2,
@@ -27,7 +24,6 @@ from lyceum_warp.terms.base_motion import (
 )
 from lyceum_warp.terms.draws import (
     chosen as chosen,
-    draw_delay as draw_delay,
     draw_friction as draw_friction,
     draw_row as draw_row,
     log_uniform as log_uniform,
@@ -39,16 +35,13 @@ from lyceum_warp.terms.draws import (
 )
 from lyceum_warp.terms.feet import (
     clearance as clearance,
-    feet_in_air as feet_in_air,
     follow_swing as follow_swing,
     foot_clearance as foot_clearance,
     foot_slip as foot_slip,
     foot_swing_height as foot_swing_height,
     ground_speed as ground_speed,
     landed as landed,
-    long_swings as long_swings,
     run_clocks as run_clocks,
-    run_contact_clocks as run_contact_clocks,
     sensor_vector as sensor_vector,
     soft_landing as soft_landing,
 )
@@ -61,12 +54,10 @@ from lyceum_warp.terms.histories import (
 )
 from lyceum_warp.terms.joints import (
     absolute_power as absolute_power,
-    gait_pose as gait_pose,
     joint_acceleration_l2 as joint_acceleration_l2,
     joint_limits as joint_limits,
     joint_velocity_l2 as joint_velocity_l2,
     pose as pose,
-    pose_l1 as pose_l1,
     pose_l2 as pose_l2,
     posture as posture,
     power as power,

@@ -80,27 +80,6 @@ def yaw_rate_error(command: wp.vec3, angular_velocity: wp.vec3) -> float:
 
 
 @wp.func
-def track_planar_velocity(command: wp.vec3, linear_velocity: wp.vec3, linear_velocity_variance: float) -> float:
-    """Reward a robot that follows the commanded horizontal velocity: exp(-|c_xy - v_xy|^2 / variance).
-
-    Source: legged_gym (Rudin et al. 2022, "Learning to walk in minutes using massively parallel deep reinforcement
-    learning").
-    """
-    error = velocity_error(command, linear_velocity)
-    return wp.exp(-error * error / linear_velocity_variance)
-
-
-@wp.func
-def track_yaw_rate(command: wp.vec3, angular_velocity: wp.vec3, angular_velocity_variance: float) -> float:
-    """Reward a robot that follows the commanded yaw rate: exp(-(c_yaw - w_z)^2 / variance).
-
-    Source: legged_gym (Rudin et al. 2022).
-    """
-    error = yaw_rate_error(command, angular_velocity)
-    return wp.exp(-error * error / angular_velocity_variance)
-
-
-@wp.func
 def vertical_velocity_l2(linear_velocity: wp.vec3) -> float:
     """v_z^2, (m/s)^2.
 
@@ -116,15 +95,6 @@ def roll_pitch_rate_l2(angular_velocity: wp.vec3) -> float:
     Source: legged_gym (Rudin et al. 2022). mjlab's ``body_angular_velocity_penalty`` uses the world's axes.
     """
     return angular_velocity[0] * angular_velocity[0] + angular_velocity[1] * angular_velocity[1]
-
-
-@wp.func
-def angular_momentum_l2(subtree_angmom: Row[wp.vec3], base: int) -> float:
-    """Return the squared angular momentum of the whole robot about its centre of mass, |L|^2, (kg m^2/s)^2.
-
-    Source: mjlab 1.6.0, ``angular_momentum_penalty``.
-    """
-    return wp.length_sq(subtree_angmom[base])
 
 
 @wp.func

@@ -37,15 +37,6 @@ def draw_row(row: Row[float], low: float, high: float, rng: Row[wp.uint32]):
 
 
 @wp.func
-def draw_delay(delay: Row[float], least: int, most: int, rng: Row[wp.uint32]):
-    """Draw the delay of ``delayed_action``: a whole number of steps from ``least`` to ``most``.
-
-    The history of actions must hold at least ``most`` values.
-    """
-    delay[0] = float(uniform_int(rng, least, most))
-
-
-@wp.func
 def scale_elements(row: Row[float], indices: wp.array[int], scale: wp.vec2, rng: Row[wp.uint32]):
     """Multiply each listed element, for example of ``dof_armature``, by its own factor from U(scale[0], scale[1])."""
     for i in range(indices.shape[0]):

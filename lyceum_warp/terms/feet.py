@@ -1,8 +1,8 @@
 """Measure how long feet are in contact, and compute reward terms for swings, slips and landings.
 
-The tables ``feet`` (sites), ``foot_velocities``, ``foot_forces`` and ``foot_contacts`` (sensors) must list the feet in
-the same order. Call ``run_clocks`` in ``substep``, and ``follow_swing`` in ``advance``. Heights are measured from the
-plane z = 0. On uneven ground, a task must measure the heights itself and sum ``clearance`` over the feet.
+The tables ``feet`` (sites), ``foot_velocities`` and ``foot_forces`` (sensors) must list the feet in the same order.
+Call ``run_clocks`` in ``substep``, and ``follow_swing`` in ``advance``. Heights are measured from the plane z = 0. On
+uneven ground, a task must measure the heights itself and sum ``clearance`` over the feet.
 """
 
 import warp as wp
@@ -24,35 +24,12 @@ def ground_speed(velocity: wp.vec3) -> float:
 
 @wp.func
 def run_clocks(foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], substep_dt: float):
-    contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
-    air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
-
-
-@wp.func
-def run_clocks(
-    foot: int, touching: bool, contact_time: Row[float], air_time: Row[float], swing_time: Row[float], substep_dt: float
-):
     """Advance a foot's contact time or air time by a substep, and set the other to 0.
 
-    When the foot lands, the duration of its swing is stored in ``swing_time``, if this argument is given. Source: mjlab
-    1.6.0, ``ContactSensor``.
+    Source: mjlab 1.6.0, ``ContactSensor``.
     """
-    if touching and air_time[foot] > 0.0:
-        swing_time[foot] = air_time[foot] + substep_dt
-    run_clocks(foot, touching, contact_time, air_time, substep_dt)
-
-
-@wp.func
-def run_contact_clocks(
-    sensordata: Row[float],
-    foot_contacts: wp.array[int],
-    contact_time: Row[float],
-    air_time: Row[float],
-    substep_dt: float,
-):
-    """Call ``run_clocks`` for every foot; a foot touches the ground if its contact or touch sensor is above 0."""
-    for foot in range(foot_contacts.shape[0]):
-        run_clocks(foot, sensordata[foot_contacts[foot]] > 0.0, contact_time, air_time, substep_dt)
+    contact_time[foot] = wp.where(touching, contact_time[foot] + substep_dt, 0.0)
+    air_time[foot] = wp.where(touching, 0.0, air_time[foot] + substep_dt)
 
 
 @wp.func
@@ -158,32 +135,4 @@ def soft_landing(
     for foot in range(foot_forces.shape[0]):
         if landed(contact_time[foot] - substep_dt, dt):
             total += wp.length(sensor_vector(sensordata, foot_forces[foot]))
-    return active * total
-
-
-@wp.func
-def feet_in_air(air_time: Row[float], least_air_time: float, most_air_time: float, active: float) -> float:
-    """Return ``active`` times the number of feet whose air time is between the two bounds.
-
-    Source: mjlab 1.6.0, ``feet_air_time``.
-    """
-    total = float(0.0)
-    for foot in range(air_time.shape[0]):
-        if air_time[foot] > least_air_time and air_time[foot] < most_air_time:
-            total += 1.0
-    return active * total
-
-
-@wp.func
-def long_swings(
-    contact_time: Row[float], swing_time: Row[float], wanted_air_time: float, dt: float, active: float
-) -> float:
-    """Return the sum of (swing time - wanted) over the feet that have ``landed``, times ``active``, s.
-
-    Source: legged_gym (Rudin et al. 2022), ``feet_air_time``.
-    """
-    total = float(0.0)
-    for foot in range(contact_time.shape[0]):
-        if landed(contact_time[foot], dt):
-            total += swing_time[foot] - wanted_air_time
     return active * total

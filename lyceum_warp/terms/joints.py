@@ -45,36 +45,6 @@ def pose(
 
 
 @wp.func
-def gait_pose(
-    command: wp.vec3,
-    qpos: Row[float],
-    joint_qpos: wp.array[int],
-    default_pose: wp.array[float],
-    standing_pose_std: wp.array[float],
-    walking_pose_std: wp.array[float],
-    running_pose_std: wp.array[float],
-    least_command: float,
-    running_command: float,
-) -> float:
-    """Compute ``pose``, but with ``running_pose_std`` if ``command_size`` is at least ``running_command``.
-
-    Source: mjlab 1.6.0, ``variable_posture``.
-    """
-    if command_size(command) >= running_command:
-        return posture(qpos, joint_qpos, default_pose, running_pose_std)
-    return pose(command, qpos, joint_qpos, default_pose, standing_pose_std, walking_pose_std, least_command)
-
-
-@wp.func
-def pose_l1(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]) -> float:
-    """Return the sum of |q - q_0| over the joints, rad."""
-    total = float(0.0)
-    for j in range(joint_qpos.shape[0]):
-        total += wp.abs(qpos[joint_qpos[j]] - default_pose[j])
-    return total
-
-
-@wp.func
 def pose_l2(qpos: Row[float], joint_qpos: wp.array[int], default_pose: wp.array[float]) -> float:
     """Return the sum of (q - q_0)^2 over the joints, rad^2."""
     total = float(0.0)

@@ -15,7 +15,6 @@ from lyceum_warp.env import Env, make
 from lyceum_warp.support.docstrings import document_attributes
 from lyceum_warp.support.validate import whole_number
 from lyceum_warp.testing import (
-    episode_rules as episodes,
     fault_rules as faults,
     form_rules as form,
     index_rules as indices,
@@ -28,7 +27,7 @@ log = logging.getLogger(__name__)
 
 CHECKS: tuple[Callable[[Context], None], ...] = tuple(
     value
-    for module in (state, episodes, indices, faults, form, physics)
+    for module in (state, indices, faults, form, physics)
     for name, value in vars(module).items()
     if name.startswith("check_")
 )

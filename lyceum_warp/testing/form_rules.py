@@ -1,4 +1,4 @@
-"""Check the optional parts of a task: noise, metrics, memory and events."""
+"""Check the optional parts of a task: events and substeps."""
 
 import torch
 
@@ -6,93 +6,6 @@ from lyceum_warp.env import memory_columns
 from lyceum_warp.kernels.step_types import OUTCOMES
 from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import SHORT, Context
-
-
-def check_noise(ctx: Context) -> None:
-    """Equal states give equal noise. Worlds, episodes and steps have different noise."""
-    env = ctx.a
-    if not env.task.noisy_groups:
-        return
-    env.step(ctx.actions(1)[0])
-    state = env.get_state()
-    ctx.equal(env.get_obs(state), env.obs, "the noise of a state")
-    parts = env.state_space.parts
-    # these states differ only in their random streams
-    same = state[:1].expand_as(state).contiguous()
-    changes: dict[str, torch.Tensor] = {"key": state[:, parts["key"]]}
-    for name in ("episode", "step"):
-        changes[name] = same[:, parts[name]] + torch.arange(env.nworld, device=state.device)[:, None].double()
-    differ = {}
-    for name, values in changes.items():
-        moved = same.clone()
-        moved[:, parts[name]] = values
-        shown = [env.get_obs(moved, group=group) for group in env.task.noisy_groups]
-        differ[name] = any(bool((obs[1:] != obs[:1]).any(dim=1).all()) for obs in shown)
-    if any(differ.values()):  # a task's noise may have scale 0
-        for name, found in differ.items():
-            ctx.that(found, f"the noise is the same for every {'world' if name == 'key' else name}")
-
-
-def check_metrics(ctx: Context) -> None:
-    """``episode_metrics`` are sums of ``metrics`` over an episode without faults. They are part of the state."""
-    a, b, horizon = ctx.a, ctx.b, 4
-    if not a.metrics:
-        return
-    with ctx.changed(a, b, horizon=horizon, autoreset=True):
-        sums = {name: torch.zeros_like(values) for name, values in a.metrics.items()}
-        for i, action in enumerate(ctx.actions(2 * horizon + 1)):
-            if i == horizon + 1:
-                action[-1] = torch.nan
-            a.step(action)
-            for name, values in a.metrics.items():
-                sums[name] += values
-                ctx.equal(a.episode_metrics[name], sums[name], f"the sums of {name} at step {i}")
-                ctx.that((values[ctx.faulty(a)] == 0).all(), f"{name} of a fault: {values}")
-                sums[name][a.done] = 0.0
-            if i == horizon + 1:
-                ctx.that(ctx.faulty(a)[-1], "an action of NaN is not a fault")
-        b.set_state(a.get_state())
-        for name in a.metrics:
-            ctx.equal(b.episode_metrics[name], sums[name], f"the sums of {name} after set_state")
-        for reset in (a.reset, a.rand_reset):
-            reset()
-            for name, values in a.episode_metrics.items():
-                ctx.that((values == 0).all(), f"the sums of {name} after {reset.__name__} are {values.tolist()}")
-
-
-def check_success_steps(ctx: Context) -> None:
-    """``success`` requires ``success_steps`` successes in a row.
-
-    The number of successes so far is part of the state, and a reset clears it.
-    """
-    a, b, needed = ctx.a, ctx.b, int(ctx.a.task.definition.success_steps)
-    if needed == 1:
-        return
-    column = a.state_space.parts["success_steps"]
-    with ctx.changed(a, b, horizon=0, autoreset=False):
-        state = a.get_state()
-        state[:, column] = torch.arange(a.nworld, dtype=state.dtype, device=state.device)[:, None] % needed
-        a.set_state(state)
-        count = state[:, column].squeeze(1)
-        ctx.equal(a.get_state(), state, "the state with another count after set_state (world, column)")
-        ctx.that(not a.success.any(), f"success is {a.success.tolist()} in states with the counts {count.tolist()}")
-        for i, action in enumerate(ctx.actions(SHORT + needed)):
-            a.step(action)
-            state = a.get_state()
-            found, good = state[:, column].squeeze(1), ~ctx.faulty(a)
-            full = state.clone()
-            full[:, column] = float(needed)
-            b.set_state(full)
-            calm = ctx.calm(a) & good  # after the evaluation of the step, an event may change the state
-            count = torch.where(calm & b.success, (count + 1).clamp(max=needed), 0.0)
-            ctx.equal(found[calm], count[calm], f"the count of steps in a row after step {i}")
-            ctx.equal(a.success[good], found[good] == needed, f"success of step {i} with the counts {found.tolist()}")
-            count = found
-        for reset in (a.reset, a.rand_reset):
-            a.set_state(full)
-            reset()
-            found = a.get_state()[:, column]
-            ctx.that((found == 0).all(), f"the counts after {reset.__name__} are {found.squeeze(1).tolist()}")
 
 
 def check_events(ctx: Context) -> None:
@@ -163,25 +76,3 @@ def check_substep(ctx: Context) -> None:
             found = b.get_state()[:, : a.engine.integration_size]
             wanted = wanted[:, : a.engine.integration_size]
             ctx.equal(found[calm], wanted[calm], f"the physics of step {i} without substeps")
-
-
-def check_lasting_memory(ctx: Context) -> None:
-    """Resets preserve lasting memory, except for ``rand_reset(seed)``, which clears it."""
-    a, b = ctx.a, ctx.b
-    if (columns := memory_columns(a.task, a.state_space).get("lasting_memory")) is None:
-        return
-    state = a.get_state()
-    state[:, columns] = 3.25
-    writes = a.task.writes
-    a.set_state(state)
-    if "lasting_memory" not in writes.get("initialize", ()):
-        a.reset()
-        ctx.equal(a.get_state()[:, columns], state[:, columns], "lasting_memory after reset")
-        if "lasting_memory" not in writes.get("randomize", ()):
-            a.rand_reset()
-            ctx.equal(a.get_state()[:, columns], state[:, columns], "lasting_memory after rand_reset")
-    a.set_state(state)
-    a.rand_reset(ctx.seed, ctx.mask(0))
-    found, fresh = a.get_state()[:, columns], b.get_state()[:, columns]
-    ctx.equal(found[:1], fresh[:1], "lasting_memory after rand_reset with a seed")
-    ctx.equal(found[1:], state[1:, columns], "lasting_memory of other worlds")

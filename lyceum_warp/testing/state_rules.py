@@ -1,12 +1,10 @@
-"""Check the state, resets and randomness."""
+"""Check the state, resets, randomness and graphs."""
 
 import numpy as np
 import torch
-import warp as wp
 
 from lyceum_warp.core import COUNTERS, FAULTS
 from lyceum_warp.env import Env
-from lyceum_warp.support.arrays import launch_worlds, torch_view
 from lyceum_warp.testing.context import OUTCOMES, SHORT, Context
 
 
@@ -245,36 +243,13 @@ def check_keyframe(ctx: Context) -> None:
             ctx.equal(found.float(), wanted.float().expand_as(found).contiguous(), f"{part} of the keyframe {name!r}")
 
 
-def check_rejection(ctx: Context) -> None:
-    """Each world draws initial states until one is accepted, up to the maximum number of draws."""
-    a, b = ctx.a, ctx.b
-    reject = a.task.kernels.reject_worlds
-    if reject is None:
-        return
-    task, engine = a.task.definition, a.engine
-    count, rejected = torch.zeros(a.nworld, dtype=torch.int), wp.zeros(a.nworld, dtype=bool, device=a.device)
-    reset = engine.reset
-
-    def counted(mask: wp.array) -> None:
-        count.add_(torch.from_numpy(mask.numpy().astype(np.int32)))
-        reset(mask)
-
-    with ctx.changed(a, graphs=False):
-        for i in range(6):
-            state = a.get_state()
-            count.zero_()
-            engine.reset = counted  # type: ignore[method-assign]
-            try:
-                a.rand_reset()
-            finally:
-                del engine.reset
-            ctx.that((count >= 1).all() and (count <= task.draws).all(), f"reset {i} took {count.tolist()} draws")
-            if not task.settle:
-                args = [a.worlds.everyone, a.worlds.after, a.worlds.params, rejected]
-                launch_worlds(reject, a.nworld, args, a.device)
-                bad = torch_view(rejected).cpu() & (count < task.draws)
-                ctx.that(not bad.any(), f"reset {i} kept a rejected state after {count.tolist()} draws")
-            alone = ctx.mask(i % a.nworld)
-            b.set_state(state)
-            b.rand_reset(mask=alone)
-            ctx.equal(b.get_state()[alone], a.get_state()[alone], f"the state of world {i % a.nworld}, reset alone")
+def check_graphs(ctx: Context) -> None:
+    """Results are equal bit for bit with and without graphs."""
+    a, b, n = ctx.a, ctx.b, 20
+    with ctx.changed(a, horizon=6, graphs=True), ctx.changed(b, horizon=6, graphs=False):
+        actions = ctx.actions(n)
+        ctx.same_runs(ctx.run(b, actions), ctx.run(a, actions), "without graphs")
+        for _ in range(3):
+            a.rand_reset(ctx.seed)
+            b.rand_reset(ctx.seed)
+            ctx.equal(b.get_state(), a.get_state(), "the state after rand_reset without graphs")

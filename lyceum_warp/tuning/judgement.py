@@ -14,7 +14,7 @@ TOLERANCES = {"strict": 0.02, "loose": 0.05, "any": math.inf}
 
 RANK_CORRELATIONS = {"strict": 0.9, "loose": 0.8, "any": -1.0}
 """Smallest accepted rank correlation between returns under the planner's physics and returns under the plant's physics;
-see bench/rank_loss.py."""
+see bench/results/planning.md."""
 
 LEAST_GAIN = 1.03
 """Returns are compared only if a setting reaches this speed-up or takes less memory."""

@@ -2,7 +2,6 @@ from lyceum_warp.viz.cameras import (
     CameraChoice as CameraChoice,
     FreeCamera as FreeCamera,
     find_camera as find_camera,
-    parsed_camera as parsed_camera,
 )
 from lyceum_warp.viz.extra import NoVideoError as NoVideoError
 from lyceum_warp.viz.ghosts import (

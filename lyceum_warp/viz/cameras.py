@@ -1,16 +1,14 @@
 """Find the camera of a video: a camera of the model by name or index, or a free camera by its pose."""
 
 import dataclasses
-import math
 import textwrap
-from collections.abc import Iterable
 from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
 
 from lyceum_warp.support.suggestions import did_you_mean
-from lyceum_warp.support.validate import positive_number
+from lyceum_warp.support.validate import finite_number, positive_number
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,38 +58,6 @@ def find_camera(model: mujoco.MjModel, camera: CameraChoice = None) -> mujoco.Mj
     raise ValueError(f"there is no camera {camera!r}: {_listed(names)}, or {FREE!r}, MuJoCo's default free camera")
 
 
-def parsed_camera(arguments: Iterable[str]) -> str | FreeCamera | None:
-    """Parse a camera from the command line.
-
-    Args:
-        arguments: A name, an index, or parts of a pose as NAME=VALUE: lookat=X,Y,Z, distance, azimuth, elevation,
-            track. Without arguments, the result is None.
-    """
-    arguments = list(arguments)
-    if not arguments or (len(arguments) == 1 and "=" not in arguments[0]):
-        return arguments[0] if arguments else None
-    pose: dict[str, object] = {}
-    names = [field.name for field in dataclasses.fields(FreeCamera)]
-    for argument in arguments:
-        name, equals, value = argument.partition("=")
-        if not equals or name not in names:
-            options = ", ".join(f"{name}=..." for name in names)
-            raise ValueError(f"a camera is a name, an index, or a pose of {options}, not {argument!r}")
-        pose[name] = value if name == "track" else _numbers(name, value)
-    return FreeCamera(**pose)  # type: ignore[arg-type]
-
-
-def _numbers(name: str, value: str) -> float | tuple[float, ...]:
-    count, form = (3, "X,Y,Z") if name == "lookat" else (1, "a number")
-    try:
-        numbers = tuple(map(float, value.split(",")))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise ValueError(f"the camera's {name} must be {form}, not {value!r}")
-    return numbers if name == "lookat" else numbers[0]
-
-
 def camera_values(model: mujoco.MjModel, camera: CameraChoice = None) -> dict[str, Any]:
     """Return the attributes of the chosen camera's ``MjvCamera``, which can be pickled."""
     view = find_camera(model, camera)
@@ -125,9 +91,7 @@ def _free_camera(model: mujoco.MjModel, camera: FreeCamera) -> mujoco.MjvCamera:
         view.distance = positive_number("the camera's distance", camera.distance, "metres")
     for name in ("azimuth", "elevation"):
         if (angle := getattr(camera, name)) is not None:
-            if not isinstance(angle, int | float) or not math.isfinite(angle):
-                raise ValueError(f"the camera's {name} must be a number of degrees, not {angle!r}")
-            setattr(view, name, angle)
+            setattr(view, name, finite_number(f"the camera's {name} in degrees", angle))
     if camera.track is not None:
         view.type, view.trackbodyid = mujoco.mjtCamera.mjCAMERA_TRACKING, _body(model, camera.track)
     return view

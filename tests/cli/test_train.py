@@ -14,8 +14,8 @@ from training_runs import QUIET, TINY, interrupted, metrics, refused, train
 import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.algos import Team
-from lyceum_warp.cli.arguments import given
-from lyceum_warp.cli.train import EnvFlags, Hyperparameters, Train
+from lyceum_warp.cli.arguments import EnvFlags, given
+from lyceum_warp.cli.train import Hyperparameters, Train
 from lyceum_warp.training import ALGORITHMS, Run, load
 from lyceum_warp.viz import policy_videos
 
@@ -77,6 +77,7 @@ def test_resume_with_other_settings_prints_an_error(
         (["--iterations", "9", "--algorithm", "npg"], ["--algorithm has no effect with --resume"]),
         (["--iterations", "9", "--out", str(tmp_path)], ["--out has no effect with --resume"]),
         (["--iterations", "9", "cartpole"], ["has task point_mass, not cartpole"]),
+        (["--iterations", "9", "--engine", "warp"], ["has engine mujoco, not warp"]),
     ]:
         assert cli.main([*resume, *options]) == 2
         refused(capsys, *words)

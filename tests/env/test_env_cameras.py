@@ -6,10 +6,12 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from world_rules import check_truncation
 
 import lyceum_warp as lw
 from lyceum_warp.tasks.cartpole import Cartpole
-from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing import check_task
+from lyceum_warp.testing.fault_rules import check_bad_state
 
 KINDS = [lw.Camera("side", 32, 24), lw.Camera("side", 32, 24, "depth", "depth"),
          lw.Camera("side", 32, 24, "segmentation", "ids")]  # fmt: skip
@@ -179,6 +181,5 @@ def test_learners_and_planners_without_encoders_refuse_cameras(shared_env) -> No
 
 
 def test_a_task_with_cameras_follows_the_rules() -> None:
-    rules = [check for check in CHECKS if check.__name__ in ("check_truncation", "check_bad_state")]
-    report = check_task("cartpole", nworld=2, cameras=SIDE, checks=rules)
+    report = check_task("cartpole", nworld=2, cameras=SIDE, checks=(check_truncation, check_bad_state))
     assert "truncation" in str(report)

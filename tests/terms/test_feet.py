@@ -9,18 +9,15 @@ def test_contact_sequences_determine_foot_timers_and_swings() -> None:
     touching = rng.random((N, 200)) < 0.5
     touching = np.repeat(touching, rng.integers(1, 5), axis=1)[:, :200]
     height = rng.uniform(0.0, 0.2, (N, 200 // SKIP))
-    rows = {
-        name: np.zeros((N, 3)) for name in ("contact_time", "air_time", "swing_time", "peak_height", "swing_height")
-    }
-    contact, air, swing, peak, last_peak = (np.zeros(N) for _ in range(5))
+    rows = {name: np.zeros((N, 3)) for name in ("contact_time", "air_time", "peak_height", "swing_height")}
+    contact, air, peak, last_peak = (np.zeros(N) for _ in range(4))
     landings = 0
     for k in range(200):
-        clocks = {name: rows[name] for name in ("contact_time", "air_time", "swing_time")}
+        clocks = {name: rows[name] for name in ("contact_time", "air_time")}
         after = call("run_clocks", foot=1, touching=touching[:, k], substep_dt=SUBSTEP, **clocks).after
         rows |= {name: after[name] for name in clocks}
-        swing = np.where(touching[:, k] & (air > 0), air + 1, swing)
         contact, air = np.where(touching[:, k], contact + 1, 0), np.where(touching[:, k], 0, air + 1)
-        for name, substeps in {"contact_time": contact, "air_time": air, "swing_time": swing}.items():
+        for name, substeps in {"contact_time": contact, "air_time": air}.items():
             np.testing.assert_allclose(rows[name][:, 1], SUBSTEP * substeps, atol=1e-5)
         if k % SKIP == SKIP - 1:
             now = height[:, k // SKIP]
@@ -34,15 +31,3 @@ def test_contact_sequences_determine_foot_timers_and_swings() -> None:
             np.testing.assert_allclose(rows["swing_height"][:, 1], last_peak, atol=1e-6)
     assert landings > N
     assert all((rows[name][:, [0, 2]] == 0).all() for name in clocks)
-
-
-def test_contact_sensors_update_the_timers_of_all_feet() -> None:
-    rng = np.random.default_rng(2)
-    sensordata = rng.integers(0, 2, (N, 6)) * rng.uniform(0.1, 5.0, (N, 6))
-    clocks = {"contact_time": rng.random((N, 3)), "air_time": rng.random((N, 3))}
-    after = call(
-        "run_contact_clocks", sensordata=sensordata, foot_contacts=[4, 0, 3], substep_dt=SUBSTEP, **clocks
-    ).after
-    touching = sensordata[:, [4, 0, 3]] > 0
-    np.testing.assert_allclose(after["contact_time"], touching * (clocks["contact_time"] + SUBSTEP), rtol=1e-6)
-    np.testing.assert_allclose(after["air_time"], ~touching * (clocks["air_time"] + SUBSTEP), rtol=1e-6)

@@ -68,8 +68,7 @@ def test_history_contains_the_last_values_and_repeats_the_first_value_until_full
 
 def test_actions_are_delayed_by_the_delay_of_their_world() -> None:
     rng = np.random.default_rng(0)
-    delay = call("draw_delay", delay=[0.0], least=0, most=3).after["delay"]
-    assert {*delay.ravel()} == {0.0, 1.0, 2.0, 3.0}
+    delay = rng.integers(0, 4, (N, 1)).astype(float)
     actions, history = rng.standard_normal((9, N, 2)), np.zeros((N, 1 + 3 * 2))
     for step, action in enumerate(actions):
         source = np.maximum(step - delay[:, 0].astype(int), 0)

@@ -1,9 +1,10 @@
 import pytest
 from toy_engine import ToyEngine
+from world_rules import CHECKS
 
 import lyceum_warp as lw
 from lyceum_warp.binding import find_task
-from lyceum_warp.testing import CHECKS, check_task, state_rules as state
+from lyceum_warp.testing import check_task, state_rules as state
 from lyceum_warp.testing.fault_rules import check_not_finite
 from lyceum_warp.testing.physics_rules import check_dynamics
 
@@ -57,4 +58,4 @@ def test_task_passes_the_quick_checks_of_check_task(task: str, engine: str) -> N
 @pytest.mark.quick("point_mass")
 @pytest.mark.parametrize("task", ["hopper", "point_mass"])
 def test_task_passes_check_task_on_a_third_engine(task: str) -> None:
-    assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=100))
+    assert f"{task} on the toy engine" in str(check_task(task, engine=ToyEngine, steps=100, checks=CHECKS))

@@ -8,12 +8,13 @@ import pytest
 import warp as wp
 from form_tasks import Gifted, Weighed
 from full_task import Full, Settled
+from world_rules import CHECKS
 
 import lyceum_warp as lw
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
 from lyceum_warp.env import Worlds
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
-from lyceum_warp.testing import CHECKS, check_task
+from lyceum_warp.testing import check_task
 
 Function = Callable[..., Any]
 
@@ -175,7 +176,7 @@ def test_violated_rule_is_reported(
 @pytest.mark.quick("Full")
 @pytest.mark.parametrize("task", [Full, Settled])
 def test_task_with_every_feature_passes_check_task(task: type[lw.Task]) -> None:
-    check_task(task, engine="mujoco", steps=60)
+    check_task(task, engine="mujoco", steps=60, checks=CHECKS)
 
 
 @pytest.mark.quick("Weighed-warp", "Gifted-mujoco", "Gifted-warp")

@@ -12,20 +12,10 @@ import warp as wp
 from lyceum_warp.core.fields import Field, Stage, early_sensor_columns
 from lyceum_warp.core.model_fields import OBJECT_FIELDS, ModelField
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.warp import forward, sizes
+from lyceum_warp.engines.warp import forward, sizes, varied_model
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
 from lyceum_warp.engines.warp.group import Conditional, group_size
 from lyceum_warp.engines.warp.sizes import data_bytes, probe_sizes, warn_of_unknown_sizes
-from lyceum_warp.engines.warp.varied_model import (
-    ModelConstants,
-    ModelRows,
-    StaticGeoms,
-    constants_of,
-    outputs_of,
-    owner,
-    put_varied_model,
-    set_meshes,
-)
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
 from lyceum_warp.support.arrays import alias, flat, launch_rows, repeated
@@ -90,7 +80,7 @@ class WarpEngine(Engine):
         self.ctrl = self.arrays["ctrl"]
         for varied in self.dynamics.values():
             self.arrays[varied.name] = self._alias_model(varied)
-        self._static = StaticGeoms(model, self.dynamics, device)
+        self._static = varied_model.StaticGeoms(model, self.dynamics, device)
         self._constants = self._model_constants()
         # from these model fields, MuJoCo Warp would derive a different initial state for each world
         self._start: wp.array | None = None
@@ -116,7 +106,7 @@ class WarpEngine(Engine):
 
     def _put_model(self) -> mjw.Model:
         with wp.ScopedDevice(self.device):
-            model = put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
+            model = varied_model.put_varied_model(self.model, list(self.dynamics.values()), self.nworld)
         # each world reports its overflows; messages printed by kernels could fill the disk
         model.opt.warn_overflow = 0
         return model
@@ -145,7 +135,7 @@ class WarpEngine(Engine):
             data = data_bytes(model, *sizes)
         floats = mujoco.mj_stateSize(model, _SPEC) + sum(field.size for field in fields if field.snapshot)
         floats += 2 * sum(field.size for field in dynamics)
-        floats += sum(np.size(getattr(model, name)) for name in outputs_of(dynamics))
+        floats += sum(np.size(getattr(model, name)) for name in varied_model.outputs_of(dynamics))
         return data + 4 * floats
 
     # fields
@@ -153,17 +143,19 @@ class WarpEngine(Engine):
     def _alias_model(self, field: ModelField) -> wp.array:
         if field.name in OBJECT_FIELDS:  # ``apply_model`` copies them into the model
             return self._nominal_rows(field, self.nworld)
-        source = getattr(owner(self.m, field.name), field.name)
+        source = getattr(varied_model.owner(self.m, field.name), field.name)
         if not field.size:
             return wp.zeros((self.nworld, *field.shape), dtype=field.dtype, device=self.device)
         return alias(source, field.dtype, (self.nworld, *field.shape))
 
-    def _model_constants(self) -> ModelConstants | None:
-        fields = [field for field in self.dynamics.values() if field.size and constants_of([field])]
+    def _model_constants(self) -> varied_model.ModelConstants | None:
+        fields = [field for field in self.dynamics.values() if field.size and varied_model.constants_of([field])]
         if not fields:
             return None
         loop = self.partial_refresh
-        return ModelConstants(self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop)
+        return varied_model.ModelConstants(
+            self.model, self.m, fields, self._static, self.nworld, self.device, loop=loop
+        )
 
     def _alias(self, field: Field) -> wp.array:
         """Return a view of a field's memory. MuJoCo Warp's types differ only in name."""
@@ -216,7 +208,7 @@ class WarpEngine(Engine):
 
     def apply_model(self, mask: wp.array) -> None:
         with self._on_device():
-            set_meshes(self.m, self.arrays, self.model.nmesh, mask)
+            varied_model.set_meshes(self.m, self.arrays, self.model.nmesh, mask)
             if self._constants is not None:
                 self._constants(mask)
             self._static.place(self.m, self.d, mask)
@@ -292,9 +284,9 @@ class WarpEngine(Engine):
     def _group_of_worlds(self) -> PartialForward:
         size = group_size(self.nworld, self.device)
         fields = list(self.dynamics.values())
-        names = [field.name for field in fields if field.size and field.in_model] + outputs_of(fields)
+        names = [field.name for field in fields if field.size and field.in_model] + varied_model.outputs_of(fields)
         with wp.ScopedDevice(self.device):
-            rows = ModelRows(self.m, names, size)
+            rows = varied_model.ModelRows(self.m, names, size)
         return PartialForward(rows, self.d, self._make_data(size), self._state, self._static)
 
     @contextlib.contextmanager

@@ -15,17 +15,11 @@ from lyceum_warp.engines import options_for_plant
 from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Owner, Scene, Status
+from lyceum_warp.viewer.session import live_settings
 from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
-from lyceum_warp.viewer.session.live_settings import (
-    STARTS,
-    nominal_fields,
-    planner_numbers,
-    rebuilt_planner,
-    task_numbers,
-)
 from lyceum_warp.viewer.session.pictures import PictureMaker
 from lyceum_warp.viewer.session.playback import Playback, episodes_of
 from lyceum_warp.viewer.session.traces import TraceRollouts, Traces, TraceThread
@@ -209,20 +203,20 @@ class Stage:
         """
         planners = self.world_controls
         if owner == "physics":
-            self.live.write(**{name: value * nominal_fields(self.env)[name]})
+            self.live.write(**{name: value * live_settings.nominal_fields(self.env)[name]})
             return
         if owner == "planner":
             if not isinstance(current := self.control, WorldControl):  # the mode may have changed since the command
                 raise ValueError(f"{name} was not changed: no planner is in use")
             planners = [current]
-            rebuilt = rebuilt_planner(current.controller, name, value)
+            rebuilt = live_settings.rebuilt_planner(current.controller, name, value)
             self.controllers[current.name] = WorldControl(current.name, rebuilt, self.env)
             current.close()
         else:
             plans = [each.controller.env for each in planners if isinstance(each.controller, Planner)]
             for env in {id(env): env for env in (self.env, self.live.env, *plans)}.values():
-                env.set_params(**{name: round(value) if name in STARTS else value})
-            if name in STARTS:
+                env.set_params(**{name: round(value) if name in live_settings.STARTS else value})
+            if name in live_settings.STARTS:
                 self.reset(random=False)
         for planner in planners:
             if (thread := self._threads.pop(planner.name, None)) is not None:
@@ -304,7 +298,8 @@ class Stage:
             measured_speed=measured, backwards=self.playback.backwards, video=self.videos.name,
             ghosts=self.frames.ghosts, driven=self.driving.velocity is not None,
             pictures=self.pictures.shown,
-            planner=planner_numbers(getattr(self.control, "controller", None)), params=task_numbers(self.env),
+            planner=live_settings.planner_numbers(getattr(self.control, "controller", None)),
+            params=live_settings.task_numbers(self.env),
             plan_ms=1000 * self.control.seconds if self.control else math.nan, **fields,
         )  # fmt: skip
 
