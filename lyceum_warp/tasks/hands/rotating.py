@@ -65,6 +65,7 @@ class Params:
     object_dof: int = lw.from_model(lambda model, p: int(model.jnt_dofadr[free_joint(model)]))
     action_scale: float = 0.6  # rad for an action of 1
     drop_height: float = -0.05  # of the object; an episode ends below it, m
+    reach: float = 0.5  # distance of the object from the palm's site; an episode ends beyond it, m
     # starts
     start_position: wp.vec3 = wp.vec3(0.1, 0.0, 0.05)  # of the object, m
     start_offset: wp.vec3 = wp.vec3(0.01, 0.01, 0.01)  # largest offset of the object, m
@@ -206,7 +207,8 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 @wp.func
 def dropped(s: World, p: Params) -> bool:
-    return position(s, p)[2] < p.drop_height
+    away = wp.length(position(s, p) - s.site_xpos[p.palm]) > p.reach  # contacts can throw an object upwards
+    return away or position(s, p)[2] < p.drop_height
 
 
 @wp.func
