@@ -18,7 +18,6 @@ from typing import Any
 import contestants
 import experiment
 import kept
-import warp as wp
 from experiment import Experiment, Row, Table, choose
 from stirring import Stir, StirRedrawn
 
@@ -62,22 +61,13 @@ def estimate(case: Case) -> float:
     return 60.0 + case.blocks * case.worlds / 256
 
 
-def _free_memory(device: wp.Device) -> int:
-    wp.synchronize_device(device)
-    return device.free_memory if device.is_cuda else 0
-
-
 def measure(case: Case, options: Options) -> dict[str, Any]:
-    envs, memory = {}, {}
+    envs = {}
     for name, task, objects in (("one", Stir, ["apple"]), ("many", CONTESTANTS[case.contestant], None)):
         lw.make(task, engine=case.engine, device=case.device, objects=objects)  # compile kernels
-        before = _free_memory(wp.get_device(case.device))
-        envs[name] = env = lw.make(
+        envs[name] = lw.make(
             task, nworld=case.worlds, engine=case.engine, device=case.device, objects=objects, seed=1
         )
-        for _ in range(2):
-            env.step()
-        memory[name] = (before - _free_memory(env.device)) / case.worlds
     actions = contestants.actions(envs["one"], seed=0)
 
     def block(env: lw.Env) -> None:
@@ -96,7 +86,6 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
         "steps_per_second": {name: case.worlds / statistics.median(each) for name, each in seconds.items()},
         "ratio": statistics.median(a / b for a, b in zip(seconds["one"], seconds["many"], strict=True)),
         "bytes_per_world": {name: env.bytes_per_world for name, env in envs.items()},
-        "measured_bytes_per_world": memory,
         "state_size": {name: env.state_space.size for name, env in envs.items()},
         "faults_per_million": 1e6 * sum(envs["many"].fault_counts.values()) / steps,
     }
@@ -107,8 +96,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     lines = [
         [row.case["engine"], f"{row.case['worlds']:,}", row.case["contestant"],
          f"{row.result['steps_per_second']['many']:,.0f}", f"{row.result['ratio']:.1%}",
-         *(f"{(row.result['measured_bytes_per_world'][name] or row.result['bytes_per_world'][name]) / 1e3:,.0f}"
-           for name in ("many", "one")),
+         *(f"{row.result['bytes_per_world'][name] / 1e3:,.0f}" for name in ("many", "one")),
          f"{row.result['faults_per_million']:.1f}"]
         for row in rows
     ]  # fmt: skip
@@ -118,7 +106,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
 
 EXPERIMENT = Experiment(
     name="objects",
-    conditions="Memory is measured on a GPU, and estimated on the CPU.",
+    conditions="Memory is the estimate of the engine.",
     summary="Speed and memory of worlds that hold different objects.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
 )  # fmt: skip
