@@ -35,7 +35,7 @@ COMMANDS = (
 def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
-    assert ended.value.code == 0
+    assert not ended.value.code
     return capsys.readouterr().out.replace("│", " ")  # some terminals draw boxes without sides
 
 
