@@ -119,7 +119,7 @@ def _described(command: Any) -> Any:
     body: dict[str, Any] = {"__doc__": command.__doc__, "__annotations__": {}}
     for field in dataclasses.fields(command):
         if field.name in docs:
-            hint = "" if field.default is None else None
+            hint = "" if field.default in (None, ()) else None
             text = tyro.conf.arg(help=" ".join(docs[field.name].split()), help_behavior_hint=hint)
             body["__annotations__"][field.name] = Annotated[hints[field.name], text]
             if field.default is not dataclasses.MISSING:
