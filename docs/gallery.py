@@ -139,7 +139,7 @@ SHOWS = {
         camera=FreeCamera(lookat=(1.0, 0.0, 0.7), distance=4.2, azimuth=90.0, elevation=-10.0),
     ),
     "humanoid_walk": Show(seconds=3.0),
-    "inverted_pendulum": Show({"noise": 1.0}, seconds=2.5),
+    "inverted_pendulum": Show(seconds=2.5),
     "inverted_double_pendulum": Show(
         seconds=2.5, camera=FreeCamera(lookat=(0.0, 0.0, 0.5), distance=3.0, azimuth=90.0, elevation=-10.0)
     ),
@@ -149,7 +149,7 @@ SHOWS = {
         {"samples": 128, "horizon": 40, "knots": 5, "noise": 0.6, "temperature": 0.3}, start=0.6, seconds=2.4,
         replan_every=2,
     ),
-    "swimmer": Show({"horizon": 48}, start=1.0, seconds=3.0),
+    "swimmer": Show(start=1.0, seconds=3.0),
     "walker2d": Show(start=1.0, seconds=2.5),
     **{f"{robot}_velocity": Show(start=1.0, seconds=3.2, camera=FreeCamera(track=1, distance=distance, azimuth=135.0,
                                                                            elevation=-15.0))

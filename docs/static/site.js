@@ -2,12 +2,11 @@
 for (const block of document.querySelectorAll("div.highlight")) {
   const button = document.createElement("button");
   button.className = "copy";
-  button.title = "copy";
-  button.textContent = "⧉";
+  button.textContent = "copy";
   button.onclick = async () => {
     await navigator.clipboard.writeText(block.querySelector("pre").textContent.trimEnd());
-    button.textContent = "✓";
-    setTimeout(() => (button.textContent = "⧉"), 1500);
+    button.textContent = "copied";
+    setTimeout(() => (button.textContent = "copy"), 1500);
   };
   block.append(button);
 }

@@ -38,6 +38,8 @@ def parse(command: type, prog: str, argv: Sequence[str]) -> Any:
         _print_help(command, prog)
     if "--help-all" in argv:
         _help(command, prog)
+    if "--tyro-print-completion" in argv:
+        command = _described(command)  # shells take each line of a description for a word
     options: Any
     with contextlib.redirect_stderr(io.StringIO()) as printed:
         try:
@@ -111,23 +113,27 @@ def _print_help(command: Any, prog: str) -> None:
             print(textwrap.fill(text, _width(), break_on_hyphens=False, subsequent_indent="    "))
 
 
-def _help(command: Any, prog: str) -> None:
-    """Print the help of a command, wrapped, and without the defaults None."""
+def _described(command: Any) -> Any:
+    """Return a command whose options have their descriptions in one line, and without the defaults None."""
     hints, docs = typing.get_type_hints(command, include_extras=True), attribute_docs(*reversed(command.__mro__[:-1]))
     body: dict[str, Any] = {"__doc__": command.__doc__, "__annotations__": {}}
     for field in dataclasses.fields(command):
         if field.name in docs:
-            hint = "" if field.default is None else None
+            hint = "" if field.default in (None, ()) else None
             text = tyro.conf.arg(help=" ".join(docs[field.name].split()), help_behavior_hint=hint)
             body["__annotations__"][field.name] = Annotated[hints[field.name], text]
             if field.default is not dataclasses.MISSING:
                 body[field.name] = field.default
-    shown: Any = dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
+    return dataclasses.dataclass(frozen=True, kw_only=True)(type(command.__name__, (command,), body))
+
+
+def _help(command: Any, prog: str) -> None:
+    """Print the help of a command, wrapped."""
     paragraphs = inspect.cleandoc(command.__doc__ or "").split("\n\n")
     fill = partial(textwrap.fill, width=_width(), break_on_hyphens=False, break_long_words=False)
     texts = [text if text.startswith(("$", " ")) else fill(text) for text in paragraphs]
     print("\n\n".join(texts), end="\n\n")  # tyro would join the lines
-    tyro.cli(shown, prog=prog, description=" ", args=["--help"], config=_CONFIG)
+    tyro.cli(_described(command), prog=prog, description=" ", args=["--help"], config=_CONFIG)
 
 
 def _width() -> int:

@@ -30,7 +30,7 @@ SECONDS = 120.0
 """Time limit for a page, in seconds. Without a GPU, a browser draws only a few frames per second."""
 INPUT_SECONDS = 6.0
 """Seconds before a test repeats an input that a busy browser may have lost."""
-VIEW = {"width": 1000, "height": 640}
+VIEW = {"width": 1200, "height": 640}  # wide enough for the unfolded panel
 FLAGS = (
     "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
     "--disable-sync", "--enable-unsafe-swiftshader", "--use-angle=swiftshader", "--ignore-gpu-blocklist",
@@ -40,7 +40,7 @@ STEPS = 60
 LEFT = (24, 92)  # position of the second controller in the panel's list, in pixels
 PAUSE = (106, 178)  # position of the pause button in the mode "passive"
 SCRUBBER = (20, 316, 282)  # left end, right end and height of the slider
-MIDDLE = (500, 300)  # position of the block's centre
+MIDDLE = (600, 300)  # position of the block's centre
 
 MODEL = """
 <mujoco>
@@ -347,7 +347,8 @@ def test_a_saved_page_plays_without_a_server(browser: Browser, tmp_path: Path) -
 
 
 @pytest.mark.long
-def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> None:
+def test_keys_and_a_gamepad_set_the_command_of_a_walking_robot(context: BrowserContext) -> None:
+    context.add_init_script("pad = {axes: [0, 0, 0]}; navigator.getGamepads = () => [null, pad]")
     viewer = Viewer(Session(lw.make("go1_velocity"), seed=0))
     tab = Tab(context.new_page(), viewer).loaded()
     tab.press("Enter", lambda: viewer.status.driven)
@@ -358,6 +359,10 @@ def test_keys_set_the_command_of_a_walking_robot(context: BrowserContext) -> Non
     tab.page.keyboard.up("w")
     tab.page.keyboard.up("q")
     tab.wait(lambda: viewer.status.command == (0.0, 0.0, 0.0))
+    tab.page.evaluate("dispatchEvent(new Event('gamepadconnected'))")
+    for axes, velocity in (([0.0, -1.0, 0.0], (1.0, 0.0, 0.0)), ([1.0, 0.1, 0.5], (0.0, -1.0, -0.25))):
+        tab.page.evaluate("axes => pad.axes = axes", axes)
+        tab.wait(lambda velocity=velocity: viewer.status.command == velocity)
     tab.press("Enter", lambda: not viewer.status.driven)
     viewer.window.close()
     viewer.thread.join(30)

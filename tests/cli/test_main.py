@@ -35,7 +35,7 @@ COMMANDS = (
 def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     with pytest.raises(SystemExit) as ended:
         cli.main(words)
-    assert ended.value.code == 0
+    assert not ended.value.code
     return capsys.readouterr().out.replace("│", " ")  # some terminals draw boxes without sides
 
 
@@ -64,6 +64,14 @@ def test_help_all_describes_more_options_than_help(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="torch uses GNU's OpenMP on Linux only")
+def test_bash_completes_a_flag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    script = tmp_path / "completion"
+    script.write_text(help_of(["train", "--tyro-print-completion", "bash"], capsys))
+    words = "COMP_WORDS=(lyceum-warp train --iter); COMP_CWORD=2; _tyro_lyceum_warp_train; echo ${COMPREPLY[*]}"
+    shell = subprocess.run(["bash", "-c", f". {script}; {words}"], capture_output=True, text=True, check=True)
+    assert shell.stdout.split() == ["--iterations"]
+
+
 def test_openmp_threads_of_a_command_do_not_spin() -> None:
     """Spinning threads multiply the time of updates on busy cores."""
     command = [sys.executable, "-m", "lyceum_warp.cli", "train", "hopper", "--iterations", "0"]

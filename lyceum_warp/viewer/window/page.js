@@ -10,6 +10,16 @@
   const original = fetch;
   window.fetch = (address, options) => original(below(address), options);
 
+  const theme = () => {
+    const preferred = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+    try {
+      return (localStorage.mjwv_theme ??= preferred);
+    } catch {
+      return preferred;
+    }
+  };
+  theme();
+
   let state = null;  // the WebSocket of studio's session
   const visible = () => document.visibilityState === "visible";
   const say = (text) => state?.readyState === WebSocket.OPEN && state.send(text);
@@ -26,6 +36,7 @@
       this.addEventListener("message", (event) => {
         if (typeof event.data !== "string") return;
         if (visible() && event.data.includes("role=spectator;queue_pos=0")) say("request_control");
+        if (event.data.includes("role=controller")) say("theme=" + theme());  // studio's page may say it too early
         const [kind, text] = event.data.split(/=(.*)/s);
         if (kind !== "saved" && kind !== "copy" && kind !== "pictures") return;
         event.stopImmediatePropagation();
@@ -74,7 +85,4 @@
 
   // studio would replace the title
   Object.defineProperty(document, "title", {get: () => document.querySelector("title").text, set: () => {}});
-  try {
-    localStorage.mjwv_theme ??= matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-  } catch {}
 }

@@ -151,6 +151,7 @@ class ViewCameras:
     def __init__(self, viewer: Any, values: ModelValues) -> None:
         self.viewer, self.values = viewer, values
         self.state = ux.UxState()
+        self._fit = 1.0  # how much farther the camera is than in a page that is wider than high
 
     def choose(self, index: int) -> None:
         """Choose studio's free, flying or tracking camera, or a camera of the model."""
@@ -168,6 +169,12 @@ class ViewCameras:
             camera = self.viewer.camera
             camera.type, camera.fixedcamid = int(mujoco.mjtCamera.mjCAMERA_TRACKING), -1
             camera.trackbodyid, camera.elevation = int(model.cam_bodyid[tracking.argmax()]), -20
+        self.viewer.camera.distance *= self._fit
+
+    def fit(self, aspect: float) -> None:
+        """Move the camera so that a scene of this height, in multiples of its width, shows all of the robot."""
+        before, self._fit = self._fit, max(aspect, 1.0)
+        self.viewer.camera.distance *= self._fit / before
 
     def view(self) -> dict[str, Any]:
         """The attributes of the camera."""

@@ -21,7 +21,7 @@ UPDATE_PERIOD = 0.2
 FRESH = 0.5
 """For this many seconds after a command, all numbers are up to date."""
 TOAST_SECONDS, TOASTS = 6.0, 3
-"""The newest messages are shown for TOAST_SECONDS seconds below the scene."""
+"""The newest messages are shown for TOAST_SECONDS seconds above the legend."""
 NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 SIDE = 330
@@ -66,9 +66,11 @@ class Windows:
         # panels stay where the user moved them until the browser window is resized
         self._size, resized = (width, height), (width, height) != self._size
         cond = int(imgui.Cond.Always if resized else imgui.Cond.FirstUseEver)
-        if resized and self._scene.curves:
-            windows = self._actions.windows
-            (windows.discard if width < NARROW else windows.add)("curves")
+        if resized:
+            self._actions.cameras.fit(height / (max(width, 1.0) if width < NARROW else width - 2 * SIDE))
+            if self._scene.curves:
+                windows = self._actions.windows
+                (windows.discard if width < NARROW else windows.add)("curves")
         self._update()
         tall = min(len(self._plotted) * 168 + 100, height - 50)
         imgui.SetNextWindowCollapsed(width < NARROW, cond)
@@ -94,19 +96,20 @@ class Windows:
             self._frame = frame
 
     def _overlays(self, width: float, height: float) -> None:
-        """Show a first hint, the newest messages and the legend in the scene."""
+        """Show a first hint, and the newest messages with the legend, in the scene."""
         self._hint &= not (imgui.IsMouseDragging(0) or imgui.IsMouseDragging(1) or "keys" in self._actions.windows)
         room = width - 40 if width < NARROW else width - 2 * SIDE - 40
         if self._hint:
             top, text = (50.0, f"{HINT}   ×: the panel") if width < NARROW else (10.0, HINT)
             self._overlay("hint", (width / 2, top), (0.5, 0.0), room, [(None, text)])
-        toasts = list(self._actions.messages)[-TOASTS:]
+        lines: list[Line] = []
         if "messages" not in self._actions.windows and time.monotonic() < self._actions.said + TOAST_SECONDS:
-            lines: list[Line] = [(None, text) for text in toasts]
-            self._overlay("newest messages", (width / 2, height - 40), (0.5, 1.0), room, lines)
-        if self._frame is not None and (lines := legend(self._frame)):
+            lines = [(None, text) for text in list(self._actions.messages)[-TOASTS:]]
+        if self._frame is not None:
+            lines += legend(self._frame)
+        if lines:  # at the lower edge, below the robot
             left = 10.0 if width < NARROW else SIDE + 20.0
-            self._overlay("legend", (left, height - 40 - 32 * TOASTS), (0.0, 1.0), room, lines)
+            self._overlay("legend", (left, height - 40), (0.0, 1.0), room, lines)
 
     def _overlay(
         self, title: str, place: tuple[float, float], pivot: tuple[float, float], room: float, lines: list[Line]

@@ -66,5 +66,5 @@ def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> No
 
 @pytest.mark.parametrize("command", ["eval", "view"])
 def test_task_without_a_pretrained_policy_prints_an_error(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main([command, "reacher", "--pretrained"]) == 2
-    refused(capsys, "there is no pretrained policy of 'reacher': the tasks with a policy are ", ", hopper")
+    assert cli.main([command, "soft_ball", "--pretrained"]) == 2
+    refused(capsys, "there is no pretrained policy of 'soft_ball': the tasks with a policy are ", ", hopper")

@@ -187,6 +187,15 @@ def test_windows_are_inside_the_page(size: tuple[int, int], monkeypatch: pytest.
     assert len(edges) >= 4 and min(left) >= 0 and max(edges) <= size[0]
 
 
+def test_camera_is_farther_away_in_a_page_that_is_higher_than_wide(bench: Bench) -> None:
+    distances = []
+    for size in ((800, 600), (390, 780), (800, 600)):
+        imgui.GetIO().DisplaySize = imgui.Vec2(*size)
+        bench.show(status_of())
+        distances.append(bench.viewer.camera.distance)
+    assert distances == pytest.approx(distances[0] * np.array([1, 2, 1]))
+
+
 def test_slow_page_turns_shadows_off_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     shadow = mujoco.mjtRndFlag.mjRND_SHADOW
     monkeypatch.setattr(panel, "RATE_TIME", 0.0)

@@ -123,6 +123,22 @@ def test_only_offered_files_are_sent(studio: Studio, tmp_path: Path) -> None:
 # tabs
 
 
+def test_slow_page_gets_the_whole_of_a_large_file(studio: Studio, tmp_path: Path) -> None:
+    size = 2**25  # far more than the sockets' buffers hold
+    (tmp_path / "large").write_bytes(bytes(size))
+    studio.page.offer(str(tmp_path / "large"))
+    with socket.create_connection(("127.0.0.1", studio.port), timeout=20) as client:
+        client.sendall(f"GET /{studio.secret}/saved/large HTTP/1.1\r\nHost: x\r\n\r\n".encode())
+        received = len(client.recv(2**16))  # the response has begun
+        loop, later = studio.page._loop, threading.Event()
+        loop.call_soon_threadsafe(setattr, loop, "time", lambda: time.monotonic() + 60)  # a minute passes
+        loop.call_soon_threadsafe(lambda: loop.call_soon(later.set))
+        assert later.wait(20)
+        while data := client.recv(2**20):
+            received += len(data)
+    assert received > size
+
+
 def test_too_large_message_closes_the_websocket(studio: Studio) -> None:
     with studio.tab("state?sid=a") as tab, pytest.raises(ConnectionClosed):
         tab.send(bytes(2**20 + 1))
