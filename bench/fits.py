@@ -168,6 +168,7 @@ class Plant:
             for key in list(spec.keys):
                 spec.delete(key)
         model = compile_model(spec, [], lw.PhysicsOptions(), varied=["body_ipos"])
+        model.opt.iterations = model.opt.ls_iterations = 50  # a robot's solver does not stop early
         if not ground:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self.wanted = [*self.robot.parameters, *(TRUNK if ground else ()), DELAY]
@@ -235,7 +236,7 @@ class Plant:
         }  # fmt: skip
         content = dict.fromkeys(("names", "value", "low", "high", "determined"), ()) | {
             "format": FIT_FORMAT, "delays": dict.fromkeys(self.bound.actuators, self.delay),
-            "fields": self.bound.fields(self.model) | fields,
+            "fields": self.bound.fields(self.x) | fields,
         }  # fmt: skip
         (Path(folder) / "fit.json").write_text(json.dumps(content))
 

@@ -28,6 +28,8 @@ DRAWS = 1024
 """Draws from the posterior that the folder holds."""
 DEFAULT = ("kp.*", "kd.*", "dof_armature.*", "dof_damping.*", "dof_frictionloss.*", "delay.ctrl.*")
 """Parameters of a fit, if none are given; those that the model lacks are left out."""
+SOLVER_ITERATIONS = 50
+"""Least number of iterations of MuJoCo's solver in a fit."""
 _USUAL = {
     "qpos": 0.002, "qvel": 0.05, "base position": 0.005, "base rotation": 0.005, "base velocity": 0.05,
     "base angular velocity": 0.02, "gyro": 0.02, "accelerometer": 0.2, "framequat": 0.005, "jointpos": 0.002,
@@ -167,6 +169,9 @@ def _compiled(model: Any, options: Mapping[str, Any], *, hangs: bool) -> tuple[s
             spec.delete(key)
     physics = dataclasses.replace(physics, discardvisual=True)
     compiled = compile_model(spec, ["sensordata"], physics, varied=MOVED_INERTIA)
+    # finite differences of a solver that stops early are mostly noise
+    compiled.opt.iterations = max(SOLVER_ITERATIONS, compiled.opt.iterations)
+    compiled.opt.ls_iterations = max(SOLVER_ITERATIONS, compiled.opt.ls_iterations)
     if hangs:
         compiled.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     if compiled.nu == 0:
@@ -240,7 +245,7 @@ def _result(
     return Fit(
         bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
         covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
-        rms, (nominal, fitted), bound.fields(bound.model(at.x)),
+        rms, (nominal, fitted), bound.fields(at.x),
         {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds,
         None if out is None else Path(out),
     )  # fmt: skip
@@ -251,7 +256,7 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
     folder = result.folder
     assert folder is not None
     xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
-    rows = [bound.fields(bound.model(x)) for x in np.clip(xs, bound.low, bound.high)]
+    rows = [bound.fields(x) for x in np.clip(xs, bound.low, bound.high)]
     draws: dict[str, Any] = {field: np.array([list(row[field].values()) for row in rows]) for field in result.fields}
     content = {"format": FIT_FORMAT, "model": name} | {
         field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value

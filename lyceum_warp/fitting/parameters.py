@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import fnmatch
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -142,7 +142,13 @@ class Parameters:
             elif field == "inertia":
                 self._touch(_INERTIAL, members)
                 body = elements(self.nominal, own, label).start
-                self._factor(body)
+                if (
+                    np.linalg.eigvalsh(
+                        _pseudo_inertia({field: getattr(self.nominal, field) for field in _INERTIAL}, body)
+                    )[0]
+                    <= 0.0
+                ):
+                    raise ValueError(f"the body {label!r} has no physical inertia: fit its body_mass, or correct it")
                 for k in range(10):
                     self._append(given, f"inertia.{label}[{k}]", field, _INERTIA, -np.inf, np.inf, body=body)
             else:
@@ -186,32 +192,28 @@ class Parameters:
         rows = np.concatenate([grid[elements(self.nominal, field, name)] for name in names])
         return rows.ravel() if column is None else rows[:, column]
 
-    def _factor(self, body: int) -> np.ndarray:
-        """Get the Cholesky factor of a body's pseudo-inertia."""
-        try:
-            return np.linalg.cholesky(_pseudo_inertia(self.nominal, body))
-        except np.linalg.LinAlgError:
-            name = self.nominal.body(body).name
-            raise ValueError(f"the body {name!r} has no physical inertia: fit its body_mass, or correct it") from None
+    def values(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Compute the model fields of a hypothesis."""
+        values = {field: getattr(self.nominal, field).copy() for field in self.touched}
+        inertias: dict[int, list[float]] = {}
+        for value, coordinate in zip(x, self.coordinates, strict=True):
+            if coordinate.kind == "inertia":
+                inertias.setdefault(coordinate.body, []).append(value)
+            for field, places, direction in coordinate.writes:
+                flat = values[field].reshape(-1)
+                flat[places] = (
+                    flat[places] * np.exp(value) if coordinate.kind == "factor" else flat[places] + direction * value
+                )
+        for body, numbers in inertias.items():
+            if any(numbers):
+                _change_inertia(values, body, numbers)
+        return values
 
     def model(self, x: np.ndarray) -> mujoco.MjModel:
         """Make the model of a hypothesis."""
-        if not any((c.writes or c.kind == "inertia") and x[i] != 0.0 for i, c in enumerate(self.coordinates)):
-            return self.nominal
         model = copy.copy(self.nominal)
-        bodies: dict[int, list[float]] = {}
-        for value, coordinate in zip(x, self.coordinates, strict=True):
-            if coordinate.kind == "inertia":
-                bodies.setdefault(coordinate.body, []).append(value)
-            for field, places, direction in coordinate.writes:
-                flat = np.reshape(getattr(model, field), -1)
-                new = flat[places] * np.exp(value) if coordinate.kind == "factor" else flat[places] + direction * value
-                flat[places] = new
-        for body, numbers in bodies.items():
-            turn = np.diag(np.exp(numbers[:4]))
-            turn[np.tril_indices(4, -1)] = numbers[4:]
-            root = self._factor(body) @ turn
-            _set_inertia(model, body, root @ root.T)
+        for field, rows in self.values(x).items():
+            getattr(model, field)[...] = rows
         mujoco.mj_setConst(model, self._data)
         return model
 
@@ -228,29 +230,35 @@ class Parameters:
         """The greatest delay of each control and column that the bounds allow."""
         return self.signals(np.where(np.isfinite(self.high), self.high, 0.0))["delay"]
 
-    def fields(self, model: mujoco.MjModel) -> dict[str, dict[str, list[Any]]]:
-        """Get the rows of a model that the fit changes, by field and element."""
+    def fields(self, x: np.ndarray) -> dict[str, dict[str, list[Any]]]:
+        """Get the rows that the fit changes, by field and element."""
+        values = self.values(x)
         return {
-            field: {name: getattr(model, field)[elements(model, field, name)].tolist() for name in sorted(names)}
+            field: {name: values[field][elements(self.nominal, field, name)].tolist() for name in sorted(names)}
             for field, names in self.touched.items()
         }
 
 
-def _pseudo_inertia(model: mujoco.MjModel, body: int) -> np.ndarray:
+def _pseudo_inertia(values: Mapping[str, np.ndarray], body: int) -> np.ndarray:
     """Compute the pseudo-inertia (Wensing et al., 2018), (4, 4): second and first moments of mass, and the mass."""
     flat = np.zeros(9)
-    mujoco.mju_quat2Mat(flat, model.body_iquat[body])
+    mujoco.mju_quat2Mat(flat, values["body_iquat"][body])
     turn = flat.reshape(3, 3)
-    inertia, mass, centre = model.body_inertia[body], model.body_mass[body], model.body_ipos[body]
+    inertia, mass, centre = (values[name][body] for name in ("body_inertia", "body_mass", "body_ipos"))
     moments = turn @ np.diag(0.5 * inertia.sum() - inertia) @ turn.T + mass * np.outer(centre, centre)
     return np.block([[moments, mass * centre[:, None]], [mass * centre[None], np.full((1, 1), mass)]])
 
 
-def _set_inertia(model: mujoco.MjModel, body: int, pseudo: np.ndarray) -> None:
+def _change_inertia(values: Mapping[str, np.ndarray], body: int, numbers: Sequence[float]) -> None:
+    """Multiply the Cholesky factor of a body's pseudo-inertia, so that the inertia stays physical."""
+    turn = np.diag(np.exp(numbers[:4]))
+    turn[np.tril_indices(4, -1)] = numbers[4:]
+    root = np.linalg.cholesky(_pseudo_inertia(values, body)) @ turn
+    pseudo = root @ root.T
     mass = pseudo[3, 3]
     centre = pseudo[:3, 3] / mass
     moments, axes = np.linalg.eigh(pseudo[:3, :3] - mass * np.outer(centre, centre))
     axes[:, 0] *= np.sign(np.linalg.det(axes))
-    model.body_mass[body], model.body_ipos[body] = mass, centre
-    model.body_inertia[body] = moments.sum() - moments
-    mujoco.mju_mat2Quat(model.body_iquat[body], np.ascontiguousarray(axes).ravel())
+    values["body_mass"][body], values["body_ipos"][body] = mass, centre
+    values["body_inertia"][body] = moments.sum() - moments
+    mujoco.mju_mat2Quat(values["body_iquat"][body], np.ascontiguousarray(axes).ravel())

@@ -84,9 +84,12 @@ class Predictor:
         self.sources = {name: [(i, c.index) for i, c in enumerate(log.columns) if c.field == name]
                         for name in dict.fromkeys(column.field for column in log.columns)}  # fmt: skip
         self.quats = _quaternions(log.columns, self.model)
-        self._record = [_STATE, *(name for name in self.sources if name in ("sensordata", "actuator_force"))]
-        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
         self._data = mujoco.MjData(self.model)
+        sizes = {_STATE: mujoco.mj_stateSize(self.model, _STATE)} | {
+            name: len(getattr(self._data, name)) for name in self.sources if name in ("sensordata", "actuator_force")
+        }
+        self._sizes: dict[int | str, int] = sizes
+        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
 
     def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
@@ -150,9 +153,11 @@ class Predictor:
         Returns:
             (windows, hypotheses, samples, columns). Missing numbers are 0, and those of diverged worlds are infinite.
         """
-        count, signals = len(xs), [self.parameters.signals(x) for x in xs]
+        count, (rows, which) = len(xs), np.unique(xs, axis=0, return_inverse=True)
         batch = self._batch(len(windows) * count)
-        batch.set_models([self.parameters.model(x) for x in xs] * len(windows))
+        values = [self.parameters.values(x) for x in rows]
+        for field in self.parameters.touched:
+            batch.expand(field)[...] = np.concatenate([np.stack([v[field] for v in values])[which]] * len(windows))
         batch.warning[:] = 0
         batch.state[:] = 0.0
         shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
@@ -160,14 +165,19 @@ class Predictor:
         edges = [self.model.nq, self.model.nq + self.model.nv]
         for name, part in zip(("qpos", "qvel", "act"), np.split(initial, edges, axis=1), strict=True):
             batch.bind(name)[...] = part
-        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)
+        signals = [self.parameters.signals(x) for x in rows]
+        controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)[:, which]
         controls = controls.reshape(-1, windows.steps, self.model.nu)
+        records = {name: np.empty((len(initial), windows.steps, size)) for name, size in self._sizes.items()}
         bad = np.zeros(len(initial), bool)
-        try:
-            records = batch.rollout(windows.steps, controls, record=self._record)
-        except SimulationError as error:  # a hypothesis may be absurd; the other worlds went on
-            records = batch.rollout(windows.steps, controls, record=self._record)
-            bad[error.ids] = True
+        for call in (
+            batch.set_const,
+            lambda: batch.rollout(windows.steps, controls, record=list(records), out=records),
+        ):
+            try:
+                call()
+            except SimulationError as error:  # a hypothesis may be absurd; the other worlds went on
+                bad[error.ids] = True
         bad |= batch.warning[:, :, 1].any(axis=1)
         rolled = np.concatenate([initial[:, None], records[_STATE][:, :-1]], axis=1)
         fields = records | dict(zip(("qpos", "qvel", "act"), np.split(rolled, edges, axis=2), strict=True))
@@ -176,7 +186,9 @@ class Predictor:
             columns, indices = np.array(pairs).T
             predicted[..., columns] = fields[name].reshape(*rolled.shape[:2], -1)[..., indices]
         predicted[bad] = np.inf
-        return self._compared(windows, predicted.reshape(len(windows), count, windows.steps, -1), signals)
+        return self._compared(
+            windows, predicted.reshape(len(windows), count, windows.steps, -1), [signals[i] for i in which]
+        )
 
     def moved(self, states: np.ndarray, changes: np.ndarray) -> np.ndarray:
         """Add changes (n, nx) to states (n, nq + nv + na)."""
