@@ -424,6 +424,8 @@ def _interrupt_after_parent() -> None:
     assert parent is not None
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(5.0)  # the pool may catch the interrupt, and wait for work of a parent that is gone
+    os._exit(1)
 
 
 def core_sets(jobs: int, threads: int | None) -> list[set[int]]:
