@@ -93,13 +93,13 @@ class Fitted:
         if not path.is_file():
             raise FileNotFoundError(f"there is no {path}: pass the folder of a whole fit")
         with self._damage(path), np.load(path, allow_pickle=False) as file:
-            count = min(len(file[field]) for field in self.values)
+            count = min(len(file[name]) for name in file)
             # the seed and the index of a world decide, so that a world keeps its robot in every division of the worlds
             choice = [np.random.default_rng((seed, first_world + w)).integers(count) for w in range(nworld)]
             for field, parts in self.values.items():
                 whole = np.repeat(np.array(getattr(model, field), dtype=float)[None], nworld, axis=0)
-                for i, (name, rows) in enumerate(parts.items()):
-                    whole[:, elements(model, field, name)] = _finite(file[field])[choice, i].reshape(-1, *rows.shape)
+                for name in parts:
+                    whole[:, elements(model, field, name)] = _finite(file[f"{field}.{name}"])[choice]
                 result[field] = whole.reshape(nworld, -1)
         return result
 

@@ -257,7 +257,8 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
     assert folder is not None
     xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
     rows = [bound.fields(x) for x in np.clip(xs, bound.low, bound.high)]
-    draws: dict[str, Any] = {field: np.array([list(row[field].values()) for row in rows]) for field in result.fields}
+    draws: dict[str, Any] = {f"{field}.{name}": np.array([row[field][name] for row in rows])
+                             for field, parts in result.fields.items() for name in parts}  # fmt: skip
     content = {"format": FIT_FORMAT, "model": name} | {
         field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value
         for field in dataclasses.fields(result) if field.name not in ("folder", "correlation")

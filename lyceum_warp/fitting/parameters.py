@@ -16,8 +16,10 @@ from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number
 
 _NAME = re.compile(r"(?P<field>[a-z0-9_]+)\.(?P<pattern>.+?)(?:\[(?P<column>\d+)\])?")
-_SERVO = {"kp": (("actuator_gainprm", 0), ("actuator_biasprm", 1)), "kd": (("actuator_biasprm", 2),)}
-_SIGN = {"actuator_biasprm": -1.0}
+_SERVO = {
+    "kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)), "kd": (("actuator_biasprm", 2, -1.0),)
+}  # fmt: skip
+"""Fields, columns and signs of the gains of position servos."""
 _SIGNALS = {"delay": (0.02, 0.0, 0.05), "gain": (0.1, -np.log(10.0), np.log(10.0)), "bias": (0.02, -np.inf, np.inf)}
 """The prior's deviation and the bounds of parameters of signals. A gain is a factor."""
 _SIGNED = {"body_ipos": 0.02, "body_pos": 0.01, "geom_pos": 0.01, "site_pos": 0.01, "jnt_pos": 0.01, "qpos_spring": 0.1}
@@ -80,11 +82,10 @@ class Coordinate:
     std: float
     low: float
     high: float
-    writes: tuple[tuple[str, np.ndarray, np.ndarray], ...] = ()
-    """Fields, the flat indices in them, and the directions of shifts."""
-    signals: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, int))
+    writes: Sequence[tuple[str, np.ndarray, float]] = ()
+    """Fields, the flat indices in them, and the signs of shifts."""
+    signals: Sequence[int] = ()
     """Indices of controls, and of columns of the log after them."""
-    body: int = 0
 
     def value(self, x: Any) -> Any:
         """Convert coordinates to factors or values."""
@@ -126,52 +127,62 @@ class Parameters:
         field, known = match["field"], (*VARYING_FIELDS, *_SERVO, *_SIGNALS, "inertia")
         if field not in known:
             raise ValueError(f"the parameter {given.name!r} can't be fitted: {did_you_mean(field, known)}")
-        own = {"inertia": "body_mass", **dict.fromkeys(_SERVO, "actuator_gainprm")}.get(field, field)
+        own = {"inertia": "body_mass", "kp": "actuator_gainprm", "kd": "actuator_gainprm"}.get(field, field)
         names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, own)
         wanted = match["pattern"].split(",")
         for pattern in wanted:
             if not fnmatch.filter(names, pattern):
                 hint = did_you_mean(pattern, names, f"it has {', '.join(names) or 'none with names'}")
                 raise ValueError(f"the parameter {given.name!r} fits no element of the model or the log: {hint}")
-        names = [name for name in names if any(fnmatch.fnmatchcase(name, pattern) for pattern in wanted)]
-        apart = given.each or field == "inertia"
-        for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
-            if field in _SIGNALS:
-                places = np.concatenate([self._signals[name] for name in members])
-                self._append(given, f"{field}.{label}", field, *_SIGNALS[field], signals=places)
-            elif field == "inertia":
-                self._touch(_INERTIAL, members)
-                body = elements(self.nominal, own, label).start
-                if (
-                    np.linalg.eigvalsh(
-                        _pseudo_inertia({field: getattr(self.nominal, field) for field in _INERTIAL}, body)
-                    )[0]
-                    <= 0.0
-                ):
-                    raise ValueError(f"the body {label!r} has no physical inertia: fit its body_mass, or correct it")
-                for k in range(10):
-                    self._append(given, f"inertia.{label}[{k}]", field, _INERTIA, -np.inf, np.inf, body=body)
-            else:
-                self._add_field(given, field, label, members, None if match["column"] is None else int(match["column"]))
-
-    def _add_field(self, given: Parameter, field: str, label: str, names: list[str], column: int | None) -> None:
-        rows = np.asarray(getattr(self.nominal, _SERVO[field][0][0] if field in _SERVO else field))
+        # a wildcard for joints does not mean the free joint of a base
+        base = [self.nominal.joint(j).name for j in np.flatnonzero(self.nominal.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
+        hidden = set(base) - set(wanted) if field.startswith("dof_") else set()
+        names = [name for name in names if name not in hidden and any(fnmatch.fnmatchcase(name, p) for p in wanted)]
+        rows = np.asarray(getattr(self.nominal, own)) if field not in _SIGNALS else np.zeros(0)
         width = rows.size // max(1, len(rows))
+        column = None if match["column"] is None else int(match["column"])
         if column is not None and column >= width:
             raise ValueError(f"the parameter {given.name!r} is out of range: {field} has {width} columns")
-        for k in range(width) if field in _SIGNED and column is None else [column]:
-            pairs = _SERVO.get(field, ((field, k), *((("body_inertia", None),) if field == "body_mass" else ())))
-            self._touch([name for name, _ in pairs], names)
-            writes = [(name, place := self._indices(name, names, at), np.full(len(place), _SIGN.get(name, 1.0)))
-                      for name, at in pairs]  # fmt: skip
-            whole = f"{field}.{label}" + ("" if k is None or width == 1 else f"[{k}]")
-            if field in _SIGNED:
-                self._append(given, whole, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
-            elif any(np.ravel(getattr(self.nominal, name))[place].any() for name, place, _ in writes):
-                self._append(given, whole, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
+        apart = given.each or field == "inertia"
+        for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
+            full = f"{field}.{label}"
+            if field in _SIGNALS:
+                signals = [i for name in members for i in self._signals[name]]
+                self._append(given, full, field, *_SIGNALS[field], signals=signals)
+            elif field == "inertia":
+                writes = self._writes([(name, None, 1.0) for name in _INERTIAL], members)
+                nominal = {name: getattr(self.nominal, name) for name in _INERTIAL}
+                if np.linalg.eigvalsh(_pseudo_inertia(nominal, writes[0][1][0]))[0] <= 0.0:
+                    raise ValueError(f"the body {label!r} has no physical inertia: fit its body_mass, or correct it")
+                for k in range(10):
+                    self._append(given, f"{full}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
             else:
-                least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
-                self._append(given, whole, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
+                for k in range(width) if field in _SIGNED and column is None else [column]:
+                    self._add_field(given, full if k is None else f"{full}[{k}]", field, members, k)
+
+    def _add_field(self, given: Parameter, name: str, field: str, members: list[str], column: int | None) -> None:
+        with_inertia = [("body_inertia", None, 1.0)] if field == "body_mass" else []
+        writes = self._writes(_SERVO.get(field, [(field, column, 1.0), *with_inertia]), members)
+        if field in _SIGNED:
+            self._append(given, name, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
+        elif any(getattr(self.nominal, field).reshape(-1)[places].any() for field, places, _ in writes):
+            self._append(given, name, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
+        else:
+            least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
+            self._append(given, name, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
+
+    def _writes(
+        self, fields: Iterable[tuple[str, int | None, float]], names: Sequence[str]
+    ) -> list[tuple[str, np.ndarray, float]]:
+        """Get the flat indices of elements in fields."""
+        writes = []
+        for field, column, sign in fields:
+            self.touched.setdefault(field, set()).update(names)
+            values = np.asarray(getattr(self.nominal, field))
+            grid = np.arange(values.size).reshape(len(values), -1)
+            rows = np.concatenate([grid[elements(self.nominal, field, name)] for name in names])
+            writes.append((field, rows.ravel() if column is None else rows[:, column], sign))
+        return writes
 
     def _append(self, given: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any) -> None:
         if kind in _FACTORS and min(given.low or 1.0, given.high or 1.0) <= 0.0:
@@ -182,28 +193,17 @@ class Parameters:
             raise ValueError(f"the bounds of {given.name!r} must lie around the nominal value")
         self.coordinates.append(Coordinate(name, kind, given.prior or std, low, high, **more))
 
-    def _touch(self, fields: Iterable[str], names: Iterable[str]) -> None:
-        for field in fields:
-            self.touched.setdefault(field, set()).update(names)
-
-    def _indices(self, field: str, names: list[str], column: int | None) -> np.ndarray:
-        values = np.asarray(getattr(self.nominal, field))
-        grid = np.arange(values.size).reshape(len(values), -1)
-        rows = np.concatenate([grid[elements(self.nominal, field, name)] for name in names])
-        return rows.ravel() if column is None else rows[:, column]
-
     def values(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Compute the model fields of a hypothesis."""
         values = {field: getattr(self.nominal, field).copy() for field in self.touched}
         inertias: dict[int, list[float]] = {}
-        for value, coordinate in zip(x, self.coordinates, strict=True):
+        for x_i, coordinate in zip(x, self.coordinates, strict=True):
             if coordinate.kind == "inertia":
-                inertias.setdefault(coordinate.body, []).append(value)
-            for field, places, direction in coordinate.writes:
+                inertias.setdefault(int(coordinate.writes[0][1][0]), []).append(x_i)
+                continue
+            for field, places, sign in coordinate.writes:
                 flat = values[field].reshape(-1)
-                flat[places] = (
-                    flat[places] * np.exp(value) if coordinate.kind == "factor" else flat[places] + direction * value
-                )
+                flat[places] = flat[places] * np.exp(x_i) if coordinate.kind == "factor" else flat[places] + sign * x_i
         for body, numbers in inertias.items():
             if any(numbers):
                 _change_inertia(values, body, numbers)

@@ -104,6 +104,15 @@ def test_windows_with_contacts_determine_mass_and_gain() -> None:
         assert abs(x - truth[name]) < 0.03, name
 
 
+def test_default_fit_of_a_free_base_writes_a_folder(tmp_path: Path) -> None:
+    control = lw.excitation([-0.05], [0.08], "walk", seconds=2.0, rate=100, frequencies=(0.1, 8.0))
+    log = log_of(HOPPING, ["kp.leg"], {}, control)
+    fit = lw.fit(mujoco.MjSpec.from_string(HOPPING), log, samples=0, nthread=1, iterations=1, out=tmp_path)
+    assert "dof_frictionloss.*" in fit.names
+    assert fit.fields["dof_frictionloss"].keys() == {"leg"}  # the base has no friction
+    assert (tmp_path / "draws.npz").is_file()
+
+
 def test_outliers_hardly_move_a_fit() -> None:
     log = log_of(ARM, ["kp.*"], {"kp.*": 0.2}, controls(3.0))
     rng = np.random.default_rng(0)

@@ -279,7 +279,7 @@ def _make(folder: Path) -> None:
     fields = {"dof_damping": {"hinge": [0.1]}}
     content = {"format": 1, "fields": fields, "delays": {}, "names": ["a"], "value": [1.0], "low": [0.5], "high": [2.0]}
     (folder / "fit/fit.json").write_text(json.dumps(content | {"determined": [True]}))
-    np.savez(folder / "fit/draws.npz", dof_damping=np.full((4, 1, 1), 0.1))
+    np.savez(folder / "fit/draws.npz", **{"dof_damping.hinge": np.full((4, 1), 0.1)})
     options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1"]
     options = [*SIZES.split(), "--iterations", "2", "--keep-every", "1", "--evaluate"]
     command("train", "point_mass", "--horizon", "8", "--out", folder / "run", *options)
