@@ -1,7 +1,7 @@
 """Minimise the squared residuals of all windows over parameters and initial states."""
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -93,7 +93,7 @@ class LeastSquares:
 
     def begin(self, x: np.ndarray, noise: np.ndarray) -> Estimate:
         """Start at parameters, and guess the initial states."""
-        return self._guessed(Estimate(x, self.predictor.track(self.windows, x, _MEMORIES[0]), noise))[0]
+        return self._guessed(Estimate(x, np.zeros((0, 0)), noise), [])[0]
 
     def linearize(self, at: Estimate) -> Linear:
         """Make the normal equations from finite differences, with one world for each number and window."""
@@ -110,16 +110,15 @@ class LeastSquares:
         return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
 
     def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
-        p, base = self.parameters.size, np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
+        p, count, scale = self.parameters.size, len(rows), np.outer(steps, steps)
+        base = np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
         with np.errstate(invalid="ignore"):
             change = (rows[:, 1:] - rows[:, :1]) / at.noise
         # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
         jumps = ~(np.abs(change) < _JUMP).all(axis=1, keepdims=True)
-        slopes = np.where(jumps, 0.0, change) / steps[:, None, None]
-        flat = base.reshape(len(rows), -1)
-        jacobian = slopes.reshape(*slopes.shape[:2], -1).swapaxes(1, 2)
-        weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[..., None]
-        square, gradient = jacobian.swapaxes(1, 2) @ weighted, np.einsum("wnp,wn->wp", weighted, flat)
+        jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
+        weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
+        square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
         c = square[:, p:, p:] + np.diag(self.ridge)
         return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
@@ -132,18 +131,18 @@ class LeastSquares:
         result, move = at, 0.0
         for damping in _DAMPINGS:
             x = self._step(at, linear, damping)
-            trial, costs = self._guessed(dataclasses.replace(at, x=x, states=self._settled(at, linear, x)))
+            trial, costs = self._guessed(dataclasses.replace(at, x=x), [self._settled(at, linear, x)])
             if linear.weight @ costs + self.prior(x[None])[0] < cost:
                 result, move = trial, float(np.max(np.abs(x - at.x) / deviation))
                 break
         return dataclasses.replace(result, noise=noise, move=move if steady else np.inf, iteration=at.iteration + 1)
 
-    def _guessed(self, at: Estimate) -> tuple[Estimate, np.ndarray]:
-        """Choose each window's best initial state, the present one or a guess; return the windows' costs, too."""
-        guesses = np.stack([at.states, *(self.predictor.track(self.windows, at.x, m) for m in _MEMORIES)])
+    def _guessed(self, at: Estimate, states: Sequence[np.ndarray]) -> tuple[Estimate, np.ndarray]:
+        """Choose each window's best initial state among the given ones and guesses; return the windows' costs, too."""
+        guesses = np.stack([*states, *self.predictor.track(self.windows, at.x, _MEMORIES)])
         none, trials = np.zeros((1, 1, self.predictor.nx)), [dataclasses.replace(at, states=s) for s in guesses]
         costs = np.concatenate([self.costs(trial, at.x[None], none) for trial in trials], axis=1).T
-        best = guesses[costs.argmin(axis=0), np.arange(len(at.states))]
+        best = guesses[costs.argmin(axis=0), np.arange(len(self.windows))]
         return dataclasses.replace(at, states=best), costs.min(axis=0)
 
     def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> np.ndarray:

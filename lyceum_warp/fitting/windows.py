@@ -7,8 +7,9 @@ from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
-from mujoco.batch import Batch, SimulationError
+from mujoco.batch import Batch
 
+from lyceum_warp.engines import call_batch
 from lyceum_warp.fitting.log import Column, Log
 from lyceum_warp.fitting.parameters import Parameters
 
@@ -16,7 +17,6 @@ Signals: TypeAlias = dict[str, np.ndarray]
 """Delay, gain and bias of each control, and then of each column of the log."""
 WORLDS = 1024
 """Worlds of a batch. More would only take more memory."""
-_STATE = mujoco.mjtState.mjSTATE_QPOS.value | mujoco.mjtState.mjSTATE_QVEL.value | mujoco.mjtState.mjSTATE_ACT.value
 _QUATERNION = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}
 """Numbers of position before the quaternion, by the type of joint."""
 
@@ -81,17 +81,14 @@ class Predictor:
         self.log, self.parameters, self.model = log, parameters, parameters.nominal
         self.nx = 2 * self.model.nv + self.model.na
         """Numbers by which an initial state may differ from another: positions, velocities and activations."""
-        self.sources = {name: [(i, c.index) for i, c in enumerate(log.columns) if c.field == name]
-                        for name in dict.fromkeys(column.field for column in log.columns)}  # fmt: skip
+        fields, indices = (np.array([getattr(c, name) for c in log.columns]) for name in ("field", "index"))
+        self.sources = {field: (np.flatnonzero(fields == field), indices[fields == field]) for field in set(fields)}
+        """Places of each field's columns in the log, and their indices in the field."""
         self.quats = _quaternions(log.columns, self.model)
         self._data = mujoco.MjData(self.model)
-        sizes = {_STATE: mujoco.mj_stateSize(self.model, _STATE)} | {
-            name: len(getattr(self._data, name)) for name in self.sources if name in ("sensordata", "actuator_force")
-        }
-        self._sizes: dict[int | str, int] = sizes
         self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
 
-    def track(self, windows: Windows, x: np.ndarray, memory: float) -> np.ndarray:
+    def track(self, windows: Windows, x: np.ndarray, memories: Sequence[float]) -> list[np.ndarray]:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.
 
         The result has less noise than the measurements, obeys the contacts, and fills what was not measured.
@@ -99,15 +96,20 @@ class Predictor:
         Args:
             windows: The windows.
             x: Coordinates of the parameters.
-            memory: Seconds in which the simulation forgets its own state. A long memory suits a good model.
+            memories: Seconds in which a simulation forgets its own state. A long memory suits a good model.
 
         Returns:
-            qpos, qvel and act, (windows, nq + nv + na).
+            qpos, qvel and act for each memory, (windows, nq + nv + na).
         """
-        model, signals, data = self.parameters.model(x), self.parameters.signals(x), self._data
-        step, states = model.opt.timestep, np.empty((len(windows), model.nq + model.nv + model.na))
+        model, signals = self.parameters.model(x), self.parameters.signals(x)
+        return [self._tracked(windows, model, signals, memory) for memory in memories]
+
+    def _tracked(self, windows: Windows, model: mujoco.MjModel, signals: Signals, memory: float) -> np.ndarray:
+        data, step = self._data, model.opt.timestep
+        states = np.empty((len(windows), model.nq + model.nv + model.na))
         gain, bias = (signals[name][model.nu :] for name in ("gain", "bias"))
-        columns = {name: np.array(self.sources.get(name, []), dtype=int).reshape(-1, 2).T for name in ("qpos", "qvel")}
+        none = np.zeros((2, 0), int)
+        columns = {name: self.sources.get(name, none) for name in ("qpos", "qvel")}
         # velocities that are not measured follow from positions
         change, derived = np.zeros(model.nv), ~np.isin(np.arange(model.nv), columns["qvel"][1])
         for number in np.unique(windows.take):
@@ -162,30 +164,23 @@ class Predictor:
         batch.state[:] = 0.0
         shifts = np.broadcast_to(changes, (len(windows), count, self.nx)).reshape(-1, self.nx)
         initial = self.moved(np.repeat(states, count, axis=0), shifts)
-        edges = [self.model.nq, self.model.nq + self.model.nv]
-        for name, part in zip(("qpos", "qvel", "act"), np.split(initial, edges, axis=1), strict=True):
+        parts = np.split(initial, [self.model.nq, self.model.nq + self.model.nv], axis=1)
+        state = dict(zip(("qpos", "qvel", "act"), parts, strict=True))
+        for name, part in state.items():
             batch.bind(name)[...] = part
         signals = [self.parameters.signals(x) for x in rows]
         controls = np.stack([self.controls(windows, signal) for signal in signals], axis=1)[:, which]
         controls = controls.reshape(-1, windows.steps, self.model.nu)
-        records = {name: np.empty((len(initial), windows.steps, size)) for name, size in self._sizes.items()}
-        bad = np.zeros(len(initial), bool)
-        for call in (
-            batch.set_const,
-            lambda: batch.rollout(windows.steps, controls, record=list(records), out=records),
-        ):
-            try:
-                call()
-            except SimulationError as error:  # a hypothesis may be absurd; the other worlds went on
-                bad[error.ids] = True
-        bad |= batch.warning[:, :, 1].any(axis=1)
-        rolled = np.concatenate([initial[:, None], records[_STATE][:, :-1]], axis=1)
-        fields = records | dict(zip(("qpos", "qvel", "act"), np.split(rolled, edges, axis=2), strict=True))
-        predicted = np.empty((*rolled.shape[:2], len(self.log.columns)))
-        for name, pairs in self.sources.items():
-            columns, indices = np.array(pairs).T
-            predicted[..., columns] = fields[name].reshape(*rolled.shape[:2], -1)[..., indices]
-        predicted[bad] = np.inf
+        size = (len(initial), windows.steps)
+        records = {name: np.empty((*size, len(getattr(self._data, name)))) for name in self.sources}
+        call_batch(batch, batch.set_const)
+        call_batch(batch, batch.rollout, windows.steps, controls, record=list(records), out=records)
+        for name in state.keys() & records.keys():  # the state before each substep
+            records[name] = np.concatenate([state[name][:, None], records[name][:, :-1]], axis=1)
+        predicted = np.empty((*size, len(self.log.columns)))
+        for name, (columns, indices) in self.sources.items():
+            predicted[..., columns] = records[name][..., indices]
+        predicted[batch.warning[:, :, 1].any(axis=1)] = np.inf  # a hypothesis may be absurd
         return self._compared(
             windows, predicted.reshape(len(windows), count, windows.steps, -1), [signals[i] for i in which]
         )
