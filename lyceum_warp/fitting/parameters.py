@@ -157,8 +157,8 @@ class Parameters:
                 for k in range(10):
                     self._append(given, f"{full}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
             else:
-                for k in range(width) if field in _SIGNED and column is None else [column]:
-                    self._add_field(given, full if k is None else f"{full}[{k}]", field, members, k)
+                for one in range(width) if field in _SIGNED and column is None else [column]:
+                    self._add_field(given, full if one is None else f"{full}[{one}]", field, members, one)
 
     def _add_field(self, given: Parameter, name: str, field: str, members: list[str], column: int | None) -> None:
         with_inertia = [("body_inertia", None, 1.0)] if field == "body_mass" else []
