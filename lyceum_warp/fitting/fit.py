@@ -205,7 +205,7 @@ def _kind(column: Column, model: mujoco.MjModel) -> str:
     """Name the kind of a column's measurement."""
     if column.field == "sensordata":
         sensor = int(np.searchsorted(model.sensor_adr, column.index, side="right")) - 1
-        return mujoco.mjtSensor(model.sensor_type[sensor]).name.removeprefix("mjSENS_").lower()
+        return str(mujoco.mjtSensor(model.sensor_type[sensor]).name).removeprefix("mjSENS_").lower()
     if column.field in ("qpos", "qvel"):
         address = model.jnt_qposadr if column.field == "qpos" else model.jnt_dofadr
         joint = int(np.searchsorted(address, column.index, side="right")) - 1
