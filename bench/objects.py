@@ -65,9 +65,7 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
     envs = {}
     for name, task, objects in (("one", Stir, ["apple"]), ("many", CONTESTANTS[case.contestant], None)):
         lw.make(task, engine=case.engine, device=case.device, objects=objects)  # compile kernels
-        envs[name] = lw.make(
-            task, nworld=case.worlds, engine=case.engine, device=case.device, objects=objects, seed=1
-        )
+        envs[name] = lw.make(task, nworld=case.worlds, engine=case.engine, device=case.device, objects=objects, seed=1)
     actions = contestants.actions(envs["one"], seed=0)
 
     def block(env: lw.Env) -> None:

@@ -234,7 +234,7 @@ def _result(
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
     value, low, high = (np.array([c.value(x) for c, x in zip(bound.coordinates, end, strict=True)]) for end in ends)
     # in multiples of the priors, a direction of information 1 is known as well from the prior as from the log
-    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.reduced()[1] * bound.std)
+    strength, vectors = np.linalg.eigh(bound.std[:, None] * linear.reduced()[1].sum(axis=0) * bound.std)
     weak = vectors.T[1.0 / np.sqrt(np.maximum(strength, 0.0) + 1.0) > _KNOWN]
     directions = [{bound.names[i]: float(v[i]) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2} for v in weak]
     rms: dict[str, Any] = {

@@ -64,11 +64,10 @@ class Linear:
     """Gradients, (windows, nx)."""
 
     def reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Eliminate the initial states: each window's weighted gradient, and the Fisher information of the log."""
+        """Eliminate the initial states: each window's weighted gradient, and its Fisher information."""
         solved = np.linalg.solve(self.c, np.concatenate([self.b.swapaxes(1, 2), self.by_state[..., None]], axis=2))
         gradients = self.by_x - np.einsum("wpk,wk->wp", self.b, solved[..., -1])
-        information = np.einsum("w,wpq->pq", self.weight, self.a - self.b @ solved[..., :-1])
-        return self.weight[:, None] * gradients, information
+        return self.weight[:, None] * gradients, self.weight[:, None, None] * (self.a - self.b @ solved[..., :-1])
 
 
 class LeastSquares:
@@ -127,7 +126,9 @@ class LeastSquares:
         linear = self.linearize(at)
         cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
         steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
-        deviation = np.sqrt(np.diag(np.linalg.inv(linear.reduced()[1] + np.diag(self.parameters.std**-2.0))))
+        deviation = np.sqrt(
+            np.diag(np.linalg.inv(linear.reduced()[1].sum(axis=0) + np.diag(self.parameters.std**-2.0)))
+        )
         result, move = at, 0.0
         for damping in _DAMPINGS:
             x = self._step(at, linear, damping)
@@ -192,21 +193,22 @@ class LeastSquares:
         """Compute the covariance of the posterior.
 
         If the residuals of a window have a common cause, such as wrong contacts, the curvature promises too much. The
-        scatter of the windows' gradients then widens the intervals (the sandwich estimate, clustered by window).
+        scatter of the windows then widens the intervals: the changes of the fit without each window (the jackknife).
         """
-        gradients, information = linear.reduced()
+        gradients, informations = linear.reduced()
         prior, (count, p) = np.diag(self.parameters.std**-2.0), gradients.shape
-        inverse = np.linalg.inv(information + prior)
-        meat = gradients.T @ gradients * count / max(1, count - p) + prior
-        scale = np.sqrt(np.maximum(1.0, np.diag(inverse @ meat @ inverse) / np.diag(inverse)))
+        inverse = np.linalg.inv(informations.sum(axis=0) + prior)
+        changes = np.linalg.solve(np.eye(p) - informations @ inverse, gradients[..., None])[..., 0] @ inverse
+        variance = (changes**2).sum(axis=0) + np.diag(inverse @ prior @ inverse)
+        scale = np.sqrt(np.maximum(1.0, variance / np.diag(inverse)))
         covariance: np.ndarray = scale[:, None] * inverse * scale if count >= 2 * p else inverse
         return covariance
 
     def _step(self, at: Estimate, linear: Linear, damping: float) -> np.ndarray:
         """Solve the damped normal equations of the parameters within their bounds."""
         prior, low, high = self.parameters.std**-2.0, self.parameters.low, self.parameters.high
-        gradients, whole = linear.reduced()
-        gradient, whole = gradients.sum(axis=0) + prior * at.x, whole + np.diag(prior)
+        gradient, whole = (part.sum(axis=0) for part in linear.reduced())
+        gradient, whole = gradient + prior * at.x, whole + np.diag(prior)
         whole[np.diag_indices(len(whole))] *= 1.0 + damping
         held = ((at.x <= low) & (gradient > 0.0)) | ((at.x >= high) & (gradient < 0.0))
         whole[held], whole[:, held], gradient[held] = 0.0, 0.0, 0.0
