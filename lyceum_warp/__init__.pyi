@@ -149,8 +149,7 @@ from lyceum_warp.training.runs.folder import (
 from lyceum_warp.training.runs.pretrained_runs import pretrained_run as pretrained_run
 from lyceum_warp.training.seeds import SeedRun as SeedRun, train_seeds as train_seeds
 from lyceum_warp.training.stopping import Minutes as Minutes, TargetReturn as TargetReturn
-from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
-from lyceum_warp.training.weights_and_biases import WandB as WandB
+from lyceum_warp.training.trackers import TensorBoard as TensorBoard, WandB as WandB
 from lyceum_warp.tuning.search import Tuning as Tuning, tune as tune
 from lyceum_warp.viewer.show import view as view
 from lyceum_warp.viz.page import show as show

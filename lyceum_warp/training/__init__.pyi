@@ -57,5 +57,4 @@ from lyceum_warp.training.stopping import (
     Minutes as Minutes,
     TargetReturn as TargetReturn,
 )
-from lyceum_warp.training.tensorboard import TensorBoard as TensorBoard
-from lyceum_warp.training.weights_and_biases import WandB as WandB
+from lyceum_warp.training.trackers import TensorBoard as TensorBoard, WandB as WandB

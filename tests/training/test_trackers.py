@@ -9,7 +9,7 @@ import pytest
 
 import lyceum_warp as lw
 from lyceum_warp.training import TensorBoard
-from lyceum_warp.training.tensorboard import tag
+from lyceum_warp.training.trackers import tag
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,9 @@
-"""Write a run's curves for TensorBoard, with the extra ``tensorboard``."""
+"""Log runs for TensorBoard and to Weights & Biases, with the extras ``tensorboard`` and ``wandb``."""
 
 import math
 import os
 import time
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -137,6 +138,47 @@ class TensorBoard(Callback):
         from tensorboard.compat.proto.event_pb2 import Event
 
         self._file.write(Event(wall_time=time.time(), **event).SerializeToString())
+
+
+class WandB(Callback):
+    """Logs a run's settings, curves and videos to Weights & Biases. A resumed run continues its page.
+
+    The curves have the names that ``TensorBoard`` gives them. Pass this callback after ``Videos``.
+
+    Args:
+        project: The project.
+        options: More arguments of ``wandb.init``, such as ``mode="offline"`` or ``group="five seeds"``.
+
+    Raises:
+        ImportError: The package wandb is not installed.
+    """
+
+    def __init__(self, project: str = "lyceum_warp", **options: Any) -> None:
+        check_extra("Weights & Biases", "wandb")
+        import wandb
+
+        self._wandb = wandb
+        self._options = {"project": project, **options}
+        self.settings: dict[str, Any] = {"wandb": project}
+
+    def begin(self, run: Run, learner: Learner, iterations: int) -> None:
+        """Open the run's page."""
+        self._videos = run.folder / "videos"
+        run.amend(wandb_id=run.config.get("wandb_id", uuid.uuid4().hex[:12]))
+        config = {name: value for name, value in run.config.items() if name != "kept"}
+        options = {"name": run.folder.name, "id": run.config["wandb_id"], "resume": "allow", **self._options}
+        self._wandb.init(dir=run.folder, config=config, **options)
+
+    def __call__(self, iteration: Iteration) -> None:
+        """Log an iteration without its non-finite numbers."""
+        numbers = {tag(name): x for name, x in iteration.row().items() if x is not None and math.isfinite(x)}
+        if (video := self._videos / f"{iteration.iteration:06d}.mp4").is_file():
+            numbers["video"] = self._wandb.Video(str(video), format="mp4")
+        self._wandb.log(numbers, step=iteration.iteration)
+
+    def close(self) -> None:
+        """Close the run's page."""
+        self._wandb.finish()
 
 
 def _moving_picture(video: Path) -> Any:
