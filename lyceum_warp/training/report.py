@@ -5,7 +5,7 @@ import io
 import itertools
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from lyceum_warp.training.curve import RETURNS, Panel, curve_panels, draw_panel
 from lyceum_warp.training.runs.configuration import Configuration
 from lyceum_warp.training.runs.folder import Run, load, load_curriculum
 from lyceum_warp.training.runs.task_copy import run_env
-from lyceum_warp.viz import ACCENT, GRID, LINE, finish_axes, new_figure, one_line, show
+from lyceum_warp.viz import finish_axes, new_figure, one_line, show
 
 _SETTINGS = (
     "task", "algorithm", "network", "seed", "iterations", "nworld", "engine", "device", "threads", "exact_from",
@@ -27,11 +27,6 @@ _SETTINGS = (
     "real_time",
 )  # fmt: skip
 """Entries of config.json on the page. All others, such as those of callbacks, are left out."""
-
-_COLOURS = {LINE: "one", ACCENT: "two", GRID: "line", "#000000": "soft"}
-"""Maps colours of figures to the page's, which differ in the dark."""
-
-_NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
 def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
@@ -50,14 +45,16 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     folder = Path(folder)
     if planned := (folder / "report.json").is_file():
         config = json.loads((folder / "config.json").read_text())
-        title, body = f"{_short(config['task'])}, {config['algorithm']}", _planner_parts(folder)
+        title = f"{_text(config['task'])}, {config['algorithm']}"
+        results, curves = _section("Report", _table(json.loads((folder / "report.json").read_text()))), ""
     else:
         run = Run.open(folder)
         config = run.config
-        title, body = f"{run.task_name}, {config['algorithm']}, seed {config['seed']}", _run_parts(run)
+        title = f"{run.task_name}, {config['algorithm']}, seed {config['seed']}"
+        results, curves = _results(run), _curves(run)
     settings = {name: config[name] for name in (*_SETTINGS, config["algorithm"]) if name in config}
     parts = [
-        next(body), _episode(folder, planned=planned), *body, _section("Settings", _table(flat_settings(settings))),
+        results, _episode(folder, planned=planned), curves, _section("Settings", _table(settings)),
         _section("Machine and versions", _table(config.get("versions", {}))),
     ]  # fmt: skip
     return html_page(Path(out or folder / "report.html"), title, parts)
@@ -70,28 +67,26 @@ def html_page(out: Path, title: str, parts: Iterable[str]) -> Path:
     return out
 
 
-def _run_parts(run: Run) -> Iterator[str]:
-    panels, curve = curve_panels(run), read_curve(run)
-    rows = run.rows()
+def _results(run: Run) -> str:
+    curve, rows = read_curve(run), run.rows()
     lines = [f"{rows[-1]['iteration']:,.0f} iterations, {rows[-1]['samples'] or 0:,.0f} samples, "
              f"last return {curve.final:.5g}"]  # fmt: skip
     if run.evaluation.is_file():
         lines.append(json.loads(run.evaluation.read_text()).get("line", ""))
-    lines += [f"gate: {curve.gate}"] * bool(curve.gate) + [f"transfer: {curve.transfer}"] * bool(curve.transfer)
+    lines += [f"{name}: {text}" for name, text in (("gate", curve.gate), ("transfer", curve.transfer)) if text]
     faults = {name: round(sum(row.get(name) or 0.0 for row in rows)) for name in ("faults", "outliers")}
     lines.append(", ".join(f"{number:,d} {name}" for name, number in faults.items()))
-    yield "\n".join(f"<p>{html.escape(line)}</p>" for line in lines)
-    for group, members in itertools.groupby(panels, lambda panel: panel.group):
+    return "\n".join(f"<p>{_text(line)}</p>" for line in lines)
+
+
+def _curves(run: Run) -> str:
+    parts = []
+    for group, panels in itertools.groupby(curve_panels(run), lambda panel: panel.group):
         keys = '<p class="soft"><span class="key">stochastic policy</span><span class="key">mean policy</span></p>'
-        figures = "\n".join(map(_figure, members))
         title = {RETURNS: "Curves over samples"}.get(group, group.capitalize())
-        yield _section(title, f'{keys if group == RETURNS else ""}<div class="grid">{figures}</div>')
-
-
-def _planner_parts(folder: Path) -> Iterator[str]:
-    report = json.loads((folder / "report.json").read_text())
-    yield "<p>a planner's episodes</p>"
-    yield _section("Report", _table(flat_settings(report if isinstance(report, dict) else {"report": report})))
+        figures = "\n".join(map(_figure, panels))
+        parts.append(_section(title, f'{keys if group == RETURNS else ""}<div class="grid">{figures}</div>'))
+    return "\n".join(parts)
 
 
 def _episode(folder: Path, *, planned: bool) -> str:
@@ -109,46 +104,35 @@ def _episode(folder: Path, *, planned: bool) -> str:
             states = played.states
         text = show(env, states).content
     except Exception as error:  # a report without an episode is worth having
-        reason = re.sub(r"/\S*/", "", one_line(error))  # without folders
-        return f'<p class="soft">no episode: {html.escape(reason)}</p>'
+        return f'<p class="soft">no episode: {_text(one_line(error))}</p>'
     return _section("Episode", f'<iframe title="an episode" srcdoc="{html.escape(text)}"></iframe>')
 
 
 def _section(title: str, content: str) -> str:
-    return f"<h2>{html.escape(title)}</h2>\n{content}"
+    return f"<h2>{title}</h2>\n{content}"
 
 
 def _table(entries: Mapping[str, Any]) -> str:
-    cells = ((name, _short(value)) for name, value in entries.items() if value not in (None, "", {}))
-    names = ((re.sub(r"([._])", r"\1<wbr>", html.escape(name)), text) for name, text in cells)  # where a name may break
-    rows = (f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in names)
+    known = {name: value for name, value in flat_settings(entries).items() if value not in (None, "")}
+    rows = (f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in known.items())
     return f"<table>{''.join(rows)}</table>"
 
 
-def _short(value: Any) -> str:
+def _text(value: Any) -> str:
     """Format a value. Of a path, only the file's name remains, because folders may have a user's name."""
-    if isinstance(value, str) and value.startswith("/"):
-        return Path(value).name
-    if isinstance(value, list):
-        return " ".join(map(_short, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    text = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return html.escape(re.sub(r"(?<![\w.])/[^',:]*/", "", text))
 
 
 def _figure(panel: Panel) -> str:
-    """Draw a panel as SVG, in the page's colours."""
+    """Draw a panel as SVG."""
     figure, file = new_figure("a report", 3.2, 1.6), io.StringIO()
-    from matplotlib import rc_context
-
     axes = figure.subplots()
     draw_panel(axes, panel)
     finish_axes([axes])
     axes.locator_params(nbins=4)
-    with rc_context({"svg.fonttype": "none"}):
-        figure.savefig(file, format="svg", transparent=True, metadata=_NO_METADATA)
+    figure.savefig(file, format="svg", transparent=True, metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
     drawn = file.getvalue().partition("<svg")[2]
-    for colour, name in _COLOURS.items():
-        drawn = drawn.replace(colour, f"var(--{name})")
-    unit = f" <span>{html.escape(panel.unit)}</span>" if panel.unit else ""
-    title = html.escape(panel.title)
-    caption = f"<figcaption>{title}{unit}</figcaption>"
-    return f'<figure>{caption}<svg role="img" aria-label="{title} over samples"{drawn}</figure>'
+    title, unit = _text(panel.title), _text(panel.unit)
+    caption = f"<figcaption>{title} <span>{unit}</span></figcaption>"
+    return f"<figure>{caption}<svg role='img' aria-label='{title} over samples'{drawn}</figure>"

@@ -23,7 +23,6 @@ from lyceum_warp.viz.render import (
 )
 from lyceum_warp.viz.style import (
     ACCENT as ACCENT,
-    GRID as GRID,
     LINE as LINE,
     STYLES as STYLES,
     finish_axes as finish_axes,
