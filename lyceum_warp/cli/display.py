@@ -48,7 +48,7 @@ def counted(number: int, what: str) -> str:
     return f"{number:,d} {what}{'s' * (number != 1)}"
 
 
-_COLUMNS = [
+COLUMNS = [
     ("iter", "iteration", ".0f"), ("samples", "samples", ",.0f"), ("reward\na step", "reward_mean", ".3g"),
     ("return", "return_mean", ".1f"), ("std", "return_std", ".1f"), ("mean\npolicy", "mean_return", ".1f"),
     ("length", "length_mean", ".0f"), ("eval", "eval_mean", ".3g"), ("success", "success", ".0%"),
@@ -58,13 +58,19 @@ _COLUMNS = [
 
 
 def table(columns: Mapping[str, Sequence[str]]) -> Table:
-    """Make a table from a mapping of headings to columns. If the table is too wide for the console, cells wrap."""
+    """Make a table from a mapping of headings to columns, without empty ones. If it is too wide, its cells wrap."""
+    columns = {heading: cells for heading, cells in columns.items() if any(cells)}
     table = Table(box=rich.box.SIMPLE, padding=0, pad_edge=False)
     for i, (heading, cells) in enumerate(columns.items()):
         table.add_column(escape(heading), justify="right" if i or cells[0].isdecimal() else "left", overflow="fold")
     for row in zip(*columns.values(), strict=True):
         table.add_row(*map(escape, row))
     return table
+
+
+def table_of(rows: Sequence[Mapping[str, str]]) -> Table:
+    """Make a table from rows, which map headings to cells."""
+    return table({heading: [row[heading] for row in rows] for heading in rows[0]})
 
 
 def curve_table(rows: Sequence[Mapping[str, float | None]]) -> Table:
@@ -78,12 +84,11 @@ def curve_table(rows: Sequence[Mapping[str, float | None]]) -> Table:
     if len(selection) > _TABLE_ROWS:
         selection = [selection[round(i * (len(selection) - 1) / (_TABLE_ROWS - 1))] for i in range(_TABLE_ROWS)]
     columns = {}
-    for heading, name, form in _COLUMNS:
+    for heading, name, form in COLUMNS:
         cells = [format(row[name], form) if name in row else "" for row in selection]
         if name == "reward_mean" and all("return_mean" in row for row in iterations):
             continue  # show rewards only if an iteration has no return
-        if any(cells):
-            columns[heading] = cells
+        columns[heading] = cells
     curve = table(columns)
     sums = {what: round(sum(row.get(column, 0.0) for row in iterations)) for column, what in COUNTED.items()}
     if bad := [counted(number, what) for what, number in sums.items() if number]:

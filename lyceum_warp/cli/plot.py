@@ -1,17 +1,17 @@
 """Plot runs and compare them: lyceum-warp plot."""
 
 import dataclasses
+import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
+import numpy as np
 import tyro
 
 from lyceum_warp import training
-from lyceum_warp.cli.display import console, say_entries, table
+from lyceum_warp.cli.display import console, say_entries, table, table_of
+from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval
 from lyceum_warp.support.mappings import differing
-
-_COLUMNS = 4
-"""Maximum number of groups in the table of differences."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -39,36 +39,40 @@ class Plot:
         curves = training.read_curves(self.folders)
         groups = training.group_runs(curves)
         print_groups(groups)
-        if 1 < len(groups) <= _COLUMNS:
-            _print_differences(groups)
+        if len(groups) > 1:
+            _print_differences(groups[:4])
         alone = len(curves) == 1 and (curves[0].folder / "config.json").is_file()
         path = training.learning_curve(curves[0].folder) if alone else training.comparison_figure(groups, self.out)
         say_entries(figure=path, next=f"lyceum-warp report {curves[0].folder}")
 
 
 def print_groups(groups: "list[training.RunGroup]") -> None:
-    """Print the final returns of groups of runs with the samples before them, gates, and verdicts on transfer."""
+    """Print the final returns of groups of runs with the samples before them, gates, and verdicts on transfer.
+
+    The interval of the mean is Student's t interval. That of the interquartile mean is a percentile bootstrap interval,
+    as in Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
+    """
     rows = []
     for group in groups:
-        summary, known = group.summary(), [run for run in group.runs if len(run.returns)]
-        samples = sorted({run.samples[-1] for run in known})
+        finals = np.array([run.final for run in group.curves] or [math.nan])
+        mean, half = mean_interval(finals)
+        samples = sorted({run.samples[-1] for run in group.curves})
         tested = [run.gate.startswith("passed") for run in group.runs if run.gate]
         rows.append({
             "task": group.task, "settings": group.label, "runs": str(len(group.runs)),
             "samples": " to ".join(f"{number:,.0f}" for number in (*samples[:1], *samples[1:][-1:])),
-            "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in known})),
-            "final return\n[95 %, t]": _interval(summary, "mean"),
-            "interquartile mean\n[95 %, bootstrap]": _interval(summary, "interquartile_mean"),
+            "policy": " or ".join(sorted({"mean" if run.evaluated else "stochastic" for run in group.curves})),
+            "final return\n[95 %, t]": _interval(mean, mean - half, mean + half),
+            "interquartile mean\n[95 %, bootstrap]":
+                _interval(float(interquartile_mean(finals)), *bootstrap_interval(finals, interquartile_mean)),
             "gate": f"{sum(tested)} of {len(tested)} passed" if tested else "",
             "transfer": "; ".join(dict.fromkeys(run.transfer for run in group.runs if run.transfer)),
         })  # fmt: skip
-    columns = {name: [row[name] for row in rows] for name in rows[0]}
-    console.print(table({name: cells for name, cells in columns.items() if any(cells)}))
+    console.print(table_of(rows))
 
 
-def _interval(summary: dict[str, Any], name: str) -> str:
-    ends = ", ".join(f"{end:.5g}" for end in summary.get(f"{name}_interval", ()))
-    return (f"{summary[name]:.5g}" if name in summary else "") + (f" [{ends}]" if ends else "")
+def _interval(value: float, low: float, high: float) -> str:
+    return f"{value:.5g}" + ("" if math.isnan(low) else f" [{low:.5g}, {high:.5g}]")
 
 
 def _print_differences(groups: "list[training.RunGroup]") -> None:

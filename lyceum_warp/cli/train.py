@@ -120,8 +120,6 @@ class Train:
     network: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """A network of your own, path/to/file.py:Class: a torch module, made by Class(observations, actions), that computes
     the mean actions of npg, ppo and distill. The run's folder has a copy of the file."""
-    setting: arguments.Repeated = ()
-    """A hyperparameter of a learner of your own, such as noise=0.1; may be repeated."""
     iterations: int | None = None
     """Total number of iterations, including those before the run was resumed. The default is the number that the task
     suggests, or 100.
@@ -213,7 +211,9 @@ class Train:
     def run(self, callbacks: Sequence[Callable[[Any], object]] = ()) -> int:
         self._check_flags()
         if self.seeds:
-            return self._run_seeds()
+            from lyceum_warp.cli.seeds import train_and_show
+
+            return train_and_show(self, self.out or _new_folder(binding.task_name(binding.find_task(self.task or ""))))
         folder = self.resume or self.from_run
         source = None if folder is None else training.Run.open(folder)
         with algos.join(self.env.device or ("cpu" if source is None else source.config.get("device", "cpu"))) as team:
@@ -232,21 +232,6 @@ class Train:
         self._learner(self.configuration(source, team), source, team)
         self._callbacks(self._settings({}))
 
-    def _run_seeds(self) -> int:
-        from lyceum_warp.cli.seeds import train_and_show
-
-        assert self.task is not None
-        folder = self.out or _new_folder(binding.task_name(binding.find_task(self.task)))
-        own = {"task", "seeds", "jobs", "out", "go_on", "verbose", "env", "physics", "hyperparameters"}
-        settings = {
-            name.removesuffix("_run"): value
-            for part in (self, self.env, self.physics, self.hyperparameters)
-            for name, value in core.given_values(part).items()
-            if name not in own
-        }
-        seeds = self.seeds[0] if len(self.seeds) == 1 else self.seeds
-        return train_and_show(self.task, folder, seeds, self.jobs, settings)
-
     def _run(self, source: "training.Run | None", team: "algos.Team", more: Sequence[Callable[[Any], object]]) -> int:
         settings = self._settings({} if source is None else source.config)
         camera = arguments.video_camera(self.camera)
@@ -263,9 +248,8 @@ class Train:
             if team.leads:
                 say(f"the run in {folder} is complete")
             return self._report(source, learner) if team.leads else 0
+        del settings["wandb"]  # the callback stores it
         changes = {name: settings.pop(name) for name in ("keep_every", "save_every", "exact_from")}
-        if settings["wandb"] is None:  # lw.train has no such setting
-            del settings["wandb"]
         try:
             run = training.train(
                 learner, folder if self.resume is None or source is None else source, total, callbacks=callbacks,
@@ -367,8 +351,6 @@ class Train:
         if source is None or self.task is None or binding.task_name(binding.find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
-        if self.setting or algorithm not in training.ALGORITHMS:
-            hyperparameters = self._own_settings(algorithm, source)
         return dataclasses.replace(
             base,
             **self._given("task", "threads", "iterations", "network"),
@@ -378,17 +360,6 @@ class Train:
             hyperparameters=self.hyperparameters.on_top_of(hyperparameters, algorithm),
             seed=base.seed if self.seed is None else None,
         )
-
-    def _own_settings(self, algorithm: str, source: "training.Run | None") -> Any:
-        """Return the hyperparameters of the user's own learner: the given ones on top of the source run's."""
-        kind, config = training.learner_classes(algorithm)
-        if algorithm in training.ALGORITHMS or (config is None and self.setting):
-            raise ValueError(f"--setting has no effect with {algorithm}: use the flags of its hyperparameters")
-        saved = {} if source is None or source.config["algorithm"] != kind.algorithm else source.config[kind.algorithm]
-        try:
-            return None if config is None else config(**{**saved, **dict(map(arguments.parameter, self.setting))})
-        except TypeError as error:
-            raise ValueError(f"--setting {' '.join(self.setting)}: {error}") from error
 
     def _suggestion(self, team: "algos.Team") -> "training.Configuration":
         """Return the configuration that the task suggests."""

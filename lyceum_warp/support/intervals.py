@@ -69,8 +69,7 @@ def bootstrap_interval(
     if n < 2:
         return np.full((2, *array.shape[:-1]), math.nan)
     index = np.random.default_rng(0).integers(n, size=(resamples, n))
-    ends: np.ndarray = np.percentile(statistic(array[..., index]), (2.5, 97.5), axis=-1)
-    return ends
+    return np.percentile(statistic(array[..., index]), (2.5, 97.5), axis=-1)
 
 
 def clear_losses(first: np.ndarray, second: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:

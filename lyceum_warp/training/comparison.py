@@ -11,21 +11,16 @@ from typing import Any
 import numpy as np
 
 from lyceum_warp.support.extras import check_extra
-from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean, mean_interval
+from lyceum_warp.support.intervals import bootstrap_interval
 from lyceum_warp.support.mappings import differing, flat_settings
-from lyceum_warp.training.runs.folder import CONFIG, Run
+from lyceum_warp.training.runs.folder import Run
 from lyceum_warp.viz import STYLES, finish_axes, new_figure, save_figure
 
 _SETTINGS = ("algorithm", "network", "nworld", "engine", "device", "exact_from", "options", "params", "physics")
 """Entries of config.json that tell one kind of run from another, besides the algorithm's own."""
 
-_EVALUATION = (".mean_every", ".mean_episodes")
-"""Settings that do not change what a run learns."""
-
 _POINTS, _RESAMPLES = 200, 1000
 """Numbers of points of a mean curve, and of bootstrap resamples of its interval."""
-
-_EVENTS = "events.out.tfevents.*"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,21 +63,10 @@ class RunGroup:
     """The settings that differ from those of other groups."""
     runs: Sequence[RunCurve]
 
-    def summary(self) -> dict[str, Any]:
-        """Summarise the final returns of all runs, complete or not.
-
-        The interval of the mean is Student's t interval. That of the interquartile mean is a percentile bootstrap
-        interval, as in Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
-        """
-        finals = [run.final for run in self.runs if not math.isnan(run.final)]
-        result: dict[str, Any] = {"runs": len(self.runs), "finals": finals}
-        if finals:
-            mean, half = mean_interval(finals)
-            result |= {"mean": mean, "interquartile_mean": float(interquartile_mean(np.array(finals)))}
-        if len(finals) > 1:
-            result["mean_interval"] = [mean - half, mean + half]
-            result["interquartile_mean_interval"] = bootstrap_interval(finals, interquartile_mean).tolist()
-        return result
+    @property
+    def curves(self) -> list[RunCurve]:
+        """The runs that have a return."""
+        return [run for run in self.runs if len(run.returns)]
 
 
 def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
@@ -99,11 +83,12 @@ def read_curves(paths: Iterable[str | Path]) -> list[RunCurve]:
     """
     curves = []
     for path in map(Path, paths):
-        folders = [path] if (path / CONFIG).is_file() else sorted(file.parent for file in path.rglob("metrics.csv"))
-        others = [] if folders else sorted({file.parent for file in path.rglob(_EVENTS)})
-        if not folders and not others:
-            Run.open(path)  # raises an error that names what is there
-        curves += [read_curve(Run.open(folder)) for folder in folders] + [_read_events(folder) for folder in others]
+        if folders := sorted(file.parent for file in path.rglob("metrics.csv")):
+            curves += [read_curve(Run.open(folder)) for folder in folders]
+        elif folders := sorted({file.parent for file in path.rglob("events.out.tfevents.*")}):
+            curves += map(_read_events, folders)
+        else:
+            curves.append(read_curve(Run.open(path)))  # or an error that names what is there
     return curves
 
 
@@ -117,12 +102,11 @@ def read_curve(run: Run) -> RunCurve:
         if len(points := points[np.isfinite(points[:, 2])]):
             break
     config, passed = run.config, run.config.get("passed")
-    settings = flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))})
     gate = "not passed" if (run.folder / "gate.jsonl").exists() else ""
     return RunCurve(
         folder=run.folder,
         task=run.task_name,
-        settings={name: value for name, value in settings.items() if not name.endswith(_EVALUATION)},
+        settings=flat_settings({name: config.get(name) for name in (*_SETTINGS, str(config.get("algorithm")))}),
         versions={**config.get("versions", {}), "task source": run.manifest.get("source_hash", "")[:12]},
         samples=points[:, 0], seconds=points[:, 1], returns=points[:, 2], evaluated=column == "mean_return",
         gate=gate if passed is None else f"passed in iteration {passed['iteration']}",
@@ -189,26 +173,24 @@ def comparison_figure(groups: Sequence[RunGroup], out: str | Path) -> Path:
         ValueError: No run has a return.
         ImportError: matplotlib is not installed.
     """
-    known = [dataclasses.replace(g, runs=[run for run in g.runs if len(run.returns)]) for g in groups]
-    tasks = list(dict.fromkeys(group.task for group in known if group.runs))
+    tasks = list(dict.fromkeys(group.task for group in groups if group.curves))
     if not tasks:
         raise ValueError("no run has a return to plot: continue its training")
     figure = new_figure("a comparison", 9.0, 0.6 + 2.9 * len(tasks))
     from matplotlib.ticker import EngFormatter
 
     for task, panels in zip(tasks, figure.subplots(len(tasks), 2, squeeze=False, sharey="row"), strict=True):
-        shown = [group for group in known if group.task == task and group.runs]
+        shown = [group for group in groups if group.task == task and group.curves]
         for group, (colour, _, line) in zip(shown, itertools.cycle(STYLES)):
-            label = f"{group.label} ({len(group.runs)} run{'s' * (len(group.runs) > 1)})"
+            label = f"{group.label} ({len(group.curves)} run{'s' * (len(group.curves) > 1)})"
             for axes, name in zip(panels, ("samples", "seconds"), strict=True):
-                x, mean, low, high = mean_curve(group.runs, name)
+                x, mean, low, high = mean_curve(group.curves, name)
                 axes.plot(x, mean, color=colour, linestyle=line, label=label, marker="" if len(set(x)) > 2 else ".")
                 axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
-        evaluated = all(run.evaluated for group in shown for run in group.runs)
+        evaluated = all(run.evaluated for group in shown for run in group.curves)
         panels[0].set_title(task, loc="left")
         panels[0].set(xlabel="samples", ylabel="return of the mean policy" if evaluated else "return")
-        small = {"fontsize": "small", "title_fontsize": "small"}
-        panels[0].legend(title="mean, 95 % interval", frameon=False, loc="best", **small)
+        panels[0].legend(title="mean, 95 % interval", frameon=False, fontsize="small", title_fontsize="small")
         panels[1].set_xlabel("seconds of sampling and updates")
         panels[0].xaxis.set_major_formatter(EngFormatter(sep=""))
         finish_axes(panels)

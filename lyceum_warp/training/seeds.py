@@ -1,6 +1,5 @@
 """Train a task with several seeds, each in a process of its own."""
 
-import contextlib
 import ctypes
 import dataclasses
 import os
@@ -8,14 +7,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from lyceum_warp.support.interrupts import postponed
 from lyceum_warp.support.validate import whole_number
-
-_POLL = 0.2  # seconds
 
 
 @dataclasses.dataclass
@@ -31,17 +28,9 @@ class SeedRun:
     """The last line of a failed run's output."""
 
     @property
-    def log(self) -> Path:
-        """The file with the output of the run's process."""
-        return self.folder.with_suffix(".log")
-
-    @property
     def begun(self) -> bool:
         """Whether the run has been saved."""
         return (self.folder / "checkpoint.pt").exists()
-
-
-_Job = tuple[SeedRun, subprocess.Popen[bytes]]
 
 
 def train_seeds(
@@ -81,27 +70,26 @@ def train_seeds(
     words = [str(task), *flag_words(settings)]
     places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
     Path(folder).mkdir(parents=True, exist_ok=True)
-    waiting, active = [*runs], dict[int, _Job]()
+    waiting, active = [*runs], dict[int, tuple[SeedRun, subprocess.Popen[bytes]]]()
     with postponed() as signals:
-        try:
-            while active or (waiting and not signals):
-                if signals:
-                    _end(active.values(), signal.SIGTERM if len(signals) == 1 else signal.SIGKILL)
-                # until a run has begun, it trains alone: what one run refuses, all others would refuse, too
-                elif waiting and len(active) < len(places) and (not active or any(run.begun for run in runs)):
-                    slot = min(set(range(len(places))) - active.keys())
-                    active[slot] = _start(waiting.pop(0), words, *places[slot])
-                time.sleep(_POLL)
-                for slot, (run, process) in list(active.items()):
-                    if process.poll() is not None:
-                        del active[slot]
-                        _conclude(run, process.returncode)
-                if watch is not None:
-                    watch(runs)
-        finally:
-            _end(active.values(), signal.SIGTERM)
-            for _, process in active.values():
-                process.wait()
+        while active or (waiting and not signals):
+            # until a run has begun, it trains alone: what one run refuses, all others would refuse, too
+            alone = active and not any(run.begun for run in runs)
+            if waiting and not signals and not alone and len(active) < len(places):
+                slot = min(set(range(len(places))) - active.keys())
+                active[slot] = waiting[0], _start(waiting.pop(0), words, *places[slot])
+            time.sleep(0.2)
+            for slot, (run, process) in list(active.items()):
+                if process.poll() is not None:
+                    del active[slot]
+                    _conclude(run, process.returncode)
+                elif signals and run.state == "training":
+                    process.terminate()
+                    run.state = "stopped"
+                elif len(signals) > 1:
+                    process.kill()
+            if watch is not None:
+                watch(runs)
     return runs
 
 
@@ -111,60 +99,53 @@ def flag_words(settings: Mapping[str, Any]) -> list[str]:
     for name, value in settings.items():
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, bool):
-            words.append(flag if value else flag.replace("--", "--no-", 1))
-        elif isinstance(value, Mapping):
-            for key, part in value.items():
-                text = ",".join(map(str, part)) if isinstance(part, Sequence) and not isinstance(part, str) else part
-                words += [flag, f"{key}={text}"]
-        elif isinstance(value, tuple | list) and any(isinstance(part, str) for part in value):
-            words += [word for part in value for word in (flag, str(part))]
+            words.append(flag if value else f"--no-{flag[2:]}")
+            continue
+        if isinstance(value, Mapping):
+            value = [f"{key}={','.join(map(str, _parts(part)))}" for key, part in value.items()]
+        parts = _parts(value)
+        if any(isinstance(part, str) for part in parts):  # the flag may be repeated
+            words += [word for part in parts for word in (flag, str(part))]
         else:
-            words += [flag, *map(str, value if isinstance(value, tuple | list) else [value])]
+            words += [flag, *map(str, parts)]
     return words
 
 
-def _places(jobs: int, device: str | None) -> Iterator[tuple[set[int], dict[str, str]]]:
-    """Divide the CPU cores, and distribute the GPUs in turn: the cores, if there are enough, and the environment."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+def _parts(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, tuple | list) else [value]
+
+
+def _places(jobs: int, device: str | None) -> Iterator[tuple[list[int], dict[str, str]]]:
+    """Distribute the CPU cores and the GPUs: the cores of each job, and its environment."""
+    cores = sorted(os.sched_getaffinity(0))
     gpus: Sequence[object] = ()
     if device == "cuda":
         import torch
 
         visible = os.environ.get("CUDA_VISIBLE_DEVICES")
         gpus = visible.split(",") if visible else range(torch.cuda.device_count())
-    if jobs > len(cores):
-        cores = []
     for slot in range(jobs):
-        share = cores[slot * len(cores) // jobs : (slot + 1) * len(cores) // jobs]
-        yield set(share), {"CUDA_VISIBLE_DEVICES": str(gpus[slot % len(gpus)])} if gpus else {}
+        environment = {"CUDA_VISIBLE_DEVICES": str(gpus[slot % len(gpus)])} if gpus else {}
+        yield cores[slot::jobs] or cores, os.environ | environment
 
 
-def _start(run: SeedRun, words: Sequence[str], cores: set[int], environment: Mapping[str, str]) -> _Job:
+def _start(
+    run: SeedRun, words: Sequence[str], cores: Sequence[int], environment: Mapping[str, str]
+) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "lyceum_warp.cli", "train", *words, "--seed", str(run.seed)]
     libc = ctypes.CDLL(None)
 
     def prepare() -> None:
-        if cores:
-            os.sched_setaffinity(0, cores)
-        if hasattr(libc, "prctl"):
-            libc.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: the run is saved if this process is killed
+        os.sched_setaffinity(0, cores)
+        libc.prctl(1, signal.SIGTERM)  # PR_SET_PDEATHSIG: the run is saved if this process is killed
 
     run.state = "training"
-    with run.log.open("ab") as log:
+    with run.folder.with_suffix(".log").open("ab") as log:
         # in a session of its own, because Ctrl-C must reach the run once
-        process = subprocess.Popen(
+        return subprocess.Popen(
             [*command, "--continue", "--out", str(run.folder)], stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-            env={**os.environ, **environment}, start_new_session=True, preexec_fn=prepare,
+            env=environment, start_new_session=True, preexec_fn=prepare,
         )  # fmt: skip
-    return run, process
-
-
-def _end(jobs: Iterable[_Job], number: signal.Signals) -> None:
-    """Send a signal to each run, once."""
-    for run, process in jobs:
-        if run.state == "training" or number == signal.SIGKILL:
-            process.send_signal(number)
-            run.state = "stopped"
 
 
 def _conclude(run: SeedRun, code: int) -> None:
@@ -173,10 +154,9 @@ def _conclude(run: SeedRun, code: int) -> None:
         run.state = "complete"
     elif run.state == "training":
         run.state = "failed"
-        lines = run.log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
+        log = run.folder.with_suffix(".log")
+        lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
         if code == 2 and not run.begun:  # it was refused, and this line says everything
-            run.log.unlink()
-            with contextlib.suppress(OSError):
-                run.folder.parent.rmdir()
+            log.unlink()
             raise ValueError(run.error)

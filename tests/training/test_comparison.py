@@ -64,7 +64,7 @@ def test_curve_has_a_panel_for_each_term_and_none_without_data(runs: Path) -> No
 
 def test_report_is_one_page_without_paths(runs: Path) -> None:
     text = write_report(runs / "a").read_text()
-    assert "srcdoc=" in text and "point_mass, npg, seed 0" in text and "npg.<wbr>gamma" in text
+    assert "srcdoc=" in text and "point_mass, npg, seed 0" in text and "npg.gamma" in text
     assert str(runs) not in text and not re.findall(r'(?:src|href)="(?!#)', text)
 
 
@@ -114,9 +114,9 @@ def test_commands_take_classes_from_a_file(tmp_path: Path, capsys: pytest.Captur
     file.write_text(LEARNER)
     words = ["train", "point_mass", "--algorithm", f"{file}:Idle", "--nworld", "2", "--no-plot", "--continue"]
     for total in ("2", "3"):
-        assert cli.main([*words, "--setting", "noise=0.5", "--out", str(out), "--iterations", total]) == 0
+        assert cli.main([*words, "--out", str(out), "--iterations", total]) == 0
     run = Run.open(out)
-    assert run.config["idle"] == {"noise": 0.5} and [row["mean_return"] for row in run.rows()] == [0.5] * 3
+    assert run.config["idle"] == {"noise": 0.3} and [row["mean_return"] for row in run.rows()] == [0.3] * 3
     assert cli.main([*words, *TINY[:2], "--out", str(tmp_path / "x")]) == 2
     assert cli.main([*words[:3], f"{file}:Mean", "--out", str(tmp_path / "x")]) == 2
     assert "mine.py:Mean is not a subclass of Learner" in capsys.readouterr().err

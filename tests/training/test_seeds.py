@@ -1,4 +1,3 @@
-import json
 import signal
 import subprocess
 import sys
@@ -24,12 +23,10 @@ def test_seeds_side_by_side_equal_single_runs_and_are_summarised(
     for seed in ("0", "3"):
         assert train(tmp_path / seed, "--iterations", "3", "--seed", seed) == 0
         assert metrics(tmp_path / "both" / f"seed-{seed}") == metrics(tmp_path / seed)
-    summary = json.loads((tmp_path / "both" / "summary.json").read_text())
-    assert summary["states"] == {"0": "complete", "3": "complete"}
-    finals = [float(metrics(tmp_path / seed)[-2]["mean_return"]) for seed in ("0", "3")]
-    assert summary["groups"][0]["finals"] == pytest.approx(finals)
     assert (tmp_path / "both" / "curves.png").stat().st_size > 1000
-    assert "lyceum-warp plot" in capsys.readouterr().out
+    mean = np.mean([float(metrics(tmp_path / seed)[-2]["mean_return"]) for seed in ("0", "3")])
+    shown = capsys.readouterr().out
+    assert f"{mean:.5g} [" in shown and "lyceum-warp plot" in shown
 
 
 @pytest.mark.long  # tests/cli/test_train.py covers --continue
@@ -57,14 +54,14 @@ def test_bad_options_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixt
     argv = ["train", *WORDS, "--seeds", "3", "--jobs", "2", "--out", str(tmp_path / "x")]
     assert cli.main([*argv, "--gamma", "7"]) == 2
     refused(capsys, "gamma must be")
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("x/*"))
     assert cli.main([*argv, "--param", "speed=1"]) == 2
     refused(capsys, "no parameter 'speed'")
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("x/*"))
     ppo = ["--algorithm", "ppo", "--nworld", "2", "--num-steps", "4", "--minibatches", "100"]
     assert cli.main(["train", "point_mass", *ppo, *argv[-6:]]) == 2  # only the learner refuses these
     refused(capsys, "100 mini-batches")
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.glob("x/*"))
 
 
 def test_options_become_words_of_the_command_line() -> None:
