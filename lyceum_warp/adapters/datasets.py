@@ -135,11 +135,10 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
     })  # fmt: skip
     folder.mkdir(parents=True)
-    for file in (_DATA, _EPISODES):
-        (folder / file).parent.mkdir(parents=True)
-    pandas.DataFrame(frames).to_parquet(folder / _DATA)
-    table.to_parquet(folder / _EPISODES)
-    pandas.DataFrame({"task_index": [0]}, index=[words]).to_parquet(folder / "meta" / "tasks.parquet")
+    tasks = pandas.DataFrame({"task_index": [0]}, index=[words])
+    for file, content in ((_DATA, pandas.DataFrame(frames)), (_EPISODES, table), ("meta/tasks.parquet", tasks)):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        content.to_parquet(folder / file)
     for file, content in (("info.json", info), ("stats.json", stats)):
         (folder / "meta" / file).write_text(json.dumps(content, indent=2))
     return folder

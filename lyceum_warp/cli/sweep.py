@@ -7,7 +7,7 @@ import json
 import math
 import tomllib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -47,8 +47,8 @@ class Sweep:
 
     file: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE")]
     """The TOML file. Its optional keys: objective ("return", the default; "gate", the seconds of training until a
-    policy passes; or path/to/file.py:function of a lw.Run), direction, storage (a database's URL; by default an SQLite
-    file in out), sampler and pruner (names of Optuna's classes), and heartbeat (60 seconds)."""
+    policy passes; or path/to/file.py:function, whose number of a lw.Run is maximized), storage (a database's URL; by
+    default an SQLite file in out), sampler and pruner (names of Optuna's classes), and heartbeat (60 seconds)."""
 
     def run(self) -> None:
         check_extra("a sweep", "sweep", "optuna")
@@ -69,8 +69,7 @@ class Sweep:
                 raise ValueError("all trials were pruned: none has passed the gate, or all have diverged")
             best = study.best_trial
         except Exception as error:  # Optuna and databases raise many types of errors
-            text = viz.one_line(error).removeprefix("Search.__init__() ")
-            raise ValueError(f"{self.file}: {text}") from error
+            raise ValueError(f"{self.file}: {viz.one_line(error).removeprefix('Search.__init__() ')}") from error
         words = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
         say_entries(
             best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
@@ -88,7 +87,6 @@ class Search:
     ranges: dict
     settings: dict = dataclasses.field(default_factory=dict)
     objective: str = "return"
-    direction: str | None = None
     storage: str | None = None
     sampler: str = "TPESampler"
     pruner: str = "MedianPruner"
@@ -106,7 +104,7 @@ def check_search(search: Search) -> None:
     if search.objective not in ("return", "gate"):
         binding.object_in_file(search.objective)
     trial_settings(search, optuna.create_study().ask())
-    ends = {name: list(_by_word(entry["choices"])) if "choices" in entry else [entry["low"], entry["high"]]
+    ends = {name: _words(entry) if "choices" in entry else [entry["low"], entry["high"]]
             for name, entry in search.ranges.items()}  # fmt: skip
     for k in range(max(map(len, ends.values()), default=1)):
         trial = optuna.trial.FixedTrial({name: values[k % len(values)] for name, values in ends.items()})
@@ -123,8 +121,7 @@ def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
         first, _, part = name.partition(".")
         try:
             if "choices" in entry:
-                words = _by_word(entry["choices"])
-                value = words[trial.suggest_categorical(name, list(words))]
+                value = json.loads(trial.suggest_categorical(name, _words(entry)))
             else:
                 whole = isinstance(entry["low"], int) and isinstance(entry["high"], int)
                 value = (trial.suggest_int if whole else trial.suggest_float)(name, **entry)
@@ -134,15 +131,14 @@ def trial_settings(search: Search, trial: Any) -> dict[str, Any]:
     return settings
 
 
-def _by_word(choices: Sequence[Any]) -> dict[Any, Any]:
-    """Map choices by what Optuna stores instead, which are single values."""
-    return {json.dumps(choice) if isinstance(choice, list) else choice: choice for choice in choices}
+def _words(entry: Mapping[str, Any]) -> list[str]:
+    """Convert choices to JSON, because Optuna stores single values only."""
+    return [json.dumps(choice) for choice in entry["choices"]]
 
 
 def _command(search: Search, settings: Mapping[str, Any], *more: str) -> Train:
     """Make the command that trains a trial."""
-    command: Train = parse(Train, "lyceum-warp train", [search.task, *training.flag_words(settings), *more])
-    return command
+    return parse(Train, "lyceum-warp train", [search.task, *training.flag_words(settings), *more])
 
 
 def _study(search: Search, name: str) -> Any:
@@ -150,7 +146,6 @@ def _study(search: Search, name: str) -> Any:
     import optuna
 
     out = Path(search.out)
-    direction: Any = search.direction or ("minimize" if search.objective == "gate" else "maximize")
     sampler, pruner = getattr(optuna.samplers, search.sampler)(), getattr(optuna.pruners, search.pruner)()
     out.mkdir(parents=True, exist_ok=True)
     storage = optuna.storages.RDBStorage(
@@ -158,8 +153,9 @@ def _study(search: Search, name: str) -> Any:
         heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
     )  # fmt: skip
     return optuna.create_study(
-        storage=storage, sampler=sampler, pruner=pruner, study_name=name, direction=direction, load_if_exists=True
-    )
+        storage=storage, study_name=name, load_if_exists=True, sampler=sampler, pruner=pruner,
+        direction="minimize" if search.objective == "gate" else "maximize",
+    )  # fmt: skip
 
 
 def _say_trial(study: Any, trial: Any) -> None:

@@ -120,16 +120,14 @@ def learning_curve(run: str | Path | Run) -> Path:
     figure = new_figure("a learning curve", 7.5 if columns < 4 else 10.0, 3.0 + 1.8 * (height - 1))
     grid = figure.add_gridspec(height, columns, height_ratios=[1.7, *[1.0] * (height - 1)])
     places = [grid[0, :], *(grid[1 + k // columns, k % columns] for k in range(len(others)))]
-    all_axes: list[Any] = []
     for panel, place in zip((first, *others), places, strict=True):
         axes = figure.add_subplot(place)
         draw_panel(axes, panel)
         axes.set_title(panel.title, loc="left", fontsize="small")
         axes.set_ylabel(panel.unit.replace(", ", "\n"), fontsize="small")
         axes.tick_params(labelsize="small")
-        all_axes.append(axes)
-    all_axes[0].set_title(f"{run.task_name}, seed {run.config['seed']}", loc="left")
-    all_axes[0].set(xlabel="samples", ylabel=f"{first.title}, {first.unit}")
-    all_axes[0].legend(frameon=False, loc="best")
-    finish_axes(all_axes)
+    figure.axes[0].set_title(f"{run.task_name}, seed {run.config['seed']}", loc="left")
+    figure.axes[0].set(xlabel="samples", ylabel=f"{first.title}, {first.unit}")
+    figure.axes[0].legend(frameon=False, loc="best")
+    finish_axes(figure.axes)
     return save_figure(figure, run.folder / "curve.png")
