@@ -16,7 +16,7 @@ from lyceum_warp.binding.registry import (
     errors_of as errors_of,
     file_name as file_name,
     find_task as find_task,
-    made_in_file as made_in_file,
+    made as made,
     object_in_file as object_in_file,
     package_task_names as package_task_names,
     register as register,

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import importlib
 import importlib.util
+import inspect
 import io
 import linecache
 import os
@@ -265,18 +266,17 @@ def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
     return found
 
 
-def made_in_file(spelled: str, base: type[Any], *arguments: Any) -> Any:
-    """Make an object of a subclass of ``base`` from ``path/to/file.py:Class``.
+def made(kind: type[Any], *arguments: Any, **options: Any) -> Any:
+    """Make an object of a user's class.
 
     Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: The file cannot be run, has no such class, or the class takes other arguments.
+        ValueError: The class takes other arguments.
     """
-    kind = class_in_file(spelled, base)
     try:
-        return kind(*arguments)
+        inspect.signature(kind).bind(*arguments, **options)
     except TypeError as error:
-        raise ValueError(f"{spelled} is made by {kind.__name__}{arguments}: {error}") from error
+        raise ValueError(f"{kind.__name__} takes other arguments: {error}") from error
+    return kind(*arguments, **options)
 
 
 def class_sources(kind: type[Any]) -> dict[str, bytes]:

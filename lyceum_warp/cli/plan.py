@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from lyceum_warp import controllers, training, viz
 from lyceum_warp.algos import MPPI, MPPIConfig, PlanUpdate, task_config
-from lyceum_warp.binding import file_name, find_task, made_in_file, spelled_task, task_name
+from lyceum_warp.binding import class_in_file, file_name, find_task, made, spelled_task, task_name
 from lyceum_warp.cli import arguments
 from lyceum_warp.cli.display import console, counted, episode_result, say, say_entries, tried
 from lyceum_warp.core import EnvOptions, Task
@@ -42,7 +42,7 @@ class Settings(arguments.OptionFlags, options=[MPPIConfig], omit=["fill"]):
         """Override a configuration's settings with the given flags."""
         settings = arguments.given(self)
         if ".py:" in settings.get("update", ""):
-            settings["update"] = made_in_file(settings["update"], PlanUpdate)
+            settings["update"] = made(class_in_file(settings["update"], PlanUpdate))
         for name in ("noise", "min_noise"):
             if name in settings and len(settings[name]) == 1:
                 settings[name] = settings[name][0]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import inspect
-import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from torch import nn
 
 from lyceum_warp import algos
 from lyceum_warp.algos import LIMIT, Distill, GaussianPolicy, Learner, Team
-from lyceum_warp.binding import class_in_file, class_sources, made_in_file, spelled_task
+from lyceum_warp.binding import class_in_file, class_sources, made, spelled_task
 from lyceum_warp.core import EnvOptions
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
@@ -32,8 +31,7 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {
 def learner_classes(algorithm: str) -> tuple[Any, Any]:
     """Return the classes of an algorithm and of its hyperparameters.
 
-    A class of the user's, ``path/to/file.py:Class``, has the hyperparameters that its constructor's argument ``config``
-    is annotated with, or None.
+    The hyperparameters of a class of the user's, ``path/to/file.py:Class``, are None.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -43,9 +41,7 @@ def learner_classes(algorithm: str) -> tuple[Any, Any]:
         return ALGORITHMS[algorithm]
     if ".py:" not in algorithm:
         raise ValueError(f"there is no algorithm {algorithm!r}: use {', '.join(ALGORITHMS)} or path/to/file.py:Class")
-    kind = class_in_file(algorithm, Learner)
-    hint = typing.get_type_hints(kind.__init__).get("config")
-    return kind, next(filter(dataclasses.is_dataclass, (hint, *typing.get_args(hint))), None)
+    return class_in_file(algorithm, Learner), None
 
 
 def describe(learner: Learner) -> dict[str, Any]:
@@ -166,12 +162,7 @@ class Configuration:
             arguments = {name: value for name, value in arguments.items() if value is not None} | {"seed": seed}
             if team.size > 1 or "team" in inspect.signature(kind).parameters:
                 arguments["team"] = team
-            try:
-                inspect.signature(kind).bind(env, **arguments)
-            except TypeError as error:
-                raise ValueError(f"{self.algorithm} cannot be made with {', '.join(arguments)}: {error}") from error
-            learner: Learner = kind(env, **arguments)
-            return learner
+            return made(kind, env, **arguments)
         except (ValueError, FileNotFoundError) as error:
             if run is not None:
                 run.note_settings(error)
@@ -184,7 +175,7 @@ class Configuration:
         options = {name: getattr(config, name) for name in ("log_std", "normalize") if hasattr(config, name)}
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
-            return GaussianPolicy(*sizes, network=made_in_file(network, nn.Module, *sizes), **options)
+            return GaussianPolicy(*sizes, network=made(class_in_file(network, nn.Module), *sizes), **options)
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from lyceum_warp.algos import GaussianPolicy
-from lyceum_warp.binding import file_name, made_in_file
+from lyceum_warp.binding import class_in_file, file_name, made
 from lyceum_warp.env import Curriculum
 from lyceum_warp.support.files import replace_text, replaced, unknown_format
 from lyceum_warp.support.suggestions import did_you_mean
@@ -419,7 +419,7 @@ def policy_of(content: Mapping[str, Any], path: Path, policy: Any = None) -> Any
         run = Run.open(folder)
         if "network" in run.config and is_trusted(folder, run.config):
             spelled = str(run.task_folder / NETWORK / run.config["network"])
-            policy = GaussianPolicy.like(shape, made_in_file(spelled, nn.Module, shape["nobs"], shape["nact"]))
+            policy = GaussianPolicy.like(shape, made(class_in_file(spelled, nn.Module), shape["nobs"], shape["nact"]))
     return network_of(content, path, "policy", policy)
 
 
