@@ -1,5 +1,6 @@
 """Train a task with several seeds, each in a process of its own."""
 
+import contextlib
 import ctypes
 import dataclasses
 import os
@@ -159,4 +160,6 @@ def _conclude(run: SeedRun, code: int) -> None:
         run.error = lines[-1].removeprefix("lyceum-warp: ")
         if code == 2 and not run.begun:  # it was refused, and this line says everything
             log.unlink()
+            with contextlib.suppress(OSError):
+                run.folder.parent.rmdir()
             raise ValueError(run.error)
