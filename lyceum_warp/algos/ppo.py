@@ -47,7 +47,7 @@ _RULES: dict[str, Rule] = {
     "num_steps": 1, "epochs": 1, "minibatches": 1, "mean_every": 0, "mean_episodes": 1, "gamma": (0.0, 1.0),
     "lam": (0.0, 1.0), "clip": 0.0, "value_coef": 0.0, "entropy_coef": 0.0, "final_entropy_coef": 0.0,
     "learning_rate": 0.0, "symmetry_coef": 0.0, "desired_kl": 0.0, "max_grad_norm": 0.0, "log_std": (-13.8, 13.8),
-    "recurrent": 0, "state_coef": 0.0, "value_group": GROUP, **PICTURE_RULES,
+    "recurrent": 0, "value_only": 0, "state_coef": 0.0, "value_group": GROUP, **PICTURE_RULES,
 }  # fmt: skip
 
 
@@ -75,6 +75,10 @@ class PPOConfig(PictureConfig):
     change of a predicted value to the range from -clip to clip."""
     clip_value_loss: bool = True
     """Whether the value loss is the larger of the prediction's error and the clipped prediction's error."""
+    value_only: int = 0
+    """Number of first iterations in which only the value function learns, without clip_value_loss. A new value function
+    would otherwise ruin a policy that acts well already, such as a student. train --from sets 20 if the run has no
+    value function."""
     value_coef: float = 1.0
     """Coefficient of the value loss."""
     entropy_coef: float = 0.01
@@ -277,7 +281,7 @@ class PPO(OnPolicyLearner):
         predicting = () if self._predictor is None else self._predictor.parameters()
         acting = [self.std, *(p for p in self.policy.parameters() if p is not log_std), *predicting]
         learned = [[p for p in group if p.requires_grad] for group in (acting, self.value.parameters())]
-        self._parameters = [p for group in learned for p in group]
+        self._acting, self._parameters = learned[0], [p for group in learned for p in group]
         self.rate = torch.tensor(config.learning_rate, device=device)
         self._cuda = device.type == "cuda"
         self.optimizer = Adam(self._parameters, self.rate, numbers=4)
@@ -287,6 +291,7 @@ class PPO(OnPolicyLearner):
         self._branch = Branch(device)
         self._losses = torch.zeros(3, device=device)
         self._entropy_coef = torch.zeros((), device=device)
+        self._value_clip = torch.zeros((), device=device)
         self._old_log_std = log_std.detach().clone()
         self.minibatches = Minibatches(
             self.learn, steps=steps // self._length, nworld=env.nworld, count=config.minibatches, team=team,
@@ -399,8 +404,13 @@ class PPO(OnPolicyLearner):
             advantage /= (variance * (batch / max(batch - 1, 1))).sqrt() + 1e-8
         self._entropy_coef.fill_(config.entropy_weight(self.iteration + 1))
         self._losses.zero_()
+        alone = self.iteration < config.value_only
+        self._value_clip.fill_(math.inf if alone else config.clip)
+        before = [p.detach().clone() for p in self._acting] if alone else []
         for _ in range(config.epochs):
             self.minibatches.epoch()
+        for parameter, old in zip(self._acting, before, strict=alone):  # it moved so that the learning rate adapts
+            parameter.detach().copy_(old)
         team.copy_leader(self._parameters)
         self._apply_std()
 
@@ -418,7 +428,8 @@ class PPO(OnPolicyLearner):
             value = self._value_of(samples)
             error = (value - samples["target"]).square()
             if config.clip_value_loss:
-                clipped = samples["value"] + (value - samples["value"]).clamp(-clip, clip)
+                change = (value - samples["value"]).clamp(-self._value_clip, self._value_clip)
+                clipped = samples["value"] + change
                 error = torch.max(error, (clipped - samples["target"]).square())
             value_loss = (weight * error).sum()
         mean, prediction_loss = self._mean_of(samples, weight)

@@ -407,6 +407,10 @@ class Train:
                     f"{algorithm}: omit --algorithm {algorithm}"
                 )
             if self.resume is None:
+                if algorithm == "ppo" and "value_only" not in arguments.given(self.hyperparameters):
+                    alone = 20 if value is None else 0
+                    settings = dataclasses.replace(configuration.hyperparameters, value_only=alone)
+                    configuration = dataclasses.replace(configuration, hyperparameters=settings)
                 entries["from"] = {"run": str(source.folder.resolve()), "which": self.which, "iteration": iteration}
         learner = configuration.learner(team, run=source, networks=(policy, value), teacher=teacher, task=self.task)
         if parts is not None:

@@ -1,4 +1,5 @@
 import copy
+import math
 import shutil
 from pathlib import Path
 from typing import Any
@@ -51,8 +52,14 @@ def test_student_without_memory_imitates_what_it_sees(shared_env: SharedEnv) -> 
     rows = [next(learner) for _ in range(30)]
     assert rows[-1].loss < 0.02 * rows[0].loss and rows[1].mean_return is not None
     assert rows[-1].samples == 30 * 12 * 16 and rows[-1].length_mean == 30.0
-    ppo = lw.PPO(env, copy.deepcopy(learner.policy), config=lw.PPOConfig(value_hidden=(8,), mean_every=0))
-    assert next(ppo).std_mean == pytest.approx(0.1, abs=0.02)  # PPO goes on from the student
+    config = lw.PPOConfig(value_hidden=(8,), mean_every=0, value_only=1)
+    ppo = lw.PPO(env, copy.deepcopy(learner.policy), config=config)  # PPO goes on from the student
+    bias = ppo.value.network[-1].bias.clone()
+    assert next(ppo).std_mean == pytest.approx(math.exp(-2.3)) and not torch.equal(ppo.value.network[-1].bias, bias)
+    pairs = list(zip(ppo.policy.parameters(), learner.policy.parameters(), strict=True))
+    assert all(torch.equal(p, q) for p, q in pairs)
+    next(ppo)
+    assert not any(torch.equal(p, q) for p, q in pairs)
 
 
 def test_student_imitates_saved_episodes(shared_env: SharedEnv) -> None:
@@ -121,7 +128,14 @@ def test_run_of_a_student_resumes_without_its_teachers_folder(
     out = str(tmp_path / "further")
     words = ["--from", str(tmp_path / "whole"), "--algorithm", "ppo", "--iterations", "1", "--value-hidden", "8"]
     assert cli.main(["train", *words, "--out", out, "--mean-every", "0", *QUIET]) == 0
-    assert lw.load(out).state_size == 4 and lw.load_value(out).state_size == 4
+    further = lw.load(out)
+    assert further.state_size == 4 and lw.load_value(out).state_size == 4
+    # at first, only the value function learns, if it is new
+    student = dict(lw.load(tmp_path / "whole").named_parameters())
+    assert all(torch.equal(part, student[name]) for name, part in further.named_parameters())
+    words = ["--from", out, "--iterations", "1", "--out", str(tmp_path / "third"), "--mean-every", "0"]
+    assert cli.main(["train", *words, *QUIET]) == 0
+    assert not torch.equal(lw.load(tmp_path / "third").log_std, further.log_std)
     capsys.readouterr()
     assert cli.main(["train", "--resume", out, "--teacher", "hopper"]) == 2
     refused(capsys, "--teacher has no effect with --resume")
