@@ -26,7 +26,8 @@ NARROW = 1100
 """Below this width in pixels, the initial windows would cover the robot, for example in a notebook."""
 SIDE = 330
 """Width of the windows on both sides, in pixels. They have one width, so that the scene's free part is centred."""
-HINT = "drag: turn   right drag: move   wheel: zoom   double-click, then Ctrl + right drag: push   F1: keys"
+HINTS = ("drag: turn", "right drag: move", "wheel: zoom", "double-click, then Ctrl + right drag: push", "F1: keys")
+HINT = "   ".join(text.replace(" ", "\u00a0") for text in HINTS)  # lines break between these
 _LEGEND_PLACE = int(implot.Location.North)
 _OVERLAY = (
     int(imgui.WindowFlags.NoDecoration) | int(imgui.WindowFlags.NoInputs) | int(imgui.WindowFlags.AlwaysAutoResize)
@@ -228,13 +229,15 @@ class Windows:
         assert self._frame is not None
         status = self._frame.status
         of = f" of {status.steps:,}" if status.steps else ""
-        rows = [("step", f"{status.step:,}{of}"), ("time", f"{status.time:.3f} s")]
-        if np.isfinite(status.measured_speed):
-            rows.append(("speed", f"{status.measured_speed:.2f} of {speed_name(status.speed)}"))
+        measured, rate = status.measured_speed, self.page_rate
+        rows = [  # always the same rows, so that the buttons below do not move
+            ("step", f"{status.step:,}{of}"),
+            ("time", f"{status.time:.3f} s"),
+            ("speed", f"{measured:.2f} of {speed_name(status.speed)}" if np.isfinite(measured) else "paused"),
+            ("pictures", f"{rate:.1f} per s" if np.isfinite(rate) else ""),
+        ]
         if np.isfinite(status.plan_ms):
             rows.append(("control", f"{status.plan_ms:.1f} ms"))
-        if np.isfinite(self.page_rate):
-            rows.append(("pictures", f"{self.page_rate:.1f} per s"))
         two_columns("##status", [*rows, *self._last_values[:FEW_CURVES], *status.text])
 
     def _drive(self) -> None:
@@ -277,14 +280,14 @@ class Windows:
         if flags and imgui.Button("copy changed numbers as flags"):
             self._actions.tell(f"copy={' '.join(flags)}")
 
-    def _number(self, owner: Owner, name: str, number: float) -> None:
+    def _number(self, owner: Owner, name: str, number: float, label: str = "") -> None:
         """Build a slider from 0 to four times the first value. Ctrl+click lets the user type any value."""
         far = 4 * self._first.setdefault((owner, name), number) or 1.0
         value = self._edited.get((owner, name), number)
         if isinstance(number, int):
-            changed, value = imgui.SliderInt(name, int(value), 1, int(far))
+            changed, value = imgui.SliderInt(label or name, int(value), 1, int(far))
         else:
-            changed, value = imgui.SliderFloat(name, value, min(far, 0.0), max(far, 0.0), "%.4g")
+            changed, value = imgui.SliderFloat(label or name, value, min(far, 0.0), max(far, 0.0), "%.4g")
         if changed:
             self._edited[owner, name] = value
         if imgui.IsItemDeactivatedAfterEdit():
@@ -375,9 +378,7 @@ class Windows:
                 continue
             self._curve(name, i)
             if name in params:  # the weight of a term has the term's name
-                imgui.PushID("weight")
-                self._number("task", name, params[name])
-                imgui.PopID()
+                self._number("task", name, params[name], f"weight##{name}")
 
     def _curve(self, name: str, column: int) -> None:
         low, mean, high = self._plot
@@ -468,7 +469,7 @@ def highlighted_button(label: str, on: bool) -> bool:
 def wrapped(text: str, room: float) -> str:
     """Wrap a text to a width in pixels. ImGui would break lines within words."""
     columns = int(len(text) * room / max(imgui.CalcTextSize(text).x, 1.0))
-    return textwrap.fill(text, max(columns, 20))
+    return textwrap.fill(text, max(columns, 20), break_on_hyphens=False)
 
 
 def two_columns(label: str, rows: Sequence[tuple[str, str]]) -> None:
