@@ -57,6 +57,9 @@ autodoc_typehints_description_target = "documented"
 
 MANY_MEMBERS = 8
 
+SENTENCE = " ".join(Path(__file__).with_name("index.md").read_text().split("\n\n")[1].split())
+"""What the project is: the first paragraph of the first page."""
+
 CONTENTS = {
     "Guide": "notebooks/first_task own_task warp_for_python task_form terms scope",
     "Tasks": "gallery tasks/gymnasium tasks/dm_control tasks/adroit tasks/hands tasks/control tasks/arms tasks/balance "
@@ -137,18 +140,21 @@ def load_late(app: Any, doctree: nodes.document) -> None:
 
 
 def describe(app: Any, pagename: str, templatename: str, context: dict[str, Any], doctree: Any) -> None:
-    """Describe a page to search engines by its first paragraph."""
+    """Describe a page to search engines by its first paragraph, and pages without one by the project's sentence."""
     paragraph = next(doctree.findall(nodes.paragraph), None) if doctree else None
-    if paragraph:
-        text = html.escape(textwrap.shorten(paragraph.astext(), 160, placeholder=" …"))
-        context["metatags"] = f'{context.get("metatags", "")}<meta name="description" content="{text}">'
+    text = html.escape(textwrap.shorten(paragraph.astext() if paragraph else SENTENCE, 160, placeholder=" …"))
+    context["metatags"] = f'{context.get("metatags", "")}<meta name="description" content="{text}">'
 
 
 def write_files(app: Any, error: Exception | None) -> None:
     """Write turnable robots and still pictures, and redirect from the site's address to its first page."""
     if error or app.builder.format != "html":
         return
-    Path(app.outdir, "index.html").write_text('<meta http-equiv="refresh" content="0; url=docs/index.html">\n')
+    Path(app.outdir, "index.html").write_text(
+        '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url=docs/index.html">\n'
+        f'<title>{project}</title><link rel="icon" href="_static/favicon.svg">\n'
+        f'<meta name="description" content="{html.escape(SENTENCE)}">\n'
+    )
     pages, stills = (Path(app.outdir, "docs", name) for name in ("turnable", "stills"))
     for folder in (pages, stills):
         folder.mkdir(exist_ok=True)

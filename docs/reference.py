@@ -42,6 +42,25 @@ TYPES = {"float32": "float", "int32": "int", "vec2f": "wp.vec2", "vec3f": "wp.ve
 OBSERVATIONS = json.loads((DOCS / "observations.json").read_text())
 """For each task and group of observations, the joint and the unit of indices; see observations.py."""
 
+UNITS = {
+    "m": "anchor_position ball ball_to_target body_position cube_from_grip cylinder dist_to_target error errors "
+    "extremities fingers fingertip foot_height goal hammer hand handle handles_from_grips head_height "
+    "height_scan nail palm palm_error palm_to_ball palm_to_target palms position_error target_position "
+    "tips to_grip to_target widths",
+    "m/s": "ball_velocity com_velocity linear_velocity torso_velocity",
+    "rad": "euler reference_joint_position",
+    "rad/s": "object_angular_velocity reference_joint_velocity",
+    "m/s, m/s, rad/s": "command body_velocities",
+    "rad/s, m/s": "body_velocity",
+    "m/s², rad/s": "imu",
+    "N": "constraint_force",
+    "N m": "actuator_force",
+    "s": "foot_air_time",
+    "kg m², kg m, kg": "inertia",
+}
+"""The units of parts that are not single joints' positions and velocities. Other parts have no unit."""
+UNIT_OF = {part: unit for unit, parts in UNITS.items() for part in parts.split()}
+
 METHODS = (types.FunctionType, property, classmethod, staticmethod)
 
 SECTIONS = Config(napoleon_custom_sections=["Functions"], napoleon_use_rtype=False)
@@ -199,19 +218,23 @@ def commands(name: str, cls: type[lw.Task], *, shown: bool) -> list[str]:
 
 
 def observations(group: str, layout: dict[str, int], sources: dict[str, list[str]]) -> list[str]:
-    """Return a table of a group's observations. A part has one row, or a row per number if joints are known."""
+    """Return a table of a group's observations. A part has a row per number if many joints have their own."""
     title = "observation" if group == "policy" else f"`{group}` observation"
     rows: list[tuple[str, ...]] = []
     end = 0
     for part, size in layout.items():
         end, start = end + size, end
-        if any(str(i) in sources for i in range(start, end)):
-            rows += [(f"{i}", f"`{part}`", *sources.get(str(i), ("", ""))) for i in range(start, end)]
+        joints = [sources.get(str(i), ("", "")) for i in range(start, end)]
+        if 3 * len({joint for joint, _ in joints if joint}) >= size:  # a height scan depends on the base only
+            rows += [
+                (f"{start + i}", f"`{part}`", joint, unit or UNIT_OF.get(part, ""))
+                for i, (joint, unit) in enumerate(joints)
+            ]
         else:
-            rows.append((f"{start} to {end - 1}" if size > 1 else f"{start}", f"`{part}`", "", ""))
+            place = f"{start} to {end - 1}" if size > 1 else f"{start}"
+            rows.append((place, f"`{part}`", "", UNIT_OF.get(part, "")))
     head = f"{title}, {count(end, 'number')}"
-    lines = table(("index", head, "joint", "unit"), rows) if sources else table(
-        ("index", head), [row[:2] for row in rows])  # fmt: skip
+    lines = table(("index", head, "joint", "unit"), rows)
     return lines if len(rows) <= 12 else folded(head, lines)
 
 
