@@ -6,10 +6,8 @@ import io
 import logging
 import os
 import sys
+import textwrap
 from collections.abc import Sequence
-from typing import Any
-
-import tyro
 
 from lyceum_warp.cli.parsing import parse
 from lyceum_warp.support.interrupts import Interrupted, signals
@@ -39,9 +37,12 @@ _COMMANDS = {
 Only the module of the given command is imported, because most modules import torch, Warp and MuJoCo.
 """
 
-_DESCRIPTION = """Batched MuJoCo worlds for robot learning.
+_HELP = """usage: lyceum-warp COMMAND [OPTIONS] ...
 
-lyceum-warp COMMAND --help describes a command and its usual options, with examples. --help-all describes all options.
+Batched MuJoCo worlds for robot learning.
+
+lyceum-warp COMMAND --help describes a command and its usual options, with
+examples. --help-all describes all options. The commands:
 """
 
 
@@ -89,8 +90,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: list[str]) -> int:
     if argv[:1] in ([], ["-h"], ["--help"]):
-        commands: Any = {name: type(name, (), {"__doc__": line}) for name, (_, line) in _COMMANDS.items()}
-        tyro.extras.subcommand_cli_from_dict(commands, prog="lyceum-warp", description=_DESCRIPTION, args=["--help"])
+        print(_HELP)
+        for name, (_, line) in _COMMANDS.items():
+            print(textwrap.fill(f"  {name:8} {line}", 80, subsequent_indent=" " * 11))
+        return 0
     name, *arguments = argv
     if name not in _COMMANDS:
         hint = did_you_mean(name, _COMMANDS, f"there are {', '.join(_COMMANDS)}")

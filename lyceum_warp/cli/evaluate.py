@@ -26,11 +26,11 @@ class Eval:
     If the task's file or model has moved or changed since the run started, the command uses the run's own copy.
 
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --video
-    $ lyceum-warp eval runs/hopper-20260101-120000 --video --camera track=torso --camera azimuth=45
+    $ lyceum-warp eval runs/hopper --video --camera track=torso --camera azimuth=45
     $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 100 --transfer
     $ lyceum-warp eval runs/humanoid-20260101-120000 --physics exact
     $ lyceum-warp eval go1_velocity --pretrained
-    $ lyceum-warp eval runs/hopper-20260101-120000 --episodes 8 --episodes-to runs/hopper-episodes
+    $ lyceum-warp eval runs/hopper --episodes 8 --episodes-to runs/hopper-episodes
     $ lyceum-warp eval runs/g1_tracking-20260101-120000 --clips --video
     """
 

@@ -21,7 +21,7 @@ class Export:
     pip install 'lyceum-warp[export]'. torch loads a .pt2 file: torch.export.load(file).module()(obs).
 
     $ lyceum-warp export runs/hopper-20260101-120000
-    $ lyceum-warp export runs/hopper-20260101-120000 --which best --to robot/policy.onnx
+    $ lyceum-warp export runs/hopper --which best --to robot/policy.onnx
     """
 
     folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]

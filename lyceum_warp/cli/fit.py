@@ -22,9 +22,9 @@ class Fit:
     and lw.make(..., fitted=FOLDER), use the values. docs/fitting.md describes logs and parameters.
 
     $ lyceum-warp fit go1_velocity log.npz
-    $ lyceum-warp fit arm.xml log.csv --shared "dof_damping.*" --each "kp.*" --shared "delay.ctrl.*"
+    $ lyceum-warp fit arm.xml log.csv --shared "dof_damping.*" --each "kp.*"
     $ lyceum-warp fit go1_velocity hanging.npz --hangs --each "dof_frictionloss.*"
-    $ lyceum-warp train go1_velocity --fitted fits/go1_velocity-20260101-120000 --fitted-draws
+    $ lyceum-warp train go1_velocity --fitted fits/go1_velocity --fitted-draws
     """
 
     model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK|MODEL")]

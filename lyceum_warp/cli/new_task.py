@@ -39,8 +39,8 @@ class New:
     $ lyceum-warp new walk --model robots/dog.xml
     $ lyceum-warp new tasks/hop.py --model gymnasium:hopper.xml
     $ lyceum-warp new go1_walk --model menagerie:unitree_go1/scene.xml
-    $ lyceum-warp new g1_walk --model menagerie:unitree_g1/scene_mjx.xml --template velocity
-    $ lyceum-warp new spot_tracking --model menagerie:boston_dynamics_spot/scene.xml --template tracking
+    $ lyceum-warp new g1_walk --model menagerie:unitree_g1/scene_mjx.xml
+    $ lyceum-warp new my_tracking --model robot.xml --template tracking
     """
 
     task: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="TASK")]

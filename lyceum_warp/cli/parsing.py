@@ -119,7 +119,9 @@ def _described(command: Any) -> Any:
     body: dict[str, Any] = {"__doc__": command.__doc__, "__annotations__": {}}
     for field in dataclasses.fields(command):
         if field.name in docs:
-            hint = "" if field.default in (None, ()) else None
+            several = field.default is dataclasses.MISSING and "tuple[" in str(hints[field.name])
+            empty = several or field.default in (None, (), "")
+            hint = "" if empty else None
             text = tyro.conf.arg(help=" ".join(docs[field.name].split()), help_behavior_hint=hint)
             body["__annotations__"][field.name] = Annotated[hints[field.name], text]
             if field.default is not dataclasses.MISSING:

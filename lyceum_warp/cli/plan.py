@@ -69,9 +69,9 @@ class Plan:
     $ lyceum-warp plan reach --real-time --episodes 10
     $ lyceum-warp plan half_cheetah --steps 200 --samples 128 --temperature 1
     $ lyceum-warp plan reach --update predictive_sampling --knots 4 --replan-every 2
-    $ lyceum-warp plan hopper --steps 300 --horizon 16 --value runs/hopper-20260101-120000 --discount 0.995
+    $ lyceum-warp plan hopper --horizon 16 --value runs/hopper --discount 0.995
     $ lyceum-warp plan humanoid --physics exact --steps 100
-    $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024 --solver noslip_iterations=0
+    $ lyceum-warp plan adroit_pen --device cuda:0 --samples 1024
     """
 
     USUAL = ("episodes", "steps", "seed", "real_time", "out", "param", "device", "horizon", "samples", "physics")

@@ -80,17 +80,17 @@ class Train:
     it immediately.
 
     $ lyceum-warp train hopper --iterations 100 --seed 1
-    $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --param reset_noise_scale=0 --hidden 32 32
+    $ lyceum-warp train half_cheetah --param ctrl_cost_weight=0.05 --hidden 32 32
     $ lyceum-warp train path/to/my_task.py --samples 4000 --out runs/mine
-    $ lyceum-warp train humanoid --device cuda --integrator euler --solver iterations=4
+    $ lyceum-warp train humanoid --device cuda --solver iterations=4
     $ lyceum-warp train --resume runs/mine --iterations 200
     $ lyceum-warp train hopper --out runs/mine --continue
     $ lyceum-warp train hopper --seeds 5 --jobs 2 --out runs/five
     $ lyceum-warp train my_changed_task.py --from runs/mine --which best
     $ lyceum-warp train hopper --algorithm ppo --iterations 300 --learning-rate 3e-4
     $ lyceum-warp train half_cheetah --algorithm sac --iterations 1000
-    $ lyceum-warp train go1_student_velocity --teacher go1_velocity --recurrent 256 --device cuda
-    $ lyceum-warp train hopper --algorithm distill --demonstrations runs/hopper-episodes
+    $ lyceum-warp train go1_student_velocity --teacher RUN --recurrent 256
+    $ lyceum-warp train hopper --algorithm distill --demonstrations runs/seen
     $ lyceum-warp train g1_tracking --clips dances/ walk.csv --device cuda
     $ torchrun --nproc-per-node 2 -m lyceum_warp.cli train hopper --device cuda
 

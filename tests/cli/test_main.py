@@ -41,12 +41,13 @@ def help_of(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 def test_help_lists_commands_with_examples(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    out = help_of([], capsys)
-    assert all(f"• {name} " in out for name in COMMANDS)
+    assert cli.main([]) == 0
+    out = capsys.readouterr().out
+    assert all(f"\n  {name} " in out for name in COMMANDS) and all(len(line) <= 80 for line in out.splitlines())
     for name in COMMANDS:
         shown = help_of([name, "--help"], capsys)
-        assert f"$ lyceum-warp {name}" in shown and "None)" not in shown
-        assert all(len(line) <= 80 or line.startswith(("$", "    ")) for line in shown.splitlines())
+        assert f"$ lyceum-warp {name}" in shown and "None)" not in shown and "(default: )" not in shown
+        assert all(len(line) <= 80 or line.startswith("usage:") for line in shown.splitlines())
 
 
 def test_help_all_describes_more_options_than_help(
