@@ -48,8 +48,8 @@ def _lines(cls: type) -> list[str]:
     """Return the source of a class's module, which need not be loaded."""
     if cls.__module__ in sys.modules:
         return inspect.findsource(inspect.getmodule(cls) or cls)[0]
-    found = importlib.util.find_spec(cls.__module__)
-    return Path(str(found and found.origin)).read_text("utf-8").splitlines(keepends=True)
+    spec = importlib.util.find_spec(cls.__module__)
+    return Path(str(spec and spec.origin)).read_text("utf-8").splitlines(keepends=True)
 
 
 def listed(docs: Mapping[str, str]) -> str:

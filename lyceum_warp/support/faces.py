@@ -48,12 +48,12 @@ def _document(modules: Iterable[str]) -> None:
 
 def sources(package: str) -> dict[str, tuple[str, str | None]]:
     """Return the module of each public name, and the name's attribute there, or None if the name is the module."""
-    found: dict[str, tuple[str, str | None]] = {}
+    modules: dict[str, tuple[str, str | None]] = {}
     file = Path(str(importlib.import_module(package).__file__)).with_suffix(".pyi")
     for node in ast.parse(file.read_text("utf-8")).body:
         if isinstance(node, ast.ImportFrom) and node.level:
             folder = ".".join(filter(None, (package, node.module)))
-            found |= {alias.name: (f"{folder}.{alias.name}", None) for alias in node.names}
+            modules |= {alias.name: (f"{folder}.{alias.name}", None) for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {alias.name: (node.module, alias.name) for alias in node.names}
-    return found
+            modules |= {alias.name: (node.module, alias.name) for alias in node.names}
+    return modules

@@ -47,9 +47,9 @@ def replace_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="")
 
 
-def unknown_format(path: Path, number: Any, known: int) -> ValueError:
+def unknown_format(path: Path, number: Any, newest: int) -> ValueError:
     """Return the error for a file of an unknown format."""
     return ValueError(
-        f"{path} has format {number!r}, and this lyceum_warp reads formats up to {known}: "
+        f"{path} has format {number!r}, and this lyceum_warp reads formats up to {newest}: "
         "pip install --upgrade lyceum-warp"
     )

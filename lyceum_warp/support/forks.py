@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 _watched: "weakref.WeakKeyDictionary[Any, tuple[str, ...]]" = weakref.WeakKeyDictionary()
-_kept: list[object] = []
+_references: list[object] = []
 
 
 class LeftInParent:
@@ -37,7 +37,7 @@ def _call_in(process: int, function: Callable[[], object]) -> None:
 def _after_fork() -> None:
     for thing, attributes in _watched.items():
         for name in attributes:
-            _kept.append(getattr(thing, name))  # its destructor would wait forever
+            _references.append(getattr(thing, name))  # its destructor would wait forever
             setattr(thing, name, LeftInParent())
 
 

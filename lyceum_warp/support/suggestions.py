@@ -25,19 +25,19 @@ _OTHER_WORDS = {
 """Names in other libraries and earlier releases, each with the name in this release."""
 
 
-def closest(name: str, known: Iterable[str], most: int = 3, cutoff: float = 0.6) -> list[str]:
+def closest(name: str, choices: Iterable[str], most: int = 3, cutoff: float = 0.6) -> list[str]:
     """Return the known name for another library's name, or else the most similar known names.
 
     ``cutoff`` is the least similarity, from 0 to 1.
     """
-    known = list(known)
+    choices = list(choices)
     other = _OTHER_WORDS.get(name, "")
-    return [other] if other in known else difflib.get_close_matches(name, known, most, cutoff)
+    return [other] if other in choices else difflib.get_close_matches(name, choices, most, cutoff)
 
 
-def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:
+def did_you_mean(name: str, choices: Iterable[str], otherwise: str = "") -> str:
     """Return "did you mean ...?" with up to three names from ``closest``; if there is none, return ``otherwise``."""
-    close = closest(name, known)
+    close = closest(name, choices)
     return f"did you mean {' or '.join(close)}?" if close else otherwise
 
 
@@ -46,11 +46,11 @@ def suggest_arguments(cls: Class) -> Class:
     init, fields = cls.__init__, cls.__dataclass_fields__  # type: ignore[misc, attr-defined]
 
     @functools.wraps(init)
-    def checked(self: Any, *args: Any, **words: Any) -> None:
-        if unknown := [word for word in words if word not in fields]:
+    def checked(self: Any, *args: Any, **arguments: Any) -> None:
+        if unknown := [argument for argument in arguments if argument not in fields]:
             hint = did_you_mean(unknown[0], fields, f"it has {', '.join(fields)}")
             raise TypeError(f"{cls.__name__} has no field {unknown[0]!r}: {hint}")
-        init(self, *args, **words)
+        init(self, *args, **arguments)
 
     cls.__init__ = checked  # type: ignore[misc]
     return cls

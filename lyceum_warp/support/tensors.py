@@ -37,10 +37,10 @@ def repeatable(act: Callable[..., Any], obs: Any, *state: torch.Tensor) -> tuple
         first = outputs(obs)[0]
         first = first.clone() if isinstance(first, torch.Tensor) else None  # a policy may return a buffer
         outputs(others if isinstance(obs, tuple) else others[0])
-    found = outputs(obs)
-    if first is not None and not torch.equal(first.nan_to_num(), found[0].nan_to_num()):
+    results = outputs(obs)
+    if first is not None and not torch.equal(first.nan_to_num(), results[0].nan_to_num()):
         raise ValueError(
             "the policy gives different actions for the same observations: it must have no random generator of its "
             "own, and no memory, unless it has state_size and act(obs, state) returns the actions and the next state"
         )
-    return found
+    return results

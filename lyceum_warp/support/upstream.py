@@ -61,7 +61,7 @@ def extend_structs() -> None:
                 inherited |= vars(base).get("__annotations__", {})
             cls.__annotations__ = inherited | vars(cls).get("__annotations__", {})
 
-    def bases(struct: Any, given: tuple[Any, ...]) -> tuple[type, ...]:
+    def bases(struct: Any, original_bases: tuple[Any, ...]) -> tuple[type, ...]:
         struct.cls.__init_subclass__ = classmethod(merge)
         return (struct.cls,)
 
@@ -181,8 +181,8 @@ def replaced_in_this_thread(functions: Mapping[str, Callable[..., Any]]) -> Iter
             owner: Any = wp if hasattr(wp, name) else wp.utils
             original = getattr(owner, name)
 
-            def call(*args: Any, _own: Any = instead, _original: Any = original, **options: Any) -> Any:
-                return (_own if threading.get_ident() == thread else _original)(*args, **options)
+            def call(*args: Any, _replacement: Any = instead, _original: Any = original, **options: Any) -> Any:
+                return (_replacement if threading.get_ident() == thread else _original)(*args, **options)
 
             setattr(owner, name, call)
             restored.callback(setattr, owner, name, original)

@@ -47,17 +47,17 @@ def check_flag(name: str, value: Any) -> None:
         raise ValueError(f"{name} must be True or False, not {value!r}")
 
 
-def check_word(name: str, value: Any, words: Sequence[str], others: str = "") -> None:
+def check_word(name: str, value: Any, choices: Sequence[str], others: str = "") -> None:
     """Check that a value is one of the given words."""
-    if not isinstance(value, str) or value not in words:
-        *first, last = map(repr, words)
+    if not isinstance(value, str) or value not in choices:
+        *first, last = map(repr, choices)
         raise ValueError(f"{name} must be {', '.join(first)} or {last}{others}, not {value!r}")
 
 
 def check_group(group: Any, groups: Iterable[str], task: str) -> None:
     """Check that a task has a group of observations."""
-    if group not in (known := list(groups)):
-        raise ValueError(f"the task {task!r} has no group {group!r} of observations: it has {', '.join(known)}")
+    if group not in (choices := list(groups)):
+        raise ValueError(f"the task {task!r} has no group {group!r} of observations: it has {', '.join(choices)}")
 
 
 def layer_sizes(hidden: Any, name: str = "hidden") -> list[int]:
@@ -128,8 +128,8 @@ def _checked(name: str, value: Any, kinds: tuple[Any, ...], rule: Rule | None) -
         check_flag(name, value)
     if isinstance(rule, str):
         check_kind(name, value, str, rule)
-    words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
-    words += rule if isinstance(rule, list) else []
-    if words and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type) and kind is not str)):
-        check_word(name, value, words)
+    choices = [choice for kind in kinds if typing.get_origin(kind) is Literal for choice in typing.get_args(kind)]
+    choices += rule if isinstance(rule, list) else []
+    if choices and not isinstance(value, tuple(kind for kind in kinds if isinstance(kind, type) and kind is not str)):
+        check_word(name, value, choices)
     return value

@@ -17,26 +17,26 @@ _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "nump
 
 def versions(device: str = "cpu") -> dict[str, Any]:
     """Return the versions of packages and Python, a description of the machine, and the commit of a git checkout."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for package in _PACKAGES:
         try:
-            found[package.replace("-", "_")] = importlib.metadata.version(package)
+            entries[package.replace("-", "_")] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
-            found[package.replace("-", "_")] = None
-    found["torch"] = torch.__version__  # the version includes the build, such as +cpu
-    found["python"] = platform.python_version()
-    found["platform"] = platform.platform()
-    found["cpu"] = platform.processor() or platform.machine()
+            entries[package.replace("-", "_")] = None
+    entries["torch"] = torch.__version__  # the version includes the build, such as +cpu
+    entries["python"] = platform.python_version()
+    entries["platform"] = platform.platform()
+    entries["cpu"] = platform.processor() or platform.machine()
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        found["cpu"] = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    found["cores"] = os.cpu_count()
+        entries["cpu"] = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    entries["cores"] = os.cpu_count()
     if device.startswith("cuda") and torch.cuda.is_available():
-        found["gpu"] = torch.cuda.get_device_name(device)
-        found["cuda"] = torch.version.cuda
+        entries["gpu"] = torch.cuda.get_device_name(device)
+        entries["cuda"] = torch.version.cuda
     if commit := _commit():
-        found["commit"] = commit
-    return found
+        entries["commit"] = commit
+    return entries
 
 
 @functools.cache
