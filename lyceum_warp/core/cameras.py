@@ -80,16 +80,16 @@ class Camera:
         body.add_camera(name=self.name, pos=self.pos, quat=quat, fovy=self.fovy)
 
 
-def cameras_of(given: Any) -> tuple[Camera, ...]:
+def cameras_of(entries: Any) -> tuple[Camera, ...]:
     """Convert cameras, their names, or dicts of their arguments to cameras with different groups.
 
     Raises:
         ValueError: An entry is none of these, or two cameras have the same group.
     """
-    if not isinstance(given, Iterable) or isinstance(given, str):
-        raise ValueError(f"cameras must be a list, as in cameras=[lw.Camera('fixed')], not {given!r}")
+    if not isinstance(entries, Iterable) or isinstance(entries, str):
+        raise ValueError(f"cameras must be a list, as in cameras=[lw.Camera('fixed')], not {entries!r}")
     cameras: dict[str, Camera] = {}
-    for entry in given:
+    for entry in entries:
         camera = Camera(entry) if isinstance(entry, str) else Camera(**entry) if isinstance(entry, dict) else entry
         check_kind("a camera", camera, Camera, "as lw.Camera('fixed', width=64)")
         if camera.group in cameras:

@@ -266,8 +266,8 @@ def rows(model: mujoco.MjModel, name: str) -> int:
 def element_names(model: mujoco.MjModel, name: str) -> list[str]:
     """List the named elements of a field of MjData or MjModel, such as the joints of ``qvel``."""
     kind = _rows(name)[0]
-    known = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)] if kind is not None else []
-    elements_of = [element for element in known if element]
+    names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)] if kind is not None else []
+    elements_of = [element for element in names if element]
     if _rows(name) == _ACTIVATIONS:
         return [element for element in elements_of if model.actuator(element).actadr[0] >= 0]
     return elements_of
@@ -281,6 +281,6 @@ def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
         names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)]
-        known = ", ".join(sorted(n for n in names if n)) or "none with names"
-        raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {known}")
+        listing = ", ".join(sorted(n for n in names if n)) or "none with names"
+        raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {listing}")
     return index

@@ -95,5 +95,5 @@ class Verdict:
         """Convert the result to values that JSON supports."""
         limits = {name: {"low": limit.low, "high": limit.high} for name, limit in self.limits.items()}
         finite = {name: {end: x for end, x in ends.items() if math.isfinite(x)} for name, ends in limits.items()}
-        own = {"task": self.task, "seed": self.seed, "memory": self.memory, "passed": self.passed}
-        return {**own, "numbers": dict(self.numbers), "limits": finite}
+        entries = {"task": self.task, "seed": self.seed, "memory": self.memory, "passed": self.passed}
+        return {**entries, "numbers": dict(self.numbers), "limits": finite}

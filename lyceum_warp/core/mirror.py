@@ -50,12 +50,12 @@ class Mirror:
         order, signs = list[int](), list[float]()
         for name, part in parts.items():
             size = part.stop - part.start
-            found = self.parts.get(name)
-            if found is None or len(found[1]) != size:
-                has = "no reflection" if found is None else f"a reflection of {len(found[1])} columns"
+            reflection = self.parts.get(name)
+            if reflection is None or len(reflection[1]) != size:
+                has = "no reflection" if reflection is None else f"a reflection of {len(reflection[1])} columns"
                 raise ValueError(f"the mirror of the task {task!r} has {has} for {name!r}, which has {size} columns")
-            order += [part.start + int(place) for place in found[0]]
-            signs += map(float, found[1])
+            order += [part.start + int(place) for place in reflection[0]]
+            signs += map(float, reflection[1])
         return order, signs
 
 

@@ -181,11 +181,11 @@ def put_rows(model: mujoco.MjModel, values: Mapping[str, Any], columns: Mapping[
         target = columns[name]
         try:
             numbers = value if isinstance(value, torch.Tensor) else np.asarray(value)
-            given = torch.as_tensor(numbers, dtype=torch.float64, device=target.device)
-            target.copy_(given.reshape(-1, target.shape[1]))
+            rows = torch.as_tensor(numbers, dtype=torch.float64, device=target.device)
+            target.copy_(rows.reshape(-1, target.shape[1]))
         except (TypeError, ValueError, RuntimeError):
-            own = field.value(model).shape or (1,)
-            shapes = f"{(len(target), *own)}, or {own} for all worlds"
+            shape = field.value(model).shape or (1,)
+            shapes = f"{(len(target), *shape)}, or {shape} for all worlds"
             raise ValueError(f"{name} must be numbers of shape {shapes}, not {described(value)}") from None
 
 

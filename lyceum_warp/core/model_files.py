@@ -79,8 +79,8 @@ ModelSource: TypeAlias = str | Path | mujoco.MjSpec | ModelFile
 
 def _package_folder(package: str) -> Path | None:
     """Find an installed package's folder without importing the package."""
-    found = importlib.util.find_spec(package)
-    return Path(found.submodule_search_locations[0]) if found and found.submodule_search_locations else None
+    locations = getattr(importlib.util.find_spec(package), "submodule_search_locations", None)
+    return Path(locations[0]) if locations else None
 
 
 def _in_package(file: str, package: str, within: str, install: str, before_python: str | None = None) -> ModelFile:
@@ -242,8 +242,8 @@ def load_spec(source: ModelSource, owner: type | None = None) -> mujoco.MjSpec:
         return spec
     if isinstance(source, ModelFile):
         return source.spec()
-    found = find_model(source, owner)
-    return found.spec() if isinstance(found, ModelFile) else read_spec(found)
+    model = find_model(source, owner)
+    return model.spec() if isinstance(model, ModelFile) else read_spec(model)
 
 
 def declaring_folder(owner: type, attribute: str) -> Path:

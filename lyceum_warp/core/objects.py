@@ -76,10 +76,10 @@ def mesh(file: str | Path | ModelFile, *, scale: float = 1.0, **attributes: Any)
     return ObjectGeom("mesh", {name: value for name, value in attributes.items() if name not in _MESH}, file, asset)
 
 
-def _check_names(what: str, names: Iterable[str], known: Sequence[str]) -> None:
+def _check_names(what: str, names: Iterable[str], choices: Sequence[str]) -> None:
     for name in names:
-        if name not in known:
-            hint = did_you_mean(name, known, f"use {', '.join(known)}")
+        if name not in choices:
+            hint = did_you_mean(name, choices, f"use {', '.join(choices)}")
             raise ValueError(f"{what} has no {name!r}: {hint}")
 
 
@@ -113,9 +113,9 @@ class Objects:
 
     def chosen(self, names: Collection[str] | None) -> dict[str, int]:
         """Return the index of each named object, or of all objects, in ``models``."""
-        known = list(self.models)
-        _check_names("the task's lw.Objects", names or (), known)
-        return {name: known.index(name) for name in (known if names is None else names)}
+        objects = list(self.models)
+        _check_names("the task's lw.Objects", names or (), objects)
+        return {name: objects.index(name) for name in (objects if names is None else names)}
 
     def path(self, geom: ObjectGeom, owner: type) -> Path | None:
         """Return the file of a geom's mesh. Relative paths start at the folder of the task ``owner``."""

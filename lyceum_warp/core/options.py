@@ -118,10 +118,10 @@ class PhysicsOptions:
         """Get all options: look up the set that ``base`` names, and override it with the other options."""
         if self.base is None:
             return self
-        known = {"exact": PhysicsOptions(), **named}
-        if self.base not in known:
-            raise ValueError(f"there is no physics {self.base!r}: use {', '.join(map(repr, known))}")
-        return dataclasses.replace(known[self.base], **(self.given() | {"base": None}))
+        sets = {"exact": PhysicsOptions(), **named}
+        if self.base not in sets:
+            raise ValueError(f"there is no physics {self.base!r}: use {', '.join(map(repr, sets))}")
+        return dataclasses.replace(sets[self.base], **(self.given() | {"base": None}))
 
 
 @suggest_arguments
@@ -201,16 +201,16 @@ class EnvOptions:
             object.__setattr__(self, option, _names(option, getattr(self, option), "fields", example))
 
     @classmethod
-    def split(cls, words: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
+    def split(cls, values: Mapping[str, Any], base: "EnvOptions | None" = None) -> tuple["EnvOptions", dict[str, Any]]:
         """Split keyword arguments into options and task parameters."""
-        rest = {name: value for name, value in words.items() if name not in OPTIONS}
-        options = {name: value for name, value in words.items() if name in OPTIONS}
+        rest = {name: value for name, value in values.items() if name not in OPTIONS}
+        options = {name: value for name, value in values.items() if name in OPTIONS}
         return (base or cls()).changed(options), rest
 
-    def changed(self, words: Mapping[str, Any]) -> "EnvOptions":
+    def changed(self, changes: Mapping[str, Any]) -> "EnvOptions":
         """Return a copy of the options with the given changes."""
-        physics = {name: value for name, value in words.items() if name in _PHYSICS}
-        others = {name: value for name, value in words.items() if name not in _PHYSICS}
+        physics = {name: value for name, value in changes.items() if name in _PHYSICS}
+        others = {name: value for name, value in changes.items() if name not in _PHYSICS}
         if physics:
             others["physics"] = dataclasses.replace(_physics(others.get("physics", self.physics)), **physics)
         return dataclasses.replace(self, **others)
@@ -222,9 +222,9 @@ class EnvOptions:
 
     def given(self) -> dict[str, Any]:
         """Get the options that differ from their defaults, by name, including those of the physics."""
-        own = given_values(self)
-        own.pop("physics", None)
-        return own | self.physics.given()
+        options = given_values(self)
+        options.pop("physics", None)
+        return options | self.physics.given()
 
 
 def _names(option: str, names: Any, what: str, example: str) -> tuple[str, ...]:
@@ -233,11 +233,11 @@ def _names(option: str, names: Any, what: str, example: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _physics(given: Any) -> PhysicsOptions:
-    if isinstance(given, str):
-        return PhysicsOptions(base=given)
-    check_kind("physics", given, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
-    return given
+def _physics(physics: Any) -> PhysicsOptions:
+    if isinstance(physics, str):
+        return PhysicsOptions(base=physics)
+    check_kind("physics", physics, PhysicsOptions, "as lw.PhysicsOptions(cone='elliptic')")
+    return physics
 
 
 _PHYSICS = tuple(field.name for field in dataclasses.fields(PhysicsOptions) if field.name != "base")

@@ -91,11 +91,11 @@ def action_space(
 
 def _controls(model: mujoco.MjModel) -> dict[str, int]:
     """Map the name of each actuator to its number of controls."""
-    given = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
+    names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, i) for i in range(model.nactuator)]
     sizes: dict[str, int] = {}
     for i in np.argsort(model.actuator_ctrladr, kind="stable").tolist():
-        name = given[i] or f"actuator_{i}"
-        while not given[i] and name in given:  # another actuator may have this name
+        name = names[i] or f"actuator_{i}"
+        while not names[i] and name in names:  # another actuator may have this name
             name = f"{name}_"
         if model.actuator_ctrlnum[i]:
             sizes[name] = int(model.actuator_ctrlnum[i])
@@ -139,7 +139,7 @@ def control_ranges(model: mujoco.MjModel) -> np.ndarray:
 
 
 def state_space(
-    model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], own: Mapping[str, int]
+    model: mujoco.MjModel, snapshots: Iterable[Field], dynamics: Iterable[ModelField], parts: Mapping[str, int]
 ) -> Space:
     """Make the space of states: integration state in MuJoCo's order, snapshots, model fields, counters, other parts."""
     sizes = {}
@@ -150,4 +150,4 @@ def state_space(
             fallback = mujoco.mjtState(component).name.removeprefix("mjSTATE_").lower()
             sizes[names.get(component, fallback)] = size
     sizes |= {field.name: field.size for field in snapshots} | {field.name: field.size for field in dynamics}
-    return Space.of({**sizes, **dict.fromkeys(COUNTERS, 1), **own}, dtype=torch.float64)
+    return Space.of({**sizes, **dict.fromkeys(COUNTERS, 1), **parts}, dtype=torch.float64)
