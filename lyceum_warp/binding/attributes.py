@@ -23,8 +23,8 @@ def check_attributes(source: TaskSource, fields: Collection[str] = ()) -> None:
 
     ``fields`` are names of further fields of MjData and MjModel.
     """
-    for name, known, similarity in _new_names(source):
-        if guess := closest(name, known, 1, similarity):
+    for name, candidates, similarity in _new_names(source):
+        if guess := closest(name, candidates, 1, similarity):
             raise ValueError(f"the name {name!r} is unknown: did you mean {guess[0]}?")
     for problem in _problems(source.definition, source):
         raise ValueError(problem)
@@ -35,24 +35,24 @@ def check_fields(names: Iterable[str]) -> None:
     """Raise a ValueError unless MjData or MjModel has a field of each name."""
     for name in names:
         if not (is_data_field(name) or is_model_field(name)):
-            known = [*DATA_FIELDS, *VARYING_FIELDS]
-            hint = did_you_mean(name, known, "fields have MuJoCo's names, of MjData and MjModel")
+            fields = [*DATA_FIELDS, *VARYING_FIELDS]
+            hint = did_you_mean(name, fields, "fields have MuJoCo's names, of MjData and MjModel")
             raise ValueError(f"there is no field {name!r}: {hint}")
 
 
 def _new_names(source: TaskSource) -> Iterator[tuple[str, Collection[str], float]]:
     """Yield names that would have no effect if they were misspelt, with known names and the least similarity."""
-    known = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
+    attributes = {*(name for name in vars(Task) if not name.startswith("_")), *FUNCTIONS, "World", "Params"}
     for name in vars(source.definition):
-        if name not in known and not name.startswith(("_", GROUP_PREFIX)):
-            yield name, known, 0.75
+        if name not in attributes and not name.startswith(("_", GROUP_PREFIX)):
+            yield name, attributes, 0.75
     for name in source.definition.params:
         if name not in source.params.vars:
             yield name, source.params.vars, 0.6
     missing = [name for name, function in source.functions.items() if function is None]
-    known = {*FUNCTIONS, *source.terms.functions}
+    function_names = {*FUNCTIONS, *source.terms.functions}
     for name, value in vars(sys.modules[source.definition.__module__]).items():
-        if isinstance(value, wp.Function) and name not in known and source.world in value.input_types.values():
+        if isinstance(value, wp.Function) and name not in function_names and source.world in value.input_types.values():
             yield name, missing, 0.85
 
 

@@ -39,11 +39,11 @@ def explained(error: Exception, task: BoundTask) -> Exception:
     # Warp's message starts with the kernel that Warp compiled first, which may belong to another task. The error is in
     # the last function that it names. If this is a kernel, a result has the wrong type.
     *_, innermost = text.split("Error while parsing function ")
-    found = re.match(r'"(\w+)" at (.*?):(\d+):\n(.*?)\n;(.*)', innermost, re.DOTALL)
-    if not found:
-        known = type(error).__module__.startswith("warp")
-        return ValueError(f"Warp can't compile it: {' '.join(text.split())}") if known else error
-    function, file, line, source, message = (" ".join(group.split()) for group in found.groups())
+    match = re.match(r'"(\w+)" at (.*?):(\d+):\n(.*?)\n;(.*)', innermost, re.DOTALL)
+    if not match:
+        from_warp = type(error).__module__.startswith("warp")
+        return ValueError(f"Warp can't compile it: {' '.join(text.split())}") if from_warp else error
+    function, file, line, source, message = (" ".join(group.split()) for group in match.groups())
     call = re.search(r"\b(reward|evaluate|terminated|success)\((?:s0|s1|view)\b", source)
     kind = re.search(r"value argument type \((.+?)\) must be|with different type \(<class '[\w.]*?(\w+)'>\)", message)
     if call and kind:

@@ -153,8 +153,8 @@ class TaskSource:
         fields = {name: wp.types.type_repr(field.type) for name, field in declared.vars.items()}
         for owner in reversed(self._owners):
             struct = vars(owner).get("Params", owner.scope.get("Params"))
-            known = struct.vars.items() if is_struct(struct) and issubclass(declared.cls, struct.cls) else ()
-            if {name: wp.types.type_repr(field.type) for name, field in known} == fields:
+            base_fields = struct.vars.items() if is_struct(struct) and issubclass(declared.cls, struct.cls) else ()
+            if {name: wp.types.type_repr(field.type) for name, field in base_fields} == fields:
                 return struct
         return declared
 
@@ -179,8 +179,8 @@ class TaskSource:
                 raise ValueError(
                     f"the memory World.{name} has the name of an existing field or part of the state: rename it"
                 )
-        known = (*self.memory, "shared") if self.shared_structs else self.memory
-        types = {name: v.type for name, v in self.world.vars.items() if name not in known}
+        memory_names = (*self.memory, "shared") if self.shared_structs else self.memory
+        types = {name: v.type for name, v in self.world.vars.items() if name not in memory_names}
         kinds = {part.kind for part in self.memory.values()}
         return types | {name: Row[float] for name in MEMORIES if name in kinds}
 

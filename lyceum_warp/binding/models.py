@@ -52,8 +52,8 @@ def keyframe_state(model: mujoco.MjModel, name: str) -> np.ndarray:
     key = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_KEY, name)
     if key < 0:
         names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_KEY, i) for i in range(model.nkey)]
-        known = ", ".join(repr(n) for n in names if n) or "none with a name"
-        raise ValueError(f"the model has no keyframe {name!r}; it has {known}")
+        keyframes = ", ".join(repr(n) for n in names if n) or "none with a name"
+        raise ValueError(f"the model has no keyframe {name!r}; it has {keyframes}")
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, key)
     data.time = 0.0
@@ -135,17 +135,17 @@ def compile_model(
 
 
 def _remove_repeated_pairs(spec: mujoco.MjSpec) -> None:
-    known: set[frozenset[str]] = set()
+    pairs: set[frozenset[str]] = set()
     for pair in list(spec.pairs):
         geoms = frozenset((pair.geomname1, pair.geomname2))
-        if geoms in known:
+        if geoms in pairs:
             spec.delete(pair)
             log.info(
                 "%s lists a pair of %s twice: the second entry is dropped",
                 spec.modelname,
                 " and ".join(sorted(geoms)),
             )
-        known.add(geoms)
+        pairs.add(geoms)
 
 
 def warn_of_unstable_servos(model: mujoco.MjModel) -> None:

@@ -26,11 +26,11 @@ _reads: "weakref.WeakKeyDictionary[ModuleType, Stamps]" = weakref.WeakKeyDiction
 
 def stamps(files: Iterable[Path]) -> Stamps:
     """Read the modification times and sizes of files."""
-    found: Stamps = dict.fromkeys(files)
-    for file in found:
+    stamp_of: Stamps = dict.fromkeys(files)
+    for file in stamp_of:
         with contextlib.suppress(OSError):
-            found[file] = (stat := file.stat()).st_mtime_ns, stat.st_size
-    return found
+            stamp_of[file] = (stat := file.stat()).st_mtime_ns, stat.st_size
+    return stamp_of
 
 
 def data_files(sources: Iterable[Path]) -> Stamps:

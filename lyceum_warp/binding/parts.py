@@ -33,8 +33,8 @@ Layout = dict[str, Slice]
 
 def parts_of(struct: Any, owner: str) -> dict[str, Part]:
     """Return the parts that a struct declares, by field name. ``owner`` is the struct's name in error messages."""
-    found = {name: getattr(struct.cls, name, None) for name in struct.vars}
-    parts = {name: part for name, part in found.items() if isinstance(part, Part)}
+    attributes = {name: getattr(struct.cls, name, None) for name in struct.vars}
+    parts = {name: part for name, part in attributes.items() if isinstance(part, Part)}
     for name in parts:
         kind = struct.vars[name].type
         if not is_row(kind) or kind.ndim != 1 or getattr(kind.dtype, "_wp_scalar_type_", kind.dtype) is not wp.float32:

@@ -49,26 +49,26 @@ def register(task: type[Task]) -> type[Task]:
     Raises:
         ValueError: The name belongs to another task, or the class is not a task.
     """
-    given: Any = task
-    if not (isinstance(given, type) and issubclass(given, Task)):
-        name = getattr(given, "__name__", repr(given))
+    candidate: Any = task
+    if not (isinstance(candidate, type) and issubclass(candidate, Task)):
+        name = getattr(candidate, "__name__", repr(candidate))
         raise ValueError(f"@lw.register takes a subclass of lw.Task, not {name}: write class {name}(lw.Task)")
     name = task_name(task)
-    known = _tasks.get(name)
-    if known is None and not task.__module__.startswith(_PACKAGE) and name in _package_modules():
+    previous = _tasks.get(name)
+    if previous is None and not task.__module__.startswith(_PACKAGE) and name in _package_modules():
         owner = _package_modules()[name]
-    elif known is not None and not _may_replace(task, known):
-        owner = f"{known.__module__}.{known.__qualname__}"
+    elif previous is not None and not _may_replace(task, previous):
+        owner = f"{previous.__module__}.{previous.__qualname__}"
     else:
         _tasks[name] = task
         return task
     raise ValueError(f"the task name {name!r} is taken by {owner}: rename yours")
 
 
-def _may_replace(task: type[Task], known: type[Task]) -> bool:
+def _may_replace(task: type[Task], previous: type[Task]) -> bool:
     # two task files may have the same name
-    by_path = task.__module__.startswith(_FILE) and known.__module__.startswith(_FILE)
-    return by_path or known.__module__ == task.__module__ or _file(known) == _file(task)
+    by_path = task.__module__.startswith(_FILE) and previous.__module__.startswith(_FILE)
+    return by_path or previous.__module__ == task.__module__ or _file(previous) == _file(task)
 
 
 def package_task_names() -> list[str]:
@@ -83,15 +83,15 @@ def _package_modules() -> dict[str, str]:
     A module directly in ``lyceum_warp.tasks`` has the name of its only task. A folder lists its tasks and their
     modules in ``TASKS``.
     """
-    found: dict[str, str] = {}
+    modules: dict[str, str] = {}
     for folder in map(Path, importlib.import_module("lyceum_warp.tasks").__path__):
         for module in pkgutil.iter_modules([str(folder)]):
             if module.ispkg:
                 tasks = importlib.import_module(f"{_PACKAGE}{module.name}").TASKS
-                found |= {task: f"{_PACKAGE}{module.name}.{file}" for file, names in tasks.items() for task in names}
+                modules |= {task: f"{_PACKAGE}{module.name}.{file}" for file, names in tasks.items() for task in names}
             else:
-                found[module.name] = f"{_PACKAGE}{module.name}"
-    return found
+                modules[module.name] = f"{_PACKAGE}{module.name}"
+    return modules
 
 
 def _file(task: type[Any]) -> str | None:
@@ -116,8 +116,8 @@ def task_name(task: type[Task]) -> str:
     Some of the package's tasks have a prefix, such as ``dm/`` in ``dm/walker_walk``.
     """
     name = snake_case(task.__name__)
-    declared = (known for known, module in _package_modules().items() if module == task.__module__)
-    return next((known for known in declared if known.endswith(f"/{name}")), name)
+    declared = (full_name for full_name, module in _package_modules().items() if module == task.__module__)
+    return next((full_name for full_name in declared if full_name.endswith(f"/{name}")), name)
 
 
 def file_name(name: str) -> str:
@@ -183,8 +183,8 @@ def source_files(task: type[Task]) -> Mapping[Path, bytes]:
     """
     if task not in _sources:
         file = Path(_file(task) or "")
-        known = file.suffix == ".py" and file.is_file()
-        _sources[task] = _read(file, local_modules(file)) if known else {}
+        is_source = file.suffix == ".py" and file.is_file()
+        _sources[task] = _read(file, local_modules(file)) if is_source else {}
     return _sources[task]
 
 
@@ -225,12 +225,12 @@ def _run(path: Path, name: str, source: bytes) -> None:
 def _explained(error: BaseException) -> str:
     """Return the message for an error in a task file, with a fix if Warp's own message is unclear."""
     text = str(error).strip()
-    if found := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
-        argument, function, kind = found.groups()
+    if match := re.search(r"argument '(\w+)' of function (\w+): Unrecognized type '<class '[\w.]*?(\w+)'>'", text):
+        argument, function, kind = match.groups()
         return f"the argument {argument} of {function} has the type {kind}, which must be decorated with @wp.struct"
-    if found := re.search(r"type object '(\w+)' has no attribute '_type_'", text):
+    if match := re.search(r"type object '(\w+)' has no attribute '_type_'", text):
         return (
-            f"a @wp.struct has a field of the type {found.group(1)}: it can hold float, int, bool, vectors and "
+            f"a @wp.struct has a field of the type {match.group(1)}: it can hold float, int, bool, vectors and "
             "matrices (wp.vec3, ...) and arrays"
         )
     return text if type(error) is ValueError else f"{type(error).__name__}: {text}".removesuffix(": ")
@@ -239,18 +239,18 @@ def _explained(error: BaseException) -> str:
 def _task_of_file(path: Path, attribute: str) -> type[Task]:
     with _LOADING:
         module = _module_of_file(path)
-    found = {
+    tasks = {
         key: value
         for key, value in vars(module).items()
         if isinstance(value, type) and issubclass(value, Task) and value.__module__ == module.__name__
     }
     if attribute:
-        if attribute not in found:
-            raise ValueError(f"{path} has no task {attribute!r}; it has {', '.join(found) or 'none'}")
-        return found[attribute]
-    if len(found) != 1:
-        raise ValueError(f"{path} has {len(found)} tasks ({', '.join(found)}): name one of them, as {path}:Name")
-    return next(iter(found.values()))
+        if attribute not in tasks:
+            raise ValueError(f"{path} has no task {attribute!r}; it has {', '.join(tasks) or 'none'}")
+        return tasks[attribute]
+    if len(tasks) != 1:
+        raise ValueError(f"{path} has {len(tasks)} tasks ({', '.join(tasks)}): name one of them, as {path}:Name")
+    return next(iter(tasks.values()))
 
 
 def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
@@ -260,10 +260,10 @@ def class_in_file(spelled: str, base: type[Any]) -> type[Any]:
         FileNotFoundError: There is no such file.
         ValueError: The file cannot be run, or has no such class.
     """
-    found = object_in_file(spelled)
-    if not isinstance(found, type) or not issubclass(found, base):
+    cls = object_in_file(spelled)
+    if not isinstance(cls, type) or not issubclass(cls, base):
         raise ValueError(f"{spelled} is not a subclass of {base.__name__}")
-    return found
+    return cls
 
 
 def made(kind: type[Any], *arguments: Any, **options: Any) -> Any:

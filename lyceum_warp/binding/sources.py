@@ -82,8 +82,8 @@ class FunctionSource:
 
     def condition(self, node: ast.expr) -> bool | None:
         """Evaluate a condition that is a ``wp.static(...)``. Return None for any other condition."""
-        found = self.value(node) if self.is_static(node) else None
-        return None if found is None else bool(found)
+        value = self.value(node) if self.is_static(node) else None
+        return None if value is None else bool(value)
 
 
 source_of = functools.cache(FunctionSource)
@@ -117,9 +117,9 @@ def builtin(name: str) -> Any:
 
 def overloads(function: wp.Function) -> list[wp.Function]:
     """Return those overloads of a function that have Python source."""
-    found = [*function.user_overloads.values(), *function.user_templates.values()]
+    candidates = [*function.user_overloads.values(), *function.user_templates.values()]
     # the overloads include the instances that Warp has made of a generic function
-    return [overload for overload in found if overload.generic_parent is None] or [function]
+    return [overload for overload in candidates if overload.generic_parent is None] or [function]
 
 
 def _scope(function: Any) -> dict[str, Any]:

@@ -191,8 +191,8 @@ class Terms:
             return f"{place} takes {name}, but the end of an episode depends only on the state: it may take s and p"
         if name in _OWN:
             return f"{place} takes {name}, which is a name of the generated text: rename it"
-        known = {*variables, *self._params.vars, *self._world.vars, *source_of(function).scope} - {name}
-        hint = did_you_mean(name, known)
+        names = {*variables, *self._params.vars, *self._world.vars, *source_of(function).scope} - {name}
+        hint = did_you_mean(name, names)
         return (
             f"{place} takes {name}, which is not a function of the task, a parameter or a field of World"
             f"{hint and f': {hint}'}"

@@ -63,14 +63,14 @@ def trace(function: wp.Function) -> Trace:
     """Analyse a function and its callees."""
     kinds = enumerate(map(_kind, function.input_types.values()))
     places = tuple(None if kind is None else _Place(i, None, kind) for i, kind in kinds)
-    found = Trace(list(function.input_types))
+    result = Trace(list(function.input_types))
     if has_source(function):
-        _read_function(function, places, found)
+        _read_function(function, places, result)
     else:
         name = name_of(function)
-        unknown = (Write(i, None, argument, name, name, use=name) for i, argument in enumerate(found.arguments))
-        found.writes = {write: None for write in unknown if places[write.position]}
-    return found
+        unknown = (Write(i, None, argument, name, name, use=name) for i, argument in enumerate(result.arguments))
+        result.writes = {write: None for write in unknown if places[write.position]}
+    return result
 
 
 def written_fields(function: wp.Function) -> frozenset[str]:
@@ -154,18 +154,18 @@ def _kind(written: Any) -> Any:
     return written if is_struct(written) else (written.ndim, written.dtype) if is_row(written) else None
 
 
-def _read_function(function: wp.Function, places: tuple[_Place | None, ...], found: Trace) -> None:
+def _read_function(function: wp.Function, places: tuple[_Place | None, ...], trace: Trace) -> None:
     """Analyse a function for the values that its caller passes. A value that cannot be written is None."""
-    if (key := (function, *places)) not in found.calls:
-        found.calls[key] = None
-        _Reader(function, places, found)
+    if (key := (function, *places)) not in trace.calls:
+        trace.calls[key] = None
+        _Reader(function, places, trace)
 
 
 class _Reader:
     """Reads the source of one function and of its callees, and adds to a trace."""
 
-    def __init__(self, function: wp.Function, places: tuple[_Place | None, ...], found: Trace) -> None:
-        self.trace, self.source = found, source_of(function)
+    def __init__(self, function: wp.Function, places: tuple[_Place | None, ...], trace: Trace) -> None:
+        self.trace, self.source = trace, source_of(function)
         # a key is a name, or "name.field" for a row in a local struct
         self.places: dict[str, _Place | None] = dict(zip(function.input_types, places, strict=True))
         # read loops twice: a local struct may be used before the line that puts a row into it
@@ -218,14 +218,14 @@ class _Reader:
         place = self._read(node.value) if node.value is not None else None
         whole = place if place is not None and place.kind is not None else None
         for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
-            known = None
+            target_place = None
             if not self._is_local(target):
                 self._store(target)
             elif whole is not None:
                 name = ast.unparse(target)
-                known = self.places[name] = self.places.get(name) or whole
-            if whole is not None and known != whole:
-                for lost in filter(None, (known, whole)):
+                target_place = self.places[name] = self.places.get(name) or whole
+            if whole is not None and target_place != whole:
+                for lost in filter(None, (target_place, whole)):
                     self._note(lost, node, follows=False)
 
     def _is_local(self, target: ast.expr) -> bool:
@@ -243,31 +243,31 @@ class _Reader:
 
     def _call(self, node: ast.Call) -> None:
         kind, callee = self.source.call(node)
-        given = [*node.args, *(keyword.value for keyword in node.keywords)]
+        arguments = [*node.args, *(keyword.value for keyword in node.keywords)]
         if kind == "helper":
             for overload in overloads(callee):
                 self._call_helper(overload, node)
         elif kind == "builtin" and callee.key in _READERS:
-            for argument in given:
+            for argument in arguments:
                 self._read(argument)
         elif kind == "other":
-            self._read_all(node, [node.func, *given], elements=callee is wp.address_of)
+            self._read_all(node, [node.func, *arguments], elements=callee is wp.address_of)
         elif kind != "static":
-            self._read_all(node, given)
+            self._read_all(node, arguments)
 
     def _call_helper(self, callee: wp.Function, node: ast.Call) -> None:
         expressions: dict[str, ast.expr] = dict(zip(callee.input_types, node.args, strict=False))
         expressions |= {keyword.arg: keyword.value for keyword in node.keywords if keyword.arg}
-        places = {name: place for name, given in expressions.items() if (place := self._read(given)) is not None}
-        given: list[_Place | None] = []
+        places = {name: place for name, value in expressions.items() if (place := self._read(value)) is not None}
+        arguments: list[_Place | None] = []
         for name, expected in callee.input_types.items():
             place = places.get(name)
             if hasattr(expected, "value_type") and place is not None:  # a wp.ref
                 self._note(place, node, follows=False)
             if place is None or place.kind is None:
-                given.append(None)
+                arguments.append(None)
             elif expected is Any or type(place.kind) is type(_kind(expected)):
-                given.append(place)
+                arguments.append(place)
             else:
                 return  # another overload
-        _read_function(callee, tuple(given), self.trace)
+        _read_function(callee, tuple(arguments), self.trace)
