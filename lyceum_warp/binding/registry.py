@@ -183,8 +183,7 @@ def source_files(task: type[Task]) -> Mapping[Path, bytes]:
     """
     if task not in _sources:
         file = Path(_file(task) or "")
-        is_source = file.suffix == ".py" and file.is_file()
-        _sources[task] = _read(file, local_modules(file)) if is_source else {}
+        _sources[task] = _read(file, local_modules(file)) if file.suffix == ".py" and file.is_file() else {}
     return _sources[task]
 
 

@@ -280,7 +280,6 @@ def _called(kind: mujoco.mjtObj) -> str:
 def _find(model: mujoco.MjModel, kind: mujoco.mjtObj, element: str) -> int:
     index = mujoco.mj_name2id(model, kind, element)
     if index < 0:
-        names = [mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)]
-        listing = ", ".join(sorted(n for n in names if n)) or "none with names"
-        raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {listing}")
+        names = ", ".join(sorted(filter(None, (mujoco.mj_id2name(model, kind, i) for i in range(model.nnames)))))
+        raise ValueError(f"the model has no {_called(kind)} {element!r}; it has: {names or 'none with names'}")
     return index

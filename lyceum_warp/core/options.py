@@ -222,9 +222,7 @@ class EnvOptions:
 
     def given(self) -> dict[str, Any]:
         """Get the options that differ from their defaults, by name, including those of the physics."""
-        options = given_values(self)
-        options.pop("physics", None)
-        return options | self.physics.given()
+        return {name: x for name, x in given_values(self).items() if name != "physics"} | self.physics.given()
 
 
 def _names(option: str, names: Any, what: str, example: str) -> tuple[str, ...]:
