@@ -45,9 +45,9 @@ def known_sizes(pytestconfig: pytest.Config) -> Iterator[None]:
         return
     source = hashlib.sha256(Path(str(sizes.__file__)).read_bytes()).hexdigest()[:16]
     key = f"lyceum_warp/sizes-{mujoco.__version__}-{source}"
-    sizes._known.update({model: tuple(found) for model, found in cache.get(key, {}).items()})
+    sizes._cache.update({model: tuple(found) for model, found in cache.get(key, {}).items()})
     yield
-    cache.set(key, cache.get(key, {}) | sizes._known)  # another process may have stored sizes
+    cache.set(key, cache.get(key, {}) | sizes._cache)  # another process may have stored sizes
 
 
 @pytest.fixture(scope="module")

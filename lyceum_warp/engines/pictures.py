@@ -46,7 +46,8 @@ class Pictures:
     """The pictures by group, (nworld, height, width, channels)."""
 
     def __init__(self, engine: Engine, cameras: Sequence[Camera]) -> None:
-        self.cameras, self._engine, model, nworld = cameras, engine, engine.model, engine.nworld
+        self.cameras, self._engine = cameras, engine
+        model, nworld = engine.model, engine.nworld
         sizes = _sizes(model, cameras)
         kinds = {
             kind: [any((c.name, c.kind) == (name, kind) for c in cameras) for name in sizes]
@@ -100,9 +101,9 @@ def _sizes(model: mujoco.MjModel, cameras: Iterable[Camera]) -> dict[str, tuple[
     sizes: dict[str, tuple[int, int]] = {}
     for camera in cameras:
         if camera.name not in names:
-            known = ", ".join(repr(name) for name in names if name) or "none"
+            choices = ", ".join(repr(name) for name in names if name) or "none"
             raise ValueError(
-                f"the model has no camera {camera.name!r}: it has {known}; give a pose, as in "
+                f"the model has no camera {camera.name!r}: it has {choices}; give a pose, as in "
                 f"lw.Camera({camera.name!r}, pos=(2, 0, 1), lookat=(0, 0, 0)), to add one"
             )
         size = camera.width, camera.height

@@ -11,7 +11,7 @@ from lyceum_warp.engines.warp.sizes import probe_sizes
 @pytest.fixture(autouse=True)
 def unknown_sizes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Probe every model, even if the tests' cache contains its sizes."""
-    monkeypatch.setattr(sizes, "_known", {})
+    monkeypatch.setattr(sizes, "_cache", {})
 
 
 WELDS = "".join(f'<weld body1="b{i}" active="false"/>' for i in range(8))

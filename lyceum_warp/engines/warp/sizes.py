@@ -19,7 +19,8 @@ from lyceum_warp.kernels import faults
 
 log = logging.getLogger(__name__)
 
-_WORLDS, _WORLDS_OF_OBJECT, _HOLDS, _SUBSTEPS = 48, 16, 25, 20
+_WORLDS, _WORLDS_OF_OBJECT = 48, 16
+_HOLDS, _SUBSTEPS = 25, 20
 
 _LEAST, _LEAST_WITH_FLEX = (8, 8), (256, 512)
 """The smallest (nconmax, njmax) without and with a flex. A geom that is pressed into a flex touches up to 50 of its
@@ -30,7 +31,7 @@ _LIMITS = {"jnt_range", "jnt_margin", "tendon_range", "tendon_margin", "qpos0"}
 _CONTACTS = set("geom_margin geom_gap geom_size geom_pos geom_quat pair_margin pair_gap body_pos body_quat".split())
 """Model fields that affect the number of constraints or contacts."""
 
-_known: dict[str, tuple[int, int]] = {}
+_cache: dict[str, tuple[int, int]] = {}
 
 
 def probe_sizes(model: mujoco.MjModel, varied: Collection[ModelField] = ()) -> tuple[int, int]:
@@ -105,9 +106,9 @@ def _probe_once(model: mujoco.MjModel, objects: Mapping[str, np.ndarray]) -> tup
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, buffer)
     key = hashlib.sha256(b"".join([buffer.tobytes(), *(rows.tobytes() for rows in objects.values())])).hexdigest()
-    if key not in _known:
-        _known[key] = _probe(model, objects)
-    return _known[key]
+    if key not in _cache:
+        _cache[key] = _probe(model, objects)
+    return _cache[key]
 
 
 def _worlds_with(model: mujoco.MjModel, objects: Mapping[str, np.ndarray], rng: np.random.Generator) -> Batch:

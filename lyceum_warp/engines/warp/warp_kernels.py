@@ -141,13 +141,13 @@ def return_bits(world_in: wp.array[int], left_in: wp.array[int], source_in: wp.a
 
 @wp.kernel(enable_backward=False)
 def mark_changed(
-    mask_in: wp.array[bool], given_in: wp.array2d[int], applied_inout: wp.array2d[int], changed_inout: wp.array[bool]
+    mask_in: wp.array[bool], bits_in: wp.array2d[int], applied_inout: wp.array2d[int], changed_inout: wp.array[bool]
 ):
     """Mark the masked worlds whose bits have changed, and store the new bits; launched over (nworld,)."""
     w = wp.tid()
     if mask_in[w]:
-        for i in range(given_in.shape[1]):
-            bits = given_in[w, i]
+        for i in range(bits_in.shape[1]):
+            bits = bits_in[w, i]
             if bits != applied_inout[w, i]:
                 applied_inout[w, i] = bits
                 changed_inout[w] = True
