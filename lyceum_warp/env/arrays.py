@@ -20,8 +20,8 @@ from lyceum_warp.support.tensors import check_tensor
 
 def own_bytes_per_world(task: BoundTask) -> int:
     """Estimate the bytes that each world needs outside the engine's arrays."""
-    own, snapshots = own_parts(task), [field for field in task.fields if field.snapshot]
-    state_size = spaces.state_space(task.model, snapshots, task.dynamics, own).size
+    parts, snapshots = own_parts(task), [field for field in task.fields if field.snapshot]
+    state_size = spaces.state_space(task.model, snapshots, task.dynamics, parts).size
     copies = sum(field.size for field in task.fields)
     observations = sum(sum(layout.values()) for layout in task.layouts.obs.values())
     total = 4 * copies + 8 * state_size + 8 * observations + 300
@@ -34,11 +34,11 @@ def own_bytes_per_world(task: BoundTask) -> int:
 
 def own_parts(task: BoundTask) -> dict[str, int]:
     """Compute the sizes of the parts that ``Worlds`` adds to the engine's state, except for the counters."""
-    form, found = task.definition, dict[str, int]()
+    form, parts = task.definition, dict[str, int]()
     for layout in task.layouts.memory.values():
-        found |= sizes(layout)
-    own = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
-    return found | {name: size for name, size in own.items() if size}
+        parts |= sizes(layout)
+    counts = {"metrics": len(task.metrics), "success_steps": int(form.success_steps > 1)}
+    return parts | {name: size for name, size in counts.items() if size}
 
 
 def memory_columns(task: BoundTask, space: spaces.Space) -> dict[str, slice]:
@@ -51,7 +51,8 @@ class WorldArrays:
     """All arrays of an environment's worlds."""
 
     def __init__(self, task: BoundTask, engine: Engine, *, final_pictures: bool = False) -> None:
-        self.task, self.engine, self.device, self.nworld = task, engine, engine.device, engine.nworld
+        self.task, self.engine = task, engine
+        self.device, self.nworld = engine.device, engine.nworld
         with wp.ScopedDevice(self.device):
             self._allocate_fields()
             self._allocate_outcome()
@@ -79,12 +80,11 @@ class WorldArrays:
         self.picture_groups = self.pictures.groups
         if final:
             self.final_picture_groups = {group: torch.zeros_like(now) for group, now in self.picture_groups.items()}
-            for pair in zip(self.picture_groups.values(), self.final_picture_groups.values(), strict=True):
-                live, kept = (wp.from_torch(words(picture)) for picture in pair)
-                self._final_pictures.append((live, kept))
+            pairs = zip(self.picture_groups.values(), self.final_picture_groups.values(), strict=True)
+            self._final_pictures += [(wp.from_torch(words(live)), wp.from_torch(words(last))) for live, last in pairs]
 
     def _allocate_fields(self) -> None:
-        n, model, task, kernels = self.nworld, self.task.model, self.task.definition, self.task.kernels
+        n, model, task = self.nworld, self.task.model, self.task.definition
         self.memory, self.lasting_memory, self._lasting_before = (
             wp.zeros((n, sum(sizes(self.task.layouts.memory[name]).values())), dtype=float)
             for name in ("memory", "lasting_memory", "lasting_memory")
@@ -98,7 +98,7 @@ class WorldArrays:
             **{name: flat(self.engine.arrays[name]) for name in task.cleared},
         }  # fmt: skip
         self._zeros = wp.zeros(max(array.shape[1] for array in self._clearable.values()), dtype=float)
-        self.transition = kernels.Transition()
+        self.transition = self.task.kernels.Transition()
         """The arrays of the last step, which the kernels of the task use."""
         self.after, self.before = self.transition.after, self.transition.before
         self._copies: dict[str, wp.array] = {}
@@ -142,7 +142,7 @@ class WorldArrays:
         self.judged_parts = parts = int(transitions.OBSERVE_FIRST) + len(self.obs_spaces)
         """Number of parts of the kernel ``judge``."""
         self._judging = parts if self.device.is_cuda else 1  # threads per transition
-        self._found = zeros_of(step_types.Findings, n, fault=(parts, n))
+        self._findings = zeros_of(step_types.Findings, n, fault=(parts, n))
         shapes = {group: (n, space.size) for group, space in self.obs_spaces.items()}
         self.obs, self.final_obs = (zeros_of(self.task.kernels.Observations, **shapes) for _ in range(2))
         self._finite_obs = wp.zeros((len(self.obs_spaces), n), dtype=bool)
@@ -188,7 +188,7 @@ class WorldArrays:
         self._outdated = wp.zeros(n, dtype=bool)
         """Worlds that need a new observation after a restart or an event."""
         self.mask_view, self.changed_view = torch_view(self.mask), torch_view(self._changed)
-        self.terminated_view = torch_view(self._found.terminated)
+        self.terminated_view = torch_view(self._findings.terminated)
 
     def set_mask(self, mask: torch.Tensor | None) -> None:
         """Choose the worlds that the next reset or restore changes; None means all."""

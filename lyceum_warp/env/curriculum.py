@@ -64,9 +64,9 @@ class Curriculum:
         for target, memory in ((env.shared, self.shared), (env.lasting, self.lasting)):
             for name, rows in memory.items():
                 if name not in target or rows.shape[-1] != target[name].shape[-1]:
-                    known = ", ".join(f"{known} ({x.shape[-1]})" for known, x in target.items()) or "none"
+                    parts = ", ".join(f"{part} ({x.shape[-1]})" for part, x in target.items()) or "none"
                     raise ValueError(
-                        f"the task {env.task.name!r} has no memory {name!r} of size {rows.shape[-1]}; it has: {known}"
+                        f"the task {env.task.name!r} has no memory {name!r} of size {rows.shape[-1]}; it has: {parts}"
                     )
 
 

@@ -390,11 +390,11 @@ class Env:
 
     def _check_objects(self, state: torch.Tensor) -> None:
         """Raise a ValueError if a state that will be set has an object that no world of this environment can hold."""
-        parts, known = self.state_space.parts, list(self.task.objects.values())
+        parts, indices = self.state_space.parts, list(self.task.objects.values())
         held = state[:, parts["object"]].squeeze(1)
-        bad = ~torch.isin(held, torch.tensor(known, dtype=held.dtype, device=held.device))
+        bad = ~torch.isin(held, torch.tensor(indices, dtype=held.dtype, device=held.device))
         if "geom_dataid" in parts:  # in an environment with other objects, meshes may have other indices
-            meshes = self.worlds.nominal_rows("geom_dataid", held.clamp(0, max(known)))
+            meshes = self.worlds.nominal_rows("geom_dataid", held.clamp(0, max(indices)))
             bad |= (state[:, parts["geom_dataid"]] != meshes).any(1)
         if (bad := bad & self.worlds.mask_view).any():
             world = int(bad.nonzero()[0])
@@ -496,10 +496,9 @@ class Env:
         if name not in self._fields:
             check_fields([name])
             (describe_model_field if is_model_field(name) else describe)(self.task.model, name)
-            kept = ", ".join(sorted(self._fields))
             raise ValueError(
                 f"this environment of {self.task.name!r} does not provide the field {name!r}: make the environment "
-                f"with fields=[{name!r}] (it provides {kept})"
+                f"with fields=[{name!r}] (it provides {', '.join(sorted(self._fields))})"
             )
         view = self._fields[name]
         if element is None:
@@ -535,14 +534,14 @@ class Env:
         self.set_state(state, mask)
 
     def _put_objects(self, names: Sequence[str], columns: Mapping[str, torch.Tensor]) -> None:
-        known = self.task.objects
-        if len(names) != self.nworld or (unknown := [name for name in names if name not in known]):
+        objects = self.task.objects
+        if len(names) != self.nworld or (unknown := [name for name in names if name not in objects]):
             what = f"{len(names)} names" if len(names) != self.nworld else repr(unknown[0])
             raise ValueError(
                 f"object must be a name, or one name for each of the {self.nworld} worlds, not {what}: worlds hold "
-                f"{', '.join(known) or 'no objects'}"
+                f"{', '.join(objects) or 'no objects'}"
             )
-        held = torch.tensor([known[name] for name in names], device=self.obs.device)
+        held = torch.tensor([objects[name] for name in names], device=self.obs.device)
         for field in self.task.dynamics:
             if field.rows is not None:
                 columns[field.name].copy_(self.worlds.nominal_rows(field.name, held))
@@ -636,8 +635,8 @@ class Env:
         """
         nworld = self.nworld if nworld is None else nworld
         # use the loaded model, because its file may have changed
-        own = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
-        options, params = EnvOptions.split(changes, self.options.changed(own | {"seed": 0, "first_world": 0}))
+        current = {"horizon": self.horizon, "autoreset": self.autoreset, "model": self.task.spec}
+        options, params = EnvOptions.split(changes, self.options.changed(current | {"seed": 0, "first_world": 0}))
         options = options.changed({"nworld": nworld})
         params = self._params_for(nworld, self._given_params) | params
         replica = Env(self.task.definition, options, params, _replica=True)
@@ -655,16 +654,16 @@ class Env:
         return self.replicate(nworld=nworld, **(few | changes))
 
     def _params_for(self, nworld: int, names: Iterable[str]) -> dict[str, Any]:
-        known, worlds = self.task.parameters, np.arange(nworld) % self.nworld
-        given = {name: value for name, value in self._given_params.items() if name not in known.tables}
-        values = {name: (known.values | given)[name] for name in names}
-        return values | {name: known.values[name][worlds] for name in names if name in known.per_world}
+        parameters, worlds = self.task.parameters, np.arange(nworld) % self.nworld
+        arguments = {name: value for name, value in self._given_params.items() if name not in parameters.tables}
+        values = {name: (parameters.values | arguments)[name] for name in names}
+        return values | {name: parameters.values[name][worlds] for name in names if name in parameters.per_world}
 
-    def _scratch_at(self, given: torch.Tensor) -> "Env":
+    def _scratch_at(self, state: torch.Tensor) -> "Env":
         if self._scratch is None:
             self._scratch = self.replicate()
         self._scratch._copy_shared(self)
-        self._scratch.set_state(given)
+        self._scratch.set_state(state)
         return self._scratch
 
     # diagnostics

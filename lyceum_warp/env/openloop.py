@@ -158,8 +158,8 @@ class OpenLoop:
         fields = [field for field in env.task.fields if field.name in env.task.types]
         numbers = sum(field.size for field in fields) + sum(field.size for field in env.task.dynamics)
         numbers += sum(own_parts(env.task).values())
-        own = 4 * (numbers + env.task.model.nu + env.action_space.size)
-        return horizon * (own + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
+        step_bytes = 4 * (numbers + env.task.model.nu + env.action_space.size)
+        return horizon * (step_bytes + 8) + env.engine.rollout_bytes_per_world(horizon, env.task.frame_skip, fields)
 
     def _whole_horizon(self) -> tuple[Phase, ...]:
         physics = partial(

@@ -243,10 +243,10 @@ class Worlds(Resets):
         kernels = self.task.kernels
         if kernels.check_memory is not None:
             launch_lanes(kernels.check_memory, self.nworld, [mask, self.transition, fault], self.device)
-        args = [mask, self.transition, transition, fault, action_fault, self._found, self.metrics, self.final_obs]
+        args = [mask, self.transition, transition, fault, action_fault, self._findings, self.metrics, self.final_obs]
         launch_parts(kernels.judge, self._judging, self.nworld, [*args, self._judging], self.device)
         launch_lanes(kernels.conclude, self.nworld, [
-            mask, self.transition, self._found, self.outcome, self.episodes, transition, keep_reason, fault,
+            mask, self.transition, self._findings, self.outcome, self.episodes, transition, keep_reason, fault,
             action_fault, self.obs, self.final_obs,
         ], self.device)  # fmt: skip
 
@@ -265,8 +265,8 @@ class Worlds(Resets):
 
     def _mark_changes(self, before: wp.array, after: wp.array, *, physics: bool) -> None:
         """Mark worlds in which an event changed a given field. ``physics`` is False for a memory field."""
-        found = [self._physics_changed, self._changed, self._outdated]
-        args = [self.restarting, flat(before), flat(after), physics, *found]
+        marks = [self._physics_changed, self._changed, self._outdated]
+        args = [self.restarting, flat(before), flat(after), physics, *marks]
         launch_lanes(rows.mark_changes, self.nworld, args, self.device)
 
     def _observe(self, mask: wp.array) -> None:

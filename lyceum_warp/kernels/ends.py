@@ -10,11 +10,11 @@ TRUNCATED = wp.constant(int(Done.TRUNCATED))
 
 
 @wp.func
-def all_faults(w: int, fault: int, found: Findings) -> int:
+def all_faults(w: int, fault: int, findings: Findings) -> int:
     """Add the faults that the parts of ``judge`` found to those of the engine and of the action."""
     bits = int(fault)
-    for part in range(found.fault.shape[0]):
-        bits = bits | found.fault[part, w]
+    for part in range(findings.fault.shape[0]):
+        bits = bits | findings.fault[part, w]
     return bits
 
 

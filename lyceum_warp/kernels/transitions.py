@@ -43,7 +43,7 @@ def _make_judge(task: TaskCode) -> None:
         transition: bool,
         fault_in: wp.array[int],
         action_fault_in: wp.array[int],
-        found_out: Findings,
+        findings_out: Findings,
         metrics_out: wp.array2d[float],
         obs_out: task.Observations,
         threads: int,
@@ -58,16 +58,16 @@ def _make_judge(task: TaskCode) -> None:
         w = first + k
         if not mask_in[w]:
             return
-        for part in range(start, found_out.fault.shape[0], threads):
-            found = int(0)
+        for part in range(start, findings_out.fault.shape[0], threads):
+            fault = int(0)
             if (fault_in[w] | action_fault_in[w]) == 0:
                 s1, p = task.view(t.after, w), task.params_of(t, w)
                 if part == ENDS:
-                    found_out.terminated[w] = task.functions.terminated(s1, p)
-                    found_out.truncated[w] = task.functions.truncated(s1, p)
-                    found_out.success[w] = task.functions.success(s1, p)
+                    findings_out.terminated[w] = task.functions.terminated(s1, p)
+                    findings_out.truncated[w] = task.functions.truncated(s1, p)
+                    findings_out.success[w] = task.functions.success(s1, p)
                     if wp.static("evaluate" in task.written):
-                        found_out.eval[w] = task.functions.evaluate(s1, p)
+                        findings_out.eval[w] = task.functions.evaluate(s1, p)
                 elif part == GAIN:
                     if wp.static(hasattr(task.terms, "score")):
                         for i in range(metrics_out.shape[1]):
@@ -76,11 +76,11 @@ def _make_judge(task: TaskCode) -> None:
                         s0 = task.view(t.before, w)
                         if wp.static(hasattr(task.terms, "score")):
                             weights = t.weights[w % t.weights.shape[0]]
-                            found_out.reward[w] = task.terms.score(s0, t.action[w], s1, p, weights, metrics_out[w])
+                            findings_out.reward[w] = task.terms.score(s0, t.action[w], s1, p, weights, metrics_out[w])
                         else:
-                            found_out.reward[w] = task.functions.reward(s0, t.action[w], s1, p)
-                        if faults.is_out_of_range(found_out.reward[w]):
-                            found = REWARD
+                            findings_out.reward[w] = task.functions.reward(s0, t.action[w], s1, p)
+                        if faults.is_out_of_range(findings_out.reward[w]):
+                            fault = REWARD
                 elif part == METRICS:
                     if wp.static("measure" in task.written and not hasattr(task.terms, "score")):
                         for i in range(metrics_out.shape[1]):
@@ -90,8 +90,8 @@ def _make_judge(task: TaskCode) -> None:
                 else:
                     group = part - OBSERVE_FIRST
                     if not task.observe_group(group, s1, p, obs_out, w, t.counters):
-                        found = OBSERVATION
-            found_out.fault[part, w] = found
+                        fault = OBSERVATION
+            findings_out.fault[part, w] = fault
 
 
 def _make_conclude(task: TaskCode) -> None:
@@ -101,7 +101,7 @@ def _make_conclude(task: TaskCode) -> None:
     def conclude(
         mask_in: wp.array[bool],
         t: task.Transition,
-        found: Findings,
+        findings: Findings,
         out: Outcome,
         episodes: Episodes,
         transition: bool,
@@ -120,14 +120,14 @@ def _make_conclude(task: TaskCode) -> None:
         the last good observations. Such a transition counts as truncated, so that learners bootstrap from the
         last good observations. The evaluation of a state alone does not change the count of successful steps.
 
-        If ``transition`` is not set, the kernel evaluates a state and ends no episode. ``found.terminated`` then holds
-        the result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
+        If ``transition`` is not set, the kernel evaluates a state and ends no episode. ``findings.terminated`` then
+        holds the result of the task's ``terminated``. ``keep_reason`` keeps the done reasons that are already stored.
         """
         k, lane = wp.tid()
         w = first + k
         if not mask_in[w]:
             return
-        fault = ends.all_faults(w, fault_inout[w] | action_fault_in[w], found)
+        fault = ends.all_faults(w, fault_inout[w] | action_fault_in[w], findings)
         if fault == 0:
             task.copy_observations(final_obs_inout, obs_out, w, lane, lanes)
         else:
@@ -137,26 +137,26 @@ def _make_conclude(task: TaskCode) -> None:
         if lane > 0:
             return
         fault_inout[w] = fault
-        out.reward[w] = wp.where(fault == 0 and transition, found.reward[w], 0.0)
+        out.reward[w] = wp.where(fault == 0 and transition, findings.reward[w], 0.0)
         if wp.static("evaluate" in task.written):
             if fault == 0:
-                out.eval[w] = found.eval[w]
+                out.eval[w] = findings.eval[w]
             elif transition:
-                found.eval[w] = task.functions.evaluate(task.view(t.before, w), task.params_of(t, w))
-                if not faults.is_out_of_range(found.eval[w]):  # else keep the previous evaluation
-                    out.eval[w] = found.eval[w]
+                findings.eval[w] = task.functions.evaluate(task.view(t.before, w), task.params_of(t, w))
+                if not faults.is_out_of_range(findings.eval[w]):  # else keep the previous evaluation
+                    out.eval[w] = findings.eval[w]
         else:
             out.eval[w] = out.reward[w]
-        found.terminated[w] = fault == 0 and found.terminated[w]
-        out.success[w] = fault == 0 and found.success[w]
+        findings.terminated[w] = fault == 0 and findings.terminated[w]
+        out.success[w] = fault == 0 and findings.success[w]
         if episodes.success_steps > 1:
             if transition:
                 ends.count_success(out.success[w], episodes.success_steps, episodes.success_count[w])
             out.success[w] = out.success[w] and episodes.success_count[w, 0] >= float(episodes.success_steps)
         reason = int(0)
         if transition:
-            truncated = fault == 0 and found.truncated[w]
-            reason = ends.reason_of_end(fault, found.terminated[w], truncated, t.counters.step[w], episodes.horizon)
+            truncated = fault == 0 and findings.truncated[w]
+            reason = ends.reason_of_end(fault, findings.terminated[w], truncated, t.counters.step[w], episodes.horizon)
         if keep_reason:
             reason = reason | out.done_reason[w]
         ends.put_reason(w, reason, out)
