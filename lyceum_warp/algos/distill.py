@@ -318,15 +318,15 @@ class Distill(SamplingLearner):
 
     def recall(self) -> None:
         """Take the next steps of the episodes. Each world has its own place in them, and continues at their end."""
-        rollout, given = self.rollout, self._demonstrations
+        rollout, demonstrations = self.rollout, self._demonstrations
         steps = torch.arange(rollout.steps, device=self._start.device)[:, None]
-        index = (self._start + self.iteration * rollout.steps + steps) % len(given.obs)
+        index = (self._start + self.iteration * rollout.steps + steps) % len(demonstrations.obs)
         self._state.copy_(self._player.state)
         for group, rows in rollout.obs_groups.items():
-            rows.copy_(given.obs_groups[group][index])
-        rollout.step.copy_(given.step[index])
+            rows.copy_(demonstrations.obs_groups[group][index])
+        rollout.step.copy_(demonstrations.step[index])
         self.policy.observe_pictures({group: rows[0] for group, rows in rollout.obs_groups.items()}, self.team)
-        self.label.copy_(given.action[index])
+        self.label.copy_(demonstrations.action[index])
 
     def update(self) -> None:
         """Run the epochs. Memory goes on from the last one, as in rsl_rl: this state is that of the new student."""

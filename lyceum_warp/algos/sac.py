@@ -322,12 +322,12 @@ class SAC(SamplingLearner):
 
     def _make_buffers(self) -> None:
         """Allocate the inputs of the updates, and prepare the losses."""
-        config, team, device, nact = self.config, self.team, self.env.obs.device, self.policy.nact
+        config, team, device = self.config, self.team, self.env.obs.device
         share = room(config.batch, team)
-        self._act_noise = torch.empty(self._all_worlds, nact, device=device)
+        self._act_noise = torch.empty(self._all_worlds, self.policy.nact, device=device)
         self._index = torch.zeros(config.updates, share, dtype=torch.long, device=device)
         self._weight = torch.full((config.updates, share), 1.0 / config.batch, device=device)
-        self._noise = torch.zeros(config.updates, share, 2 * nact, device=device)
+        self._noise = torch.zeros(config.updates, share, 2 * self.policy.nact, device=device)
         self._sums = torch.zeros(4, device=device)
         self._losses = [self.critic_loss, self.actor_loss]
         if config.compiled:

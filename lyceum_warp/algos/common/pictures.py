@@ -136,10 +136,10 @@ class Stack(nn.Module):
 
     def forward(self, x: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Compute the output, (n, frames * size), and the next state."""
-        earlier, known = state.split([self.past * self.size, self.past], dim=-1)
-        changes = (x.unsqueeze(-2) - earlier.unflatten(-1, (self.past, self.size))) * (_GAIN * known.unsqueeze(-1))
-        kept = earlier[..., : (self.past - 1) * self.size], torch.ones_like(known[..., :1]), known[..., :-1]
-        return torch.cat([x, changes.flatten(-2)], dim=-1), torch.cat([x, *kept], dim=-1)
+        earlier, mask = state.split([self.past * self.size, self.past], dim=-1)
+        changes = (x.unsqueeze(-2) - earlier.unflatten(-1, (self.past, self.size))) * (_GAIN * mask.unsqueeze(-1))
+        history = earlier[..., : (self.past - 1) * self.size], torch.ones_like(mask[..., :1]), mask[..., :-1]
+        return torch.cat([x, changes.flatten(-2)], dim=-1), torch.cat([x, *history], dim=-1)
 
 
 class PictureNetwork(nn.Module):

@@ -86,10 +86,10 @@ class GaussianPolicy(Normalized):
         if pictures:
             self.shape["pictures"] = {group: list(shape) for group, shape in pictures.items()}
         if network is None and pictures:
-            own: dict[str, Any] = {"channels": list(channels), "spatial_softmax": spatial_softmax, "frames": frames}
-            own |= {"activation": activation, "recurrent": recurrent}
-            self.shape |= own | {"hidden": layer_sizes(hidden)}
-            network = picture_network(nobs, nact, hidden, pictures=pictures, generator=generator, **own)
+            options: dict[str, Any] = {"channels": list(channels), "spatial_softmax": spatial_softmax, "frames": frames}
+            options |= {"activation": activation, "recurrent": recurrent}
+            self.shape |= options | {"hidden": layer_sizes(hidden)}
+            network = picture_network(nobs, nact, hidden, pictures=pictures, generator=generator, **options)
         elif network is None:
             self.shape |= {"hidden": layer_sizes(hidden), "activation": activation}
             # make initial mean actions near zero (as in mjrl)

@@ -49,10 +49,10 @@ class PolicyMirror(nn.Module):
         """
         image = self.obs(obs)
         if obs.is_cuda and torch.is_grad_enabled():  # one call is faster, but may round images differently
-            own, mirrored = function(torch.cat([obs, image])).chunk(2)
+            actions, mirrored = function(torch.cat([obs, image])).chunk(2)
         else:
-            own, mirrored = function(obs), function(image)
-        return 0.5 * (own + self.action(mirrored))
+            actions, mirrored = function(obs), function(image)
+        return 0.5 * (actions + self.action(mirrored))
 
 
 def reflections(env: Env, *, group: str = "policy") -> dict[str, Reflection]:

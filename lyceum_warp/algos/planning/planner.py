@@ -178,8 +178,8 @@ class Planner:
 
     def _make_worlds(self, task: type[Task], options: EnvOptions, params: Mapping[str, Any]) -> None:
         nworld = self.plants * self.samples * self.config.models
-        own = {"nworld": nworld, "autoreset": False, "horizon": 0, "cameras": ()}
-        self.env = Env(task, options.changed(own), params)
+        changes = {"nworld": nworld, "autoreset": False, "horizon": 0, "cameras": ()}
+        self.env = Env(task, options.changed(changes), params)
         names, parts = self._random_fields(), self.env.state_space.parts
         self.env.reset()
         self.timestep, self.between = self.env.timestep, self.config.between
