@@ -76,10 +76,10 @@ class OptionFlags:
             default = vars(cls).get(name)
             setattr(cls, name, default)
             kinds = (hint, *typing.get_args(hint))
-            words = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
-            flag = hint if name in declared else (str if words else hint) | None
+            choices = [word for kind in kinds if typing.get_origin(kind) is Literal for word in typing.get_args(kind)]
+            flag = hint if name in declared else (str if choices else hint) | None
             text = tyro.conf.arg(
-                metavar="|".join(words) or None,
+                metavar="|".join(choices) or None,
                 help=" ".join(docs.get(name, "").split()),
                 help_behavior_hint=defaults.get(name, "") if default is None else None,
             )
@@ -167,17 +167,17 @@ def parameter(text: str) -> tuple[str, Any]:
     return name, values[0] if len(values) == 1 else values
 
 
-def video_camera(words: Sequence[str]) -> "str | viz.FreeCamera | None":
+def video_camera(arguments: Sequence[str]) -> "str | viz.FreeCamera | None":
     """Parse the camera of a video: nothing, a name, an index, or parts of a free camera's pose as NAME=VALUE."""
-    if len(words) < 2 and "=" not in "".join(words):
-        return words[0] if words else None
+    if len(arguments) < 2 and "=" not in "".join(arguments):
+        return arguments[0] if arguments else None
     pose: dict[str, Any] = {}
-    for word in words:
-        name, _, value = word.partition("=")
+    for argument in arguments:
+        name, _, value = argument.partition("=")
         if name not in viz.FreeCamera.__dataclass_fields__:
             parts = ", ".join(f"{part}=..." for part in viz.FreeCamera.__dataclass_fields__)
-            raise ValueError(f"a camera is a name, an index, or a pose of {parts}, not {word!r}")
-        pose[name] = value if name == "track" else parameter(word)[1]
+            raise ValueError(f"a camera is a name, an index, or a pose of {parts}, not {argument!r}")
+        pose[name] = value if name == "track" else parameter(argument)[1]
     return viz.FreeCamera(**pose)
 
 
@@ -186,13 +186,13 @@ _CAMERA = re.compile(r"([^:]+)(?::(\d+)x(\d+))?(?::([a-z]+))?")
 
 def cameras(text: str) -> tuple[Camera, ...]:
     """Parse cameras, such as side:64x64,top:84x84:depth."""
-    words = text.split(",")
+    entries = text.split(",")
     parsed: list[Camera] = []
-    for word in words:
-        if (match := _CAMERA.fullmatch(word)) is None:
-            raise ValueError(f"a camera must be written as NAME, NAME:64x64 or NAME:64x64:depth, not {word!r}")
+    for entry in entries:
+        if (match := _CAMERA.fullmatch(entry)) is None:
+            raise ValueError(f"a camera must be written as NAME, NAME:64x64 or NAME:64x64:depth, not {entry!r}")
         name, width, height, kind = match.groups()
-        group = "camera" if len(words) == 1 else name if kind in (None, "rgb") else f"{name}_{kind}"
+        group = "camera" if len(entries) == 1 else name if kind in (None, "rgb") else f"{name}_{kind}"
         values: dict[str, Any] = {"width": width and int(width), "height": height and int(height), "kind": kind}
         parsed.append(Camera(name, group=group, **{key: value for key, value in values.items() if value is not None}))
     return tuple(parsed)

@@ -167,9 +167,9 @@ def _worlds(
     The function takes None, or a ``RealTimeSetting`` that overrides the flags.
     """
     planner_options = arguments.given(options.planner) | arguments.given(options.planner_physics)
-    own: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
-    own |= {"objects": planner_options.get("objects"), "cameras": planner_options.pop("cameras", None)}
-    plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **own), params)
+    env_options: dict[str, Any] = {} if options.steps is None else {"horizon": options.steps}
+    env_options |= {"objects": planner_options.get("objects"), "cameras": planner_options.pop("cameras", None)}
+    plant = Env(options.task, EnvOptions(autoreset=False, nthread=1, **env_options), params)
     if plant.horizon == 0:
         raise ValueError(f"episodes of {plant.task.name!r} have no time limit: give --steps")
     task = plant.task.definition

@@ -103,8 +103,8 @@ class View:
             if self.follow:
                 watchers.append(Follower(run, controllers["policy"]))
         elif self.mppi and self.nworld in (None, 1):  # the planner controls this world
-            own = EnvOptions(autoreset=False, nthread=1, objects=options.get("objects"), cameras=options.get("cameras"))
-            env = Env(self.what[0], own, params)
+            env_options: dict[str, Any] = {name: options.get(name) for name in ("objects", "cameras")}
+            env = Env(self.what[0], EnvOptions(autoreset=False, nthread=1, **env_options), params)
         else:
             nworld = 1 if self.nworld is None else self.nworld
             env = Env(self.what[0], EnvOptions(nworld=nworld).changed(options), params)

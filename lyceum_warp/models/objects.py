@@ -41,8 +41,8 @@ class ObjectModels:
     def __init__(self, spec: mujoco.MjSpec, objects: Objects, indices: Mapping[str, int], owner: type) -> None:
         self._objects, self._indices = objects, indices
         if (body := spec.body(objects.body)) is None:
-            known = ", ".join(body.name for body in spec.bodies[1:] if body.name)
-            raise ValueError(f"the model has no body {objects.body!r}, which lw.Objects names: it has {known}")
+            bodies = ", ".join(body.name for body in spec.bodies[1:] if body.name)
+            raise ValueError(f"the model has no body {objects.body!r}, which lw.Objects names: it has {bodies}")
         self._types = _types([objects.models[name] for name in indices])
         for geom in list(body.geoms):
             spec.delete(geom)

@@ -67,13 +67,13 @@ def curve_panels(run: Run) -> list[Panel]:
         add(RETURNS, title, unit, {_SAMPLED: sampled, _MEAN: mean})
     if not any(each.title == "return" for each in panels):  # no episode has ended yet
         add(RETURNS, "reward", "of a step", {_SAMPLED: "reward_mean"})
-    known = {field.name for field in dataclasses.fields(Iteration)} | {"samples_per_second"}
+    iteration_columns = {field.name for field in dataclasses.fields(Iteration)} | {"samples_per_second"}
     for column in rows[0]:
         name = column.removeprefix(METRIC_COLUMN)
         if column in _FAULTS:
             add(FAULTS, name.replace("_", " "), "per iteration", {"count": column})
         elif name == column:
-            if column not in known and "/" not in column and not column.startswith("time_"):
+            if column not in iteration_columns and "/" not in column and not column.startswith("time_"):
                 add(LEARNING, name.replace("_", " "), "", {"value": column})
         elif name in weights:
             add(TERMS, name, f"weight {weights[name]:g}, sum of an episode", {"term": column})

@@ -34,10 +34,10 @@ class _Tester:
     """A subprocess that tests policies of a run, one at a time."""
 
     def __init__(self, folder: Path, nthread: int) -> None:
-        words = [sys.executable, "-m", "lyceum_warp.training.gating", str(folder), str(nthread)]
+        command = [sys.executable, "-m", "lyceum_warp.training.gating", str(folder), str(nthread)]
         # in a session of its own, because Ctrl-C must not end the test before the run
         self._process = subprocess.Popen(
-            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
         self.busy = False
 

@@ -58,8 +58,8 @@ def describe(learner: Learner) -> dict[str, Any]:
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     task = env.task.definition
     weights = {name: float(env.given_params.get(name, weight)) for name, weight in task.rewards.items()}
-    own = type(getattr(learner.policy, "network", None))
-    network = {} if not (files := [*class_sources(own)]) else {"network": f"{files[0]}:{own.__name__}"}
+    cls = type(getattr(learner.policy, "network", None))
+    network = {} if not (files := [*class_sources(cls)]) else {"network": f"{files[0]}:{cls.__name__}"}
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.definition),
