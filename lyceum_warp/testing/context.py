@@ -51,17 +51,17 @@ class Context:
         if not bool(holds):
             self.fail(problem)
 
-    def equal(self, found: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
+    def equal(self, actual: torch.Tensor, wanted: torch.Tensor, what: str) -> None:
         """Fail unless two tensors have the same shape and type, and are equal bit for bit (NaN equals NaN)."""
-        if found.shape != wanted.shape or found.dtype != wanted.dtype:
-            self.fail(f"{what}: {found.dtype} {tuple(found.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
-        differ = ~((found == wanted) | ((found != found) & (wanted != wanted)))
+        if actual.shape != wanted.shape or actual.dtype != wanted.dtype:
+            self.fail(f"{what}: {actual.dtype} {tuple(actual.shape)} instead of {wanted.dtype} {tuple(wanted.shape)}")
+        differ = ~((actual == wanted) | ((actual != actual) & (wanted != wanted)))
         if differ.any():
             first = tuple(differ.nonzero()[0].tolist())
-            axis = next((i for i, size in enumerate(found.shape) if size == self.a.nworld), None)
+            axis = next((i for i, size in enumerate(actual.shape) if size == self.a.nworld), None)
             self.fail(
                 f"{what}: {int(differ.sum())} of {differ.numel()} values differ, the first at {first}: "
-                f"{found[first].item()!r} instead of {wanted[first].item()!r}",
+                f"{actual[first].item()!r} instead of {wanted[first].item()!r}",
                 world=0 if axis is None else first[axis],
             )
 
@@ -98,19 +98,19 @@ class Context:
 
     def run(self, env: Env, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         """Apply actions, and return the states and results of all steps, (steps, nworld, ...)."""
-        kept: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
+        series: dict[str, list[torch.Tensor]] = {name: [] for name in ("state", "calm", *OUTCOMES)}
         for action in actions:
             env.step(action)
-            kept["state"].append(env.get_state())
-            kept["calm"].append(self.calm(env))
+            series["state"].append(env.get_state())
+            series["calm"].append(self.calm(env))
             for name in OUTCOMES:
-                kept[name].append(getattr(env, name).clone())
-        return {name: torch.stack(values) for name, values in kept.items()}
+                series[name].append(getattr(env, name).clone())
+        return {name: torch.stack(values) for name, values in series.items()}
 
-    def same_runs(self, found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
+    def same_runs(self, actual: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], what: str) -> None:
         """Fail unless two results of ``run`` are equal bit for bit."""
         for name in wanted:
-            self.equal(found[name], wanted[name], f"{name} {what} (step, world, ...)")
+            self.equal(actual[name], wanted[name], f"{name} {what} (step, world, ...)")
 
     def same_worlds(self, mask: torch.Tensor, what: str) -> None:
         """Fail unless the results and the states of selected worlds are equal in both environments."""
@@ -121,16 +121,16 @@ class Context:
     @contextlib.contextmanager
     def changed(self, *envs: Env, **choices: Any) -> Iterator[None]:
         """Change ``horizon``, ``autoreset`` or ``graphs`` of environments until the context exits."""
-        kept: list[Any] = [
+        settings: list[Any] = [
             {"horizon": env.horizon, "autoreset": env.autoreset, "graphs": env.worlds.programs.graphs.enabled}
             for env in envs
         ]
         try:
-            for env, values in zip(envs, kept, strict=True):
+            for env, values in zip(envs, settings, strict=True):
                 env.worlds.configure(**(values | choices))
             yield
         finally:
-            for env, values in zip(envs, kept, strict=True):
+            for env, values in zip(envs, settings, strict=True):
                 env.worlds.configure(**values)
 
     def buffers(self, env: Env) -> dict[str, torch.Tensor]:

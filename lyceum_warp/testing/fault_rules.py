@@ -27,8 +27,8 @@ def _check_fault(ctx: Context, part: str, value: float) -> None:
         a.set_state(state, ctx.mask(bad), check=False)
     a.step()
     b.step()
-    found = Done(int(a.done_reason[bad]))
-    ctx.that(reason in found, f"{what}: done_reason is {found!r}")
+    reasons = Done(int(a.done_reason[bad]))
+    ctx.that(reason in reasons, f"{what}: done_reason is {reasons!r}")
     ended = a.truncated[bad] and a.done[bad] and not a.terminated[bad]
     ctx.that(ended, f"{what}: truncated is {a.truncated.tolist()}, terminated {a.terminated.tolist()}")
     ctx.that(a.reward[bad] == 0, f"{what}: the reward is {a.reward[bad].item()}")
@@ -99,9 +99,9 @@ def check_not_finite(ctx: Context) -> None:
     names = [name for name, value in params.items() if isinstance(value, float) and np.isfinite(value)]
     with ctx.changed(a, b, graphs=False):  # graphs would be captured again for each of these parameters
         for name in names:
-            kept = a.task.params[name]
+            nominal = a.task.params[name]
             ctx.restart()
-            a.set_params(**{name: np.array([extremes.get(world, kept) for world in range(a.nworld)])})
+            a.set_params(**{name: np.array([extremes.get(world, nominal) for world in range(a.nworld)])})
             try:
                 for i, action in enumerate(actions):
                     good = a.obs.clone()
@@ -118,4 +118,4 @@ def check_not_finite(ctx: Context) -> None:
                             ctx.that(extreme < 1e10, f"{key} is {extreme} {what}")
                     ctx.same_worlds(others, f"other worlds with extreme {name}, step {i}")
             finally:
-                a.set_params(**{name: kept})
+                a.set_params(**{name: nominal})

@@ -68,11 +68,11 @@ def check_substep(ctx: Context) -> None:
                 b.engine.step(1)
                 launch_worlds(substep, b.nworld, [b.worlds.after, b.worlds.params], b.device)
             b.worlds.advance_memory()
-            found = b.get_state()
+            result = b.get_state()
             for name, columns in memory.items():
-                ctx.equal(wanted[calm][:, columns], found[calm][:, columns], f"the {name} of step {i}, by substeps")
+                ctx.equal(wanted[calm][:, columns], result[calm][:, columns], f"the {name} of step {i}, by substeps")
             start(state, action)
             b.engine.step(a.task.frame_skip)
-            found = b.get_state()[:, : a.engine.integration_size]
+            result = b.get_state()[:, : a.engine.integration_size]
             wanted = wanted[:, : a.engine.integration_size]
-            ctx.equal(found[calm], wanted[calm], f"the physics of step {i} without substeps")
+            ctx.equal(result[calm], wanted[calm], f"the physics of step {i} without substeps")

@@ -70,9 +70,9 @@ def closer(
     ctx: Context, state: torch.Tensor, wanted: np.ndarray, without: np.ndarray, mask: torch.Tensor, what: str
 ) -> None:
     """Fail if ``qpos`` of a selected world is nearer to the values ``without`` than to the values ``wanted``."""
-    found = state[:, ctx.a.state_space.parts["qpos"]].cpu().numpy()
+    qpos = state[:, ctx.a.state_space.parts["qpos"]].cpu().numpy()
     effect = np.abs(wanted - without).max(axis=1)
-    error = np.abs(found - wanted).max(axis=1)
+    error = np.abs(qpos - wanted).max(axis=1)
     wrong = (effect > _SMALLEST) & (error > 0.5 * effect) & mask.cpu().numpy()
     ctx.that(
         not wrong.any(),

@@ -54,11 +54,11 @@ def check_masked_restoring(ctx: Context) -> None:
     for name, values in ctx.buffers(a).items():
         ctx.equal(values[~mask], before[name][~mask], f"{name} of worlds outside the mask (world, ...)")
     ctx.equal(a.get_state()[mask], state[mask], "the state of masked worlds")
-    found = ctx.run(a, torch.where(mask[None, :, None], early, late))
+    second = ctx.run(a, torch.where(mask[None, :, None], early, late))
     undisturbed = ctx.run(b, torch.where(mask[None, :, None], early, late))
-    for name in found:
-        ctx.equal(found[name][:, mask], first[name][:, mask], f"{name} of the restored worlds")
-        ctx.equal(found[name][:, ~mask], undisturbed[name][:, ~mask], f"{name} of the other worlds")
+    for name in second:
+        ctx.equal(second[name][:, mask], first[name][:, mask], f"{name} of the restored worlds")
+        ctx.equal(second[name][:, ~mask], undisturbed[name][:, ~mask], f"{name} of the other worlds")
 
 
 def check_set_state_shows(ctx: Context) -> None:
@@ -71,10 +71,10 @@ def check_set_state_shows(ctx: Context) -> None:
             a.step(action)
             state, shown, calm = a.get_state(), ctx.buffers(a), ctx.calm(a)
             b.set_state(state)
-            found = ctx.buffers(b)
+            buffers = ctx.buffers(b)
             for name in shown:
                 if name in ("obs", "time", "state") or name.startswith("field "):
-                    ctx.equal(found[name], shown[name], f"{name} after set_state")
+                    ctx.equal(buffers[name], shown[name], f"{name} after set_state")
             ctx.equal(b.final_obs, a.obs, "final_obs after set_state")
             ctx.equal(b.success[calm], a.success[calm], "success after set_state")
             if has_evaluate:
@@ -235,12 +235,12 @@ def check_keyframe(ctx: Context) -> None:
     env.engine.reset(env.worlds.everyone)
     state = env.get_state()
     env.rand_reset(ctx.seed)
-    given = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act, "ctrl": key.ctrl, "mocap_pos": key.mpos}
-    for part, values in given.items():
+    parts = {"qpos": key.qpos, "qvel": key.qvel, "act": key.act, "ctrl": key.ctrl, "mocap_pos": key.mpos}
+    for part, values in parts.items():
         if part in env.state_space.parts:
             wanted = torch.as_tensor(np.asarray(values).ravel().astype(np.float32), device=state.device).double()
-            found = state[:, env.state_space.parts[part]]
-            ctx.equal(found.float(), wanted.float().expand_as(found).contiguous(), f"{part} of the keyframe {name!r}")
+            rows = state[:, env.state_space.parts[part]]
+            ctx.equal(rows.float(), wanted.float().expand_as(rows).contiguous(), f"{part} of the keyframe {name!r}")
 
 
 def check_graphs(ctx: Context) -> None:
