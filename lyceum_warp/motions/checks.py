@@ -9,9 +9,14 @@ from lyceum_warp.motions.rotations import rotate
 _SAME = 0.02
 """Distance in m below which a stored body is where the model puts it. Revisions of the G1 differ by 1 cm."""
 
-_SINK, _SLIP, _CONTACT, _BEYOND = 0.02, 0.3, 0.01, 0.02
-"""What is reported: depth below the ground in m, mean speed of contacts in m/s, height in m below which a point is in
-contact, and distance beyond a joint's limit in rad."""
+_SINK = 0.02
+"""Depth in m below the ground that is reported."""
+_SLIP = 0.3
+"""Mean speed of contacts in m/s that is reported."""
+_CONTACT = 0.01
+"""Height in m below which a point is in contact."""
+_BEYOND = 0.02
+"""Distance in rad beyond a joint's limit that is reported."""
 
 
 def check_bodies(model: mujoco.MjModel, stored: np.ndarray, positions: np.ndarray, names: list[str] | None) -> None:
