@@ -299,14 +299,14 @@ def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, 
     iterations, nworld, _ = case.training
     feet = task_spec(find_task("go1_velocity")).geom("FR_foot").friction
     same = dict(zip(("sliding_friction", "spinning_friction", "rolling_friction"), ([f, f] for f in feet), strict=True))
-    known: dict[str, Any] = {"trunk_offset": [0.0, 0.0, 0.0]}
-    params_of: dict[str, Any] = {"fit": known, "wide": {}, "nominal": known | same | {"encoder_bias": 0.0}}
+    trunk: dict[str, Any] = {"trunk_offset": [0.0, 0.0, 0.0]}
+    params_of: dict[str, Any] = {"fit": trunk, "wide": {}, "nominal": trunk | same | {"encoder_bias": 0.0}}
     began = time.perf_counter()
     if case.contestant == "fit":
         plant = Plant("go1", case.seed, ground=True, kind=case.plant)
         folder = options.fits / f"go1-{case.seed}"
         lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **settings)
-        params_of["fit"] = known | {"fitted": folder, "fitted_draws": True}
+        params_of["fit"] = trunk | {"fitted": folder, "fitted_draws": True}
     fitted = time.perf_counter()
     env = lw.make(
         "go1_velocity",
@@ -322,7 +322,7 @@ def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, 
     learned = time.perf_counter()
     actor = learner.policy.to("cpu")
     seeds = [case.seed] if case.contestant == "fit" else range(1 if options.short else PLANTS)
-    judged = {f"{seed}": judge(actor, seed, case.training[2], known | same) for seed in seeds}
+    judged = {f"{seed}": judge(actor, seed, case.training[2], trunk | same) for seed in seeds}
     return {"fit_seconds": fitted - began, "training_seconds": learned - fitted, "plants": judged}
 
 
@@ -402,15 +402,15 @@ def line(case: dict[str, Any], result: dict[str, Any]) -> list[str]:
         label, contestant = settings[window], f"{contestant}, roll-outs of {window} s"
     value, low, high = (np.array(label[name]) for name in ("value", "low", "high"))
     error, covered = np.abs((value - truth) / scale), (low <= truth) & (truth <= high)
-    known, wall, cpu = np.array(result.get("fisher", [])) < 0.02, label["wall_seconds"], label["cpu_seconds"]
+    precise, wall, cpu = np.array(result.get("fisher", [])) < 0.02, label["wall_seconds"], label["cpu_seconds"]
     return [
         case["plant"], str(case["seed"]), contestant, f"{case['seconds']:g}", f"{wall:.0f}" if cpu > 0.9 * wall else "",
         f"{cpu:.0f}", f"{error.max():.1%}", f"{np.median(error):.2%}",
         f"{(error < 0.02).sum()} of {len(error)}",
-        *([str(known.sum()), str((error[known] < 0.02).sum()), str((~np.array(result["determined"])).sum())]
-          if len(known) else [""] * 3),
+        *([str(precise.sum()), str((error[precise] < 0.02).sum()), str((~np.array(result["determined"])).sum())]
+          if len(precise) else [""] * 3),
         f"{np.median(0.5 * (high - low) / scale):.2%}", f"{covered.sum()} of {len(covered)}",
-        *(f"{number:.2f}" for number in result.get("held_out", ())), *([] if len(known) else [""] * 2),
+        *(f"{number:.2f}" for number in result.get("held_out", ())), *([] if len(precise) else [""] * 2),
     ]  # fmt: skip
 
 

@@ -216,7 +216,7 @@ def cases(options: Options) -> list[Any]:
         if "kills" in parts and not cuda:
             kills = (1, 4.0) if short else (20, options.kill_every)
             trainings = SHORT_TRAININGS if short else TRAININGS
-            cases += [Kills("point_mass", words, *kills, seed) for words in trainings]
+            cases += [Kills("point_mass", arguments, *kills, seed) for arguments in trainings]
     if "memory" in parts:
         cases.append(Memory("hopper", 10 if short else 100, 32, options.engine, options.device))
     return cases
@@ -248,8 +248,8 @@ def variant(task: str, work: Path) -> tuple[str, torch.Tensor, torch.Tensor]:
     functions, nact = source_task.functions, plain.action.shape[1]
     file = Path(sys.modules[parent.__module__].__file__ or "")
     source = file.read_text().replace("@lw.register\n", "")
-    own_model = r'"(\w+\.xml)"'  # the model's path is relative to the task's file
-    source = re.sub(own_model, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
+    pattern = r'"(\w+\.xml)"'  # the model's path is relative to the task's file
+    source = re.sub(pattern, lambda m: repr(str(path)) if (path := file.parent / m[1]).exists() else m[0], source)
     fields = [f"    {name}: Row[float]\n" for name in ("userdata", "body_mass") if name not in source_task.world.vars]
     source = source.replace("class World:\n", "".join(["class World:\n", *fields]), 1)
     noisy = functions["observe"] is not None and len(functions["observe"].input_types) > 3

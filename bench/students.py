@@ -120,13 +120,13 @@ def demonstrations(count: int) -> tuple[lw.Demonstrations, list[float]]:
 
 
 def clone(case: Case, short: bool) -> dict[str, Any]:
-    teacher, returns = demonstrations(4 if short else 50)
+    teacher, teacher_returns = demonstrations(4 if short else 50)
     env = lw.make("hopper", nworld=case.nworld, device=case.device, seed=case.seed)
     config = lw.DistillConfig(hidden=(64, 64), mean_every=0)
     learner = lw.Distill(env, config=config, teacher=teacher, seed=case.seed)
     result = learned(learner, case)
-    own = returns_of("hopper", learner.policy, 4 if short else 50)
-    return result | {"returns": own, "teacher_returns": returns}
+    returns = returns_of("hopper", learner.policy, 4 if short else 50)
+    return result | {"returns": returns, "teacher_returns": teacher_returns}
 
 
 def returns_of(task: Any, policy: torch.nn.Module, episodes: int) -> list[float]:
@@ -135,7 +135,7 @@ def returns_of(task: Any, policy: torch.nn.Module, episodes: int) -> list[float]
 
 
 def tables(rows: Sequence[Row]) -> list[Table]:
-    found = []
+    sections = []
     for part, title, header in (
         ("go1", "A Go1 without its linear velocity, taught by the pretrained Go1: the gate of the task.",
          ["student", "seed", "worlds", "iterations", "s", "gate", "falls", "velocity error, m/s", "with pushes"]),
@@ -151,8 +151,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
             start = [case["contestant"], str(case["seed"]), *(trained if result["samples"] else 3 * [""])]
             lines.append([*start, *values(result)])
         if lines:
-            found.append(Table(title, header, lines))
-    return found
+            sections.append(Table(title, header, lines))
+    return sections
 
 
 def values(result: dict[str, Any]) -> list[str]:

@@ -283,12 +283,12 @@ def commands(numbers: Numbers, *, task: str, engine: str, device: str, iteration
                 numbers.add(f"{run}/{name}", torch.load(Path(run, name), map_location="cpu", weights_only=True))
 
 
-def command(*words: str) -> None:
-    program = [sys.executable, "-P", "-m", "lyceum_warp.cli", *words]
+def command(*arguments: str) -> None:
+    program = [sys.executable, "-P", "-m", "lyceum_warp.cli", *arguments]
     done = subprocess.run(program, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
     if done.returncode:
         last = " ".join(done.stderr.split("\n")[-4:]).strip()
-        raise RuntimeError(f"lyceum-warp {' '.join(words)} ended with {done.returncode}: {last}")
+        raise RuntimeError(f"lyceum-warp {' '.join(arguments)} ended with {done.returncode}: {last}")
 
 
 PARTS = {"env": environment, "plans": plans, "learners": learning, "commands": commands}
