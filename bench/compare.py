@@ -95,7 +95,7 @@ class Unit:
 
 
 @dataclasses.dataclass(frozen=True)
-class Difference:
+class Mismatch:
     """A difference between two arrays of the same name, or a failure of a checkout."""
 
     name: str
@@ -111,12 +111,12 @@ def unequal(old: np.ndarray, new: np.ndarray) -> np.ndarray:
     return (rows[0] != rows[1]).any(axis=1)
 
 
-def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Difference | None:
+def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] = ()) -> Mismatch | None:
     if old.dtype.kind == new.dtype.kind == "U" and old.shape == new.shape:  # the dtype of a string contains its length
         longer = max(old.dtype, new.dtype)
         old, new = old.astype(longer), new.astype(longer)
     if (old.dtype, old.shape) != (new.dtype, new.shape):
-        return Difference(name, f"{old.dtype} {old.shape} -> {new.dtype} {new.shape}")
+        return Mismatch(name, f"{old.dtype} {old.shape} -> {new.dtype} {new.shape}")
     if not old.size or not (which := unequal(old, new)).any():
         return None
     place = np.unravel_index(int(which.argmax()), old.shape)
@@ -129,19 +129,19 @@ def difference(name: str, old: np.ndarray, new: np.ndarray, axes: Sequence[str] 
         with np.errstate(all="ignore"):
             gaps = np.abs(new.astype(np.float64) - old.astype(np.float64)).reshape(-1)[which]
         text += f"; max |difference| {gaps.max():.6g}; {which.sum():,} of {old.size:,} differ"
-    return Difference(name, text)
+    return Mismatch(name, text)
 
 
 def differences(
     unit: str, old: Mapping[str, np.ndarray], new: Mapping[str, np.ndarray], axes: Mapping[str, Sequence[str]]
-) -> Iterator[Difference]:
+) -> Iterator[Mismatch]:
     names = [*old, *(name for name in new if name not in old)]
     for name in names:
         path = f"{unit}/{name}"
         if name not in new:
-            yield Difference(path, f"removed: {old[name].dtype} {old[name].shape}")
+            yield Mismatch(path, f"removed: {old[name].dtype} {old[name].shape}")
         elif name not in old:
-            yield Difference(path, f"added: {new[name].dtype} {new[name].shape}")
+            yield Mismatch(path, f"added: {new[name].dtype} {new[name].shape}")
         elif (change := difference(path, old[name], new[name], axes.get(name, ()))) is not None:
             yield change
 
@@ -262,7 +262,7 @@ def units(options: Options, tasks: Sequence[str], learners: Sequence[str]) -> It
 @dataclasses.dataclass
 class Report:
     ignore: Sequence[str]
-    differences: list[Difference] = dataclasses.field(default_factory=list)
+    differences: list[Mismatch] = dataclasses.field(default_factory=list)
     skipped: list[str] = dataclasses.field(default_factory=list)
     """Names of the units whose models are missing."""
     differing: int = 0
@@ -276,7 +276,7 @@ class Report:
             return False
         return True
 
-    def add(self, name: str, differences: Sequence[Difference], seconds: float = 0.0, arrays: int = 0) -> None:
+    def add(self, name: str, differences: Sequence[Mismatch], seconds: float = 0.0, arrays: int = 0) -> None:
         """Add the differences found in a unit of work, and print them."""
         self.differences += differences
         self.differing += bool(differences)
@@ -290,12 +290,12 @@ class Report:
             print(f"    and {len(differences) - LINES} more", flush=True)
 
 
-def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Difference]:
+def failures(name: str, answers: Mapping[str, Mapping[str, Any]]) -> list[Mismatch]:
     """Return a unit's failures. If both checkouts fail, this also counts as a difference."""
     failed = {side: answer["failure"] for side, answer in answers.items() if "failure" in answer}
     for failure in failed.values():
         print(failure["trace"], file=sys.stderr)
-    return [Difference(name, f"{side} failed: {failure['text']}") for side, failure in failed.items()]
+    return [Mismatch(name, f"{side} failed: {failure['text']}") for side, failure in failed.items()]
 
 
 def compare_unit(unit: Unit, sides: Sequence[Side], device: str, report: Report) -> None:
@@ -333,7 +333,7 @@ def compare(options: Options, sides: Sequence[Side], report: Report) -> None:
         if task not in old and task not in new:
             raise ValueError(f"neither checkout has a task {task!r}: there are {', '.join(sorted({*old, *new}))}")
     one_sided = [
-        Difference(f"tasks/{task}", "added" if task in new else "removed")
+        Mismatch(f"tasks/{task}", "added" if task in new else "removed")
         for task in names
         if (task in old) != (task in new) and report.selects(f"tasks/{task}")
     ]

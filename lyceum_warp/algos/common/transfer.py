@@ -20,7 +20,7 @@ EXACT = "exact"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Difference:
+class PairedDifference:
     """A quantity's means in two simulations, and the difference of the means with a 95 % confidence interval."""
 
     quantity: str
@@ -67,7 +67,7 @@ class Comparison:
     """Name of the second simulation, such as "Warp engine on cuda:0" or "coarse physics"."""
     faults: tuple[int, int]
     """Number of faults in each simulation."""
-    differences: tuple[Difference, ...]
+    differences: tuple[PairedDifference, ...]
     """Differences of returns, of lengths and of the fraction of failures. A failure is a terminated episode. If the
     task never terminates episodes, it is an episode that is clearly worse than the other one of its pair."""
 
@@ -240,16 +240,16 @@ def _compared(
     return Comparison(first=first, second=second, faults=(faults, other_faults), differences=(returns, lengths, shares))
 
 
-def _mean_difference(quantity: str, first: np.ndarray, second: np.ndarray, margin: float) -> Difference:
+def _mean_difference(quantity: str, first: np.ndarray, second: np.ndarray, margin: float) -> PairedDifference:
     mean, half = mean_interval(second - first)
     return _difference(quantity, first, second, (mean - half, mean + half), margin * np.abs(first).mean())
 
 
 def _difference(
     quantity: str, first: np.ndarray, second: np.ndarray, interval: tuple[float, float], margin: float
-) -> Difference:
+) -> PairedDifference:
     low, high = interval
-    return Difference(
+    return PairedDifference(
         quantity=quantity, first=float(first.mean()), second=float(second.mean()), low=low, high=high,
         margin=float(margin),
     )  # fmt: skip

@@ -81,8 +81,8 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
     fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics, collision_driver=driver)
     inner = _copy("_forward", fwd_position=fwd_position)
     forward = _copy("forward", _forward=inner)
-    stage = _without(frozenset())["_forward"] if done else inner
-    step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=stage))
+    runge_kutta_forward = _without(frozenset())["_forward"] if done else inner
+    step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=runge_kutta_forward))
     return {"fwd_position": fwd_position, "_forward": inner, "forward": forward, "step": step}
 
 

@@ -188,7 +188,7 @@ def plan_view(controller: Any, state: torch.Tensor) -> PlanView | None:
 Control = PolicyControl | WorldControl
 
 
-def controls(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
+def controls_by_name(controllers: Mapping[str, Any], env: Env) -> dict[str, Control]:
     """Check controllers. A policy takes one argument, and a controller of one world takes two.
 
     Raises:

@@ -16,7 +16,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.support.validate import check_kind, whole_number
 from lyceum_warp.viewer.protocol import Frame, Mode, Owner, Scene, Status
 from lyceum_warp.viewer.session import live_settings
-from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls
+from lyceum_warp.viewer.session.drivers import Control, WorldControl, controls_by_name
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.frames import FrameMaker, model_bytes
 from lyceum_warp.viewer.session.live import PLANT_HISTORY_BYTES, Live
@@ -46,7 +46,7 @@ class Stage:
     ) -> None:
         check_kind("env", env, Env, "as lw.make('hopper') returns it")
         self.env = env
-        self.controllers = controls(controllers or {}, env)
+        self.controllers = controls_by_name(controllers or {}, env)
         self.playback = Playback([] if episodes is None else episodes_of(episodes, env))
         if seed is not None:
             env.rand_reset(whole_number("seed", seed, low=0))

@@ -5,7 +5,7 @@ from conftest import SharedEnv
 
 import lyceum_warp as lw
 from lyceum_warp.algos import task_physics
-from lyceum_warp.algos.common.transfer import Comparison, Difference, Episodes, _compared
+from lyceum_warp.algos.common.transfer import Comparison, Episodes, PairedDifference, _compared
 from lyceum_warp.tasks import hopper
 
 
@@ -54,7 +54,7 @@ def test_each_set_of_physics_options_is_compared_with_exact_physics() -> None:
      (-3.0, 3.0, "not shown"), (-2.0, -1.1, "different")],
 )  # fmt: skip
 def test_verdict_compares_the_interval_with_the_margin(low: float, high: float, verdict: str) -> None:
-    assert Difference(quantity="return", first=0.0, second=0.0, low=low, high=high, margin=1.0).verdict == verdict
+    assert PairedDifference(quantity="return", first=0.0, second=0.0, low=low, high=high, margin=1.0).verdict == verdict
 
 
 def comparison(first: np.ndarray, second: np.ndarray) -> Comparison:
