@@ -68,7 +68,7 @@ class Hyperparameters(arguments.OptionFlags, options=[*_CONFIGS.values()], defau
                     f"--{name.replace('_', '-')} is a setting of {' or '.join(algorithms)}, not of {algorithm}: "
                     f"omit it, or give --algorithm {' or '.join(algorithms)}"
                 )
-        return config if kind is None else dataclasses.replace(config or kind(), **flags)
+        return dataclasses.replace(config or kind(), **flags) if algorithm in training.ALGORITHMS else config
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -351,6 +351,9 @@ class Train:
         if source is None or self.task is None or binding.task_name(binding.find_task(self.task)) == source.task_name:
             params = {**base.params, **params}
         hyperparameters = base.hyperparameters if algorithm == base.algorithm else None
+        kind, settings = training.learner_classes(algorithm)
+        if source is not None and settings is not None and kind.algorithm in source.config:
+            hyperparameters = settings(**source.config[kind.algorithm])
         return dataclasses.replace(
             base,
             **self._given("task", "threads", "iterations", "network"),
@@ -415,13 +418,13 @@ class Train:
         learner = configuration.learner(team, run=source, networks=(policy, value), teacher=teacher, task=self.task)
         if parts is not None:
             group = getattr(learner, "group", "policy")
-            if parts != (known := learner.env.obs_spaces[group].parts):
+            if parts != (expected := learner.env.obs_spaces[group].parts):
                 raise ValueError(
                     f"the teacher's observations are {', '.join(parts)}, but the group {group!r} of the task "
-                    f"{learner.env.task.name!r} has {', '.join(known)}: the parts and their sizes must be the same"
+                    f"{learner.env.task.name!r} has {', '.join(expected)}: the parts and their sizes must be the same"
                 )
-            words = [self.teacher] if self.teacher else list(map(str, self.demonstrations or ()))
-            entries["teacher"] = [str(Path(word).resolve()) if Path(word).exists() else word for word in words]
+            sources = [self.teacher] if self.teacher else list(map(str, self.demonstrations or ()))
+            entries["teacher"] = [str(Path(word).resolve()) if Path(word).exists() else word for word in sources]
         if policy is not None:
             fitted = type(learner.config)(**learner.settings())
             for name, value in arguments.given(self.hyperparameters).items():

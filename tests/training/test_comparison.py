@@ -117,6 +117,9 @@ def test_commands_take_classes_from_a_file(tmp_path: Path, capsys: pytest.Captur
         assert cli.main([*words, "--out", str(out), "--iterations", total]) == 0
     run = Run.open(out)
     assert run.config["idle"] == {"noise": 0.3} and [row["mean_return"] for row in run.rows()] == [0.3] * 3
+    run.amend(idle={"noise": 0.5})  # as a run made in Python has it
+    assert cli.main([*words, "--out", str(out), "--iterations", "4"]) == 0
+    assert run.rows()[-1]["mean_return"] == 0.5
     assert cli.main([*words, *TINY[:2], "--out", str(tmp_path / "x")]) == 2
     assert cli.main([*words[:3], f"{file}:Mean", "--out", str(tmp_path / "x")]) == 2
     assert "mine.py:Mean is not a subclass of Learner" in capsys.readouterr().err

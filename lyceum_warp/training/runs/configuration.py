@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,8 @@ ALGORITHMS: dict[str, tuple[Any, Any]] = {
 def learner_classes(algorithm: str) -> tuple[Any, Any]:
     """Return the classes of an algorithm and of its hyperparameters.
 
-    The hyperparameters of a class of the user's, ``path/to/file.py:Class``, are None.
+    A class of the user's, ``path/to/file.py:Class``, has the hyperparameters that its constructor's argument ``config``
+    is annotated with, or None.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -41,7 +43,9 @@ def learner_classes(algorithm: str) -> tuple[Any, Any]:
         return ALGORITHMS[algorithm]
     if ".py:" not in algorithm:
         raise ValueError(f"there is no algorithm {algorithm!r}: use {', '.join(ALGORITHMS)} or path/to/file.py:Class")
-    return class_in_file(algorithm, Learner), None
+    kind = class_in_file(algorithm, Learner)
+    hint = typing.get_type_hints(kind.__init__).get("config")
+    return kind, next(filter(dataclasses.is_dataclass, (hint, *typing.get_args(hint))), None)
 
 
 def describe(learner: Learner) -> dict[str, Any]:
