@@ -128,14 +128,14 @@ def write_lerobot(episodes: Sequence[Trajectory], folder: str | Path, *, instruc
         "splits": {"train": f"0:{len(episodes)}"}, "features": features, "video_path": None,
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
     }  # fmt: skip
-    words = instruction or first.task
+    task = instruction or first.task
     table = pandas.DataFrame({
-        "episode_index": range(len(episodes)), "tasks": [[words]] * len(episodes), "length": lengths,
+        "episode_index": range(len(episodes)), "tasks": [[task]] * len(episodes), "length": lengths,
         "data/chunk_index": 0, "data/file_index": 0, "dataset_from_index": ends - lengths, "dataset_to_index": ends,
         "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
     })  # fmt: skip
     folder.mkdir(parents=True)
-    tasks = pandas.DataFrame({"task_index": [0]}, index=[words])
+    tasks = pandas.DataFrame({"task_index": [0]}, index=[task])
     for file, content in ((_DATA, pandas.DataFrame(frames)), (_EPISODES, table), ("meta/tasks.parquet", tasks)):
         (folder / file).parent.mkdir(parents=True, exist_ok=True)
         content.to_parquet(folder / file)

@@ -406,11 +406,12 @@ class PPO(OnPolicyLearner):
         self._losses.zero_()
         alone = self.iteration < config.value_only
         self._value_clip.fill_(math.inf if alone else config.clip)
-        before = [p.detach().clone() for p in self._acting] if alone else []
+        before = [p.detach().clone() for p in self._acting if alone]
         for _ in range(config.epochs):
             self.minibatches.epoch()
-        for parameter, old in zip(self._acting, before, strict=alone):  # it moved so that the learning rate adapts
-            parameter.detach().copy_(old)
+        if alone:  # the policy has moved, so that the learning rate adapts
+            for parameter, old in zip(self._acting, before, strict=True):
+                parameter.detach().copy_(old)
         team.copy_leader(self._parameters)
         self._apply_std()
 

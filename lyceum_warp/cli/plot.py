@@ -81,8 +81,8 @@ def _print_differences(groups: "list[training.RunGroup]") -> None:
     for k, group in enumerate(groups, 1):
         settings, versions = group.runs[0].settings, group.runs[0].versions
         # without prefixes, a hyperparameter of two algorithms is in one row
-        own = {name.removeprefix(f"{settings['algorithm']}."): value for name, value in settings.items()}
-        entries[f"{k}: {group.label}"] = {**own, **versions}
+        short_names = {name.removeprefix(f"{settings['algorithm']}."): value for name, value in settings.items()}
+        entries[f"{k}: {group.label}"] = {**short_names, **versions}
     if names := differing([*entries.values()]):
         cells = {heading: [str(each.get(name, "")) for name in names] for heading, each in entries.items()}
         console.print(table({"difference": names, **cells}))

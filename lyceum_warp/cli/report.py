@@ -26,5 +26,4 @@ class Report:
     """The file; by default report.html in the folder."""
 
     def run(self) -> None:
-        path = training.write_report(self.folder, self.out)
-        say_entries(report=path, next="open the file in a browser, or send it: it needs no other file")
+        say_entries(report=training.write_report(self.folder, self.out), next="open or send it: it needs no other file")

@@ -11,7 +11,7 @@ from lyceum_warp import core, training
 from lyceum_warp.cli.display import COLUMNS, console, known_values, say, say_entries, table_of, tried
 from lyceum_warp.cli.plot import print_groups
 
-_OWN = {"task", "seeds", "jobs", "out", "go_on", "verbose", "env", "physics", "hyperparameters"}
+_OF_THE_WHOLE = {"task", "seeds", "jobs", "out", "go_on", "verbose", "env", "physics", "hyperparameters"}
 """Fields of the command that are no options of a seed's run."""
 
 
@@ -20,9 +20,9 @@ def train_and_show(command: Any, folder: Path) -> int:
     options: dict[str, Any] = {}
     for part in (command, command.env, command.physics, command.hyperparameters):
         options |= core.given_values(part)
-    settings = {name.removesuffix("_run"): value for name, value in options.items() if name not in _OWN}
+    settings = {name.removesuffix("_run"): value for name, value in options.items() if name not in _OF_THE_WHOLE}
     seeds = command.seeds[0] if len(command.seeds) == 1 else command.seeds
-    say(f"{command.task}: runs in {folder}, each with a log; to continue, give the same command --out {folder}")
+    say(f"{command.task}: runs in {folder}, each with a log; to continue, repeat the command with --out {folder}")
     with Live(console=console, refresh_per_second=2) as live:
         runs = training.train_seeds(
             command.task, folder, seeds, jobs=command.jobs, watch=lambda runs: live.update(_progress(runs)), **settings

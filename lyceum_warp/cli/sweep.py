@@ -70,10 +70,10 @@ class Sweep:
             best = study.best_trial
         except Exception as error:  # Optuna and databases raise many types of errors
             raise ValueError(f"{self.file}: {viz.one_line(error).removeprefix('Search.__init__() ')}") from error
-        words = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
+        arguments = " ".join([search.task, *training.flag_words(best.user_attrs["settings"])])
         say_entries(
             best=f"trial {best.number}, {best.value:.6g}: {best.params}; its run is {best.user_attrs['run']}",
-            next=f"lyceum-warp train {words} --seeds 5, or lyceum-warp plot {search.out}",
+            next=f"lyceum-warp train {arguments} --seeds 5, or lyceum-warp plot {search.out}",
         )
 
 
@@ -181,10 +181,10 @@ def _objective(search: Search, trial: Any) -> float:
                 raise optuna.TrialPruned
 
     # a worker on another host, whose trial Optuna has released, has left its lock
-    words = [*["--evaluate"] * by_return, "--continue", "--take-over", "--out", str(folder)]
+    flags = [*["--evaluate"] * by_return, "--continue", "--take-over", "--out", str(folder)]
     with folder.with_suffix(".log").open("a") as log, contextlib.redirect_stdout(log):
         try:
-            code = _command(search, settings, *words).run([report] * by_return)
+            code = _command(search, settings, *flags).run([report] * by_return)
         except FloatingPointError as error:
             raise optuna.TrialPruned from error
     if code >= 128:

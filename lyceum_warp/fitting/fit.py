@@ -108,8 +108,8 @@ def fit(
     bound = Parameters(wanted, compiled, columns)
     groups, usual = _noise(data, compiled)
     windows, predictor = cut_windows(data, bound, window), Predictor(data, bound, nthread=nthread)
-    kept = len(windows) - round(held_out * len(windows))
-    problem = LeastSquares(windows.chosen(slice(kept)), predictor, groups)
+    count = len(windows) - round(held_out * len(windows))
+    problem = LeastSquares(windows.chosen(slice(count)), predictor, groups)
     report = progress or (lambda stage, iteration, cost: None)
     checkpoint = None if out is None else Path(out) / "estimate.npz"
     if resume and checkpoint is not None and checkpoint.is_file():
@@ -117,7 +117,7 @@ def fit(
     else:
         start = np.zeros(bound.size)
         if samples:
-            some = np.unique(np.linspace(0, kept - 1, 12).astype(int))
+            some = np.unique(np.linspace(0, count - 1, 12).astype(int))
             coarse = LeastSquares(problem.windows.chosen(some), predictor, {})
             start = search(coarse, 5.0 * usual, max(8, samples), seed, lambda k, cost: report("search", k, cost))
         at = problem.begin(start, usual)
@@ -129,7 +129,7 @@ def fit(
                 np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
-    held = LeastSquares(windows.chosen(slice(kept, None)), predictor, {}) if kept < len(windows) else problem
+    held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
     notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
     covariance = problem.covariance(linear)
@@ -151,17 +151,17 @@ def _fits(name: str, model: mujoco.MjModel, columns: Sequence[str]) -> bool:
 
 def _compiled(model: Any, options: Mapping[str, Any], *, hangs: bool) -> tuple[str, mujoco.MjModel, Controls | None]:
     """Compile the model of a task or a file. The last result converts a task's actions to controls."""
-    given, params = EnvOptions.split(options)
+    env_options, params = EnvOptions.split(options)
     controls: Controls | None = None
     if isinstance(model, mujoco.MjSpec | ModelFile) or str(model).lower().endswith((".xml", ".urdf", ".mjcf")):
         if params:
             raise ValueError(f"the option {min(params)!r} needs a task, and the model is a file: leave it out")
-        spec, physics = load_spec(model), given.physics
+        spec, physics = load_spec(model), env_options.physics
         name = spec.modelname
     else:
         task = find_task(model)
-        spec, physics = task_spec(task, given.model), given.physics.resolved(task.physics)
-        name, controls = task.__name__, functools.partial(_controls, task, given, params)
+        spec, physics = task_spec(task, env_options.model), env_options.physics.resolved(task.physics)
+        name, controls = task.__name__, functools.partial(_controls, task, env_options, params)
     if hangs:
         for joint in [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]:
             spec.delete(joint)
@@ -210,8 +210,8 @@ def _kind(column: Column, model: mujoco.MjModel) -> str:
         address = model.jnt_qposadr if column.field == "qpos" else model.jnt_dofadr
         joint = int(np.searchsorted(address, column.index, side="right")) - 1
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            words = {"qpos": ("position", "rotation"), "qvel": ("velocity", "angular velocity")}[column.field]
-            return f"base {words[int(column.index - address[joint] >= 3)]}"
+            parts = {"qpos": ("position", "rotation"), "qvel": ("velocity", "angular velocity")}[column.field]
+            return f"base {parts[int(column.index - address[joint] >= 3)]}"
     return column.field
 
 

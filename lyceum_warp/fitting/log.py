@@ -76,9 +76,9 @@ def read_log(source: LogSource, model: mujoco.MjModel, controls: Controls | None
     takes: list[Take] = []
     columns: tuple[Column, ...] = ()
     for name, table in _tables(source):
-        own, take = _take(name, table, model, controls)
-        if own != (columns := columns or own):
-            odd = {column.name for column in columns} ^ {column.name for column in own}
+        quantities, take = _take(name, table, model, controls)
+        if quantities != (columns := columns or quantities):
+            odd = {column.name for column in columns} ^ {column.name for column in quantities}
             raise ValueError(f"{name} measures other quantities than the first take: {', '.join(sorted(odd))}")
         takes += _cut(name, take, notes)
     if not takes:
@@ -175,10 +175,10 @@ def _take(
 
 def _places(text: str, key: str, model: mujoco.MjModel) -> tuple[str, list[int]]:
     """Find the indices in a flat field to which a column's name refers."""
-    match, known = _NAME.fullmatch(key), ("ctrl", *MEASURED)
+    match, fields = _NAME.fullmatch(key), ("ctrl", *MEASURED)
     field = match["field"] if match else key
-    if match is None or field not in known:
-        hint = did_you_mean(field, known, f"use time, {', '.join(known)}")
+    if match is None or field not in fields:
+        hint = did_you_mean(field, fields, f"use time, {', '.join(fields)}")
         hint = "a model without a task takes 'ctrl', not 'action'" if field == "action" else hint
         raise ValueError(f"{text} is unknown: {hint}")
     places = list(range(len(getattr(mujoco.MjData(model), field))))

@@ -100,17 +100,17 @@ class Parameters:
     ) -> None:
         self.nominal, self._data = model, mujoco.MjData(model)
         self._count = model.nu + len(columns)
-        known = {f"ctrl.{name}": elements(model, "ctrl", name) for name in element_names(model, "ctrl")}
-        self.actuators = {name.removeprefix("ctrl."): part.start for name, part in known.items()}
+        controls = {f"ctrl.{name}": elements(model, "ctrl", name) for name in element_names(model, "ctrl")}
+        self.actuators = {name.removeprefix("ctrl."): part.start for name, part in controls.items()}
         """Index of the first control of each actuator."""
-        self._signals = {name: range(part.start, part.stop) for name, part in known.items()} | {
+        self._signals = {name: range(part.start, part.stop) for name, part in controls.items()} | {
             name: range(model.nu + i, model.nu + i + 1) for i, name in enumerate(columns)
         }
         self.coordinates: list[Coordinate] = []
         self.touched: dict[str, set[str]] = {}
         """The names of the elements that the fit changes, by field."""
-        for given in parameters:
-            self._add(Parameter(name=given) if isinstance(given, str) else given)
+        for parameter in parameters:
+            self._add(Parameter(name=parameter) if isinstance(parameter, str) else parameter)
         if not self.coordinates:
             raise ValueError("there is nothing to fit: pass parameters, as in ['dof_damping.*', 'delay.ctrl.*']")
         names = [coordinate.name for coordinate in self.coordinates]
@@ -121,55 +121,55 @@ class Parameters:
             np.array([getattr(c, name) for c in self.coordinates]) for name in ("std", "low", "high")
         )
 
-    def _add(self, given: Parameter) -> None:
-        match = _NAME.fullmatch(given.name)
+    def _add(self, parameter: Parameter) -> None:
+        match = _NAME.fullmatch(parameter.name)
         assert match is not None
-        field, known = match["field"], (*VARYING_FIELDS, *_SERVO, *_SIGNALS, "inertia")
-        if field not in known:
-            raise ValueError(f"the parameter {given.name!r} can't be fitted: {did_you_mean(field, known)}")
-        own = {"inertia": "body_mass", "kp": "actuator_gainprm", "kd": "actuator_gainprm"}.get(field, field)
-        names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, own)
+        field, fields = match["field"], (*VARYING_FIELDS, *_SERVO, *_SIGNALS, "inertia")
+        if field not in fields:
+            raise ValueError(f"the parameter {parameter.name!r} can't be fitted: {did_you_mean(field, fields)}")
+        model_field = {"inertia": "body_mass", "kp": "actuator_gainprm", "kd": "actuator_gainprm"}.get(field, field)
+        names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, model_field)
         wanted = match["pattern"].split(",")
         for pattern in wanted:
             if not fnmatch.filter(names, pattern):
                 hint = did_you_mean(pattern, names, f"it has {', '.join(names) or 'none with names'}")
-                raise ValueError(f"the parameter {given.name!r} fits no element of the model or the log: {hint}")
+                raise ValueError(f"the parameter {parameter.name!r} fits no element of the model or the log: {hint}")
         # a wildcard for joints does not mean the free joint of a base
         base = [self.nominal.joint(j).name for j in np.flatnonzero(self.nominal.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
         hidden = set(base) - set(wanted) if field.startswith("dof_") else set()
         names = [name for name in names if name not in hidden and any(fnmatch.fnmatchcase(name, p) for p in wanted)]
-        rows = np.asarray(getattr(self.nominal, own)) if field not in _SIGNALS else np.zeros(0)
+        rows = np.asarray(getattr(self.nominal, model_field)) if field not in _SIGNALS else np.zeros(0)
         width = rows.size // max(1, len(rows))
         column = None if match["column"] is None else int(match["column"])
         if column is not None and column >= width:
-            raise ValueError(f"the parameter {given.name!r} is out of range: {field} has {width} columns")
-        apart = given.each or field == "inertia"
+            raise ValueError(f"the parameter {parameter.name!r} is out of range: {field} has {width} columns")
+        apart = parameter.each or field == "inertia"
         for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
             full = f"{field}.{label}"
             if field in _SIGNALS:
                 signals = [i for name in members for i in self._signals[name]]
-                self._append(given, full, field, *_SIGNALS[field], signals=signals)
+                self._append(parameter, full, field, *_SIGNALS[field], signals=signals)
             elif field == "inertia":
                 writes = self._writes([(name, None, 1.0) for name in _INERTIAL], members)
                 nominal = {name: getattr(self.nominal, name) for name in _INERTIAL}
                 if np.linalg.eigvalsh(_pseudo_inertia(nominal, writes[0][1][0]))[0] <= 0.0:
                     raise ValueError(f"the body {label!r} has no physical inertia: fit its body_mass, or correct it")
                 for k in range(10):
-                    self._append(given, f"{full}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
+                    self._append(parameter, f"{full}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
             else:
                 for one in range(width) if field in _SIGNED and column is None else [column]:
-                    self._add_field(given, full if one is None else f"{full}[{one}]", field, members, one)
+                    self._add_field(parameter, full if one is None else f"{full}[{one}]", field, members, one)
 
-    def _add_field(self, given: Parameter, name: str, field: str, members: list[str], column: int | None) -> None:
+    def _add_field(self, parameter: Parameter, name: str, field: str, members: list[str], column: int | None) -> None:
         with_inertia = [("body_inertia", None, 1.0)] if field == "body_mass" else []
         writes = self._writes(_SERVO.get(field, [(field, column, 1.0), *with_inertia]), members)
         if field in _SIGNED:
-            self._append(given, name, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
+            self._append(parameter, name, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
         elif any(getattr(self.nominal, field).reshape(-1)[places].any() for field, places, _ in writes):
-            self._append(given, name, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
+            self._append(parameter, name, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
         else:
             least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
-            self._append(given, name, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
+            self._append(parameter, name, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
 
     def _writes(
         self, fields: Iterable[tuple[str, int | None, float]], names: Sequence[str]
@@ -184,14 +184,18 @@ class Parameters:
             writes.append((field, rows.ravel() if column is None else rows[:, column], sign))
         return writes
 
-    def _append(self, given: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any) -> None:
-        if kind in _FACTORS and min(given.low or 1.0, given.high or 1.0) <= 0.0:
-            raise ValueError(f"the bounds of {given.name!r} are factors of the nominal value, and must be positive")
+    def _append(
+        self, parameter: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any
+    ) -> None:
+        if kind in _FACTORS and min(parameter.low or 1.0, parameter.high or 1.0) <= 0.0:
+            raise ValueError(f"the bounds of {parameter.name!r} are factors of the nominal value, and must be positive")
         into: Callable[[float], float] = np.log if kind in _FACTORS else float
-        low, high = (old if new is None else float(into(new)) for old, new in ((low, given.low), (high, given.high)))
+        low, high = (
+            old if new is None else float(into(new)) for old, new in ((low, parameter.low), (high, parameter.high))
+        )
         if not low <= 0.0 <= high or low == high:
-            raise ValueError(f"the bounds of {given.name!r} must lie around the nominal value")
-        self.coordinates.append(Coordinate(name, kind, given.prior or std, low, high, **more))
+            raise ValueError(f"the bounds of {parameter.name!r} must lie around the nominal value")
+        self.coordinates.append(Coordinate(name, kind, parameter.prior or std, low, high, **more))
 
     def values(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Compute the model fields of a hypothesis."""

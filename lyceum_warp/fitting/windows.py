@@ -230,13 +230,13 @@ class Predictor:
 
 def _quaternions(columns: Sequence[Column], model: mujoco.MjModel) -> list[list[int]]:
     """Find the columns that are whole quaternions."""
-    found = {(column.field, column.index): i for i, column in enumerate(columns)}
+    numbers = {(column.field, column.index): i for i, column in enumerate(columns)}
     joints = zip(map(mujoco.mjtJoint, model.jnt_type), model.jnt_qposadr.tolist(), strict=True)
     starts = [("qpos", address + _QUATERNION[kind]) for kind, address in joints if kind in _QUATERNION]
     sensors = np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_FRAMEQUAT)
     groups = [[(name, start + k) for k in range(4)]
               for name, start in [*starts, *(("sensordata", int(model.sensor_adr[i])) for i in sensors)]]  # fmt: skip
-    return [[found[key] for key in group] for group in groups if all(key in found for key in group)]
+    return [[numbers[key] for key in group] for group in groups if all(key in numbers for key in group)]
 
 
 def _turn(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:

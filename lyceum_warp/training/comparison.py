@@ -158,8 +158,8 @@ def group_runs(curves: Sequence[RunCurve]) -> list[RunGroup]:
     for (task, _), runs in kinds.items():
         settings = [others[0].settings for (other, _), others in kinds.items() if other == task]
         varied = [name for name in differing(settings) if all(name in each for each in settings)]
-        words = [f"{name.rpartition('.')[2]} {runs[0].settings[name]}" for name in varied or ["algorithm"]]
-        groups.append(RunGroup(task, ", ".join(words).removeprefix("algorithm "), runs))
+        differences = [f"{name.rpartition('.')[2]} {runs[0].settings[name]}" for name in varied or ["algorithm"]]
+        groups.append(RunGroup(task, ", ".join(differences).removeprefix("algorithm "), runs))
     return groups
 
 

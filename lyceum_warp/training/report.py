@@ -113,8 +113,8 @@ def _section(title: str, content: str) -> str:
 
 
 def _table(entries: Mapping[str, Any]) -> str:
-    known = {name: value for name, value in flat_settings(entries).items() if value not in (None, "")}
-    rows = (f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in known.items())
+    cells = {name: value for name, value in flat_settings(entries).items() if value not in (None, "")}
+    rows = (f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in cells.items())
     return f"<table>{''.join(rows)}</table>"
 
 

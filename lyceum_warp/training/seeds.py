@@ -1,6 +1,5 @@
 """Train a task with several seeds, each in a process of its own."""
 
-import contextlib
 import ctypes
 import dataclasses
 import os
@@ -28,11 +27,6 @@ class SeedRun:
     error: str = ""
     """The last line of a failed run's output."""
 
-    @property
-    def begun(self) -> bool:
-        """Whether the run has been saved."""
-        return (self.folder / "checkpoint.pt").exists()
-
 
 def train_seeds(
     task: str | Path,
@@ -40,7 +34,7 @@ def train_seeds(
     seeds: int | Sequence[int] = 5,
     *,
     jobs: int = 1,
-    watch: Callable[[Sequence[SeedRun]], object] | None = None,
+    watch: Callable[[Sequence[SeedRun]], object] = lambda runs: None,
     **settings: Any,
 ) -> list[SeedRun]:
     """Train a task with several seeds, as ``lyceum-warp train TASK --seeds 5`` does.
@@ -68,17 +62,17 @@ def train_seeds(
     """
     numbers = range(whole_number("seeds", seeds, low=1, high=1000)) if isinstance(seeds, int) else sorted(set(seeds))
     runs = [SeedRun(seed, Path(folder, f"seed-{whole_number('a seed', seed, low=0)}")) for seed in numbers]
-    words = [str(task), *flag_words(settings)]
+    arguments = [str(task), *flag_words(settings)]
     places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
     Path(folder).mkdir(parents=True, exist_ok=True)
     waiting, active = [*runs], dict[int, tuple[SeedRun, subprocess.Popen[bytes]]]()
     with postponed() as signals:
         while active or (waiting and not signals):
             # until a run has begun, it trains alone: what one run refuses, all others would refuse, too
-            alone = active and not any(run.begun for run in runs)
+            alone = active and not any((run.folder / "checkpoint.pt").exists() for run in runs)
             if waiting and not signals and not alone and len(active) < len(places):
                 slot = min(set(range(len(places))) - active.keys())
-                active[slot] = waiting[0], _start(waiting.pop(0), words, *places[slot])
+                active[slot] = waiting[0], _start(waiting.pop(0), arguments, *places[slot])
             time.sleep(0.2)
             for slot, (run, process) in list(active.items()):
                 if process.poll() is not None:
@@ -89,27 +83,26 @@ def train_seeds(
                     run.state = "stopped"
                 elif len(signals) > 1:
                     process.kill()
-            if watch is not None:
-                watch(runs)
+            watch(runs)
     return runs
 
 
 def flag_words(settings: Mapping[str, Any]) -> list[str]:
     """Convert options to words of the command line, such as ``hidden=(8, 8)`` to ``--hidden 8 8``."""
-    words = []
+    flags = []
     for name, value in settings.items():
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, bool):
-            words.append(flag if value else f"--no-{flag[2:]}")
+            flags.append(flag if value else f"--no-{flag[2:]}")
             continue
         if isinstance(value, Mapping):
             value = [f"{key}={','.join(map(str, _parts(part)))}" for key, part in value.items()]
         parts = _parts(value)
         if any(isinstance(part, str) for part in parts):  # the flag may be repeated
-            words += [word for part in parts for word in (flag, str(part))]
+            flags += [word for part in parts for word in (flag, str(part))]
         else:
-            words += [flag, *map(str, parts)]
-    return words
+            flags += [flag, *map(str, parts)]
+    return flags
 
 
 def _parts(value: Any) -> Sequence[Any]:
@@ -158,8 +151,8 @@ def _conclude(run: SeedRun, code: int) -> None:
         log = run.folder.with_suffix(".log")
         lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
-        if code == 2 and not run.begun:  # it was refused, and this line says everything
+        if code == 2 and not (run.folder / "checkpoint.pt").exists():  # refused: this line says everything
             log.unlink()
-            with contextlib.suppress(OSError):
-                run.folder.parent.rmdir()
+            if not any(log.parent.iterdir()):
+                log.parent.rmdir()
             raise ValueError(run.error)
