@@ -18,16 +18,17 @@ def read_task(name: str) -> dict[str, Any]:
     (obs, _), actions = binding.observation_layouts(source, params), binding.action_sizes(source, params)
     model: Any = task.model() if callable(task.model) else task.model
     file: Any = core.find_model(model, task) if isinstance(model, str | Path) else model
-    known, made_in = isinstance(file, core.ModelFile), task.__module__.rpartition(".")[2]
+    from_package, has_file = isinstance(file, core.ModelFile), isinstance(file, core.ModelFile | Path)
+    module = task.__module__.rpartition(".")[2]
     return {
         "obs": sum(obs["policy"].values()),
         "act": len(spec.actuators) if actions is None else sum(actions.values()),
         "skip": task.frame_skip,
         "dt": float(f"{spec.option.timestep * task.frame_skip:g}"),
         "horizon": task.horizon,
-        "model": _model(file) if known or isinstance(file, Path) else f"made in {made_in}.py",
+        "model": _model(file) if has_file else f"made in {module}.py",
         "about": _description(task),
-        "files": {"packages": file.packages if known else [], "install": file.install if known else ""},
+        "files": {"packages": file.packages if from_package else [], "install": file.install if from_package else ""},
     }
 
 
