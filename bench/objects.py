@@ -3,22 +3,29 @@
     lyceum-warp bench objects --device cuda
     lyceum-warp bench objects --engines mujoco --worlds 256
     lyceum-warp bench objects --short
+    lyceum-warp bench objects --policy runs/objects lyceum_warp/pretrained/leap_reorient --device cuda
 
 A paddle stirs a mesh of MyoSuite (extra "menagerie") in a tray. Each mesh collides as its convex hull. The environment
 with one object and the environment with many take turns of ten steps with the same random actions. An object that
 leaves the tray starts a new episode.
+
+With --policy, the policies of runs whose task turns an object in a hand act with all of the task's objects instead.
 """
 
 import dataclasses
 import statistics
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import contestants
 import experiment
+import gate
 import kept
+import object_policies
 from experiment import Experiment, Row, Table, choose
+from object_policies import PolicyCase
 from stirring import Stir, StirRedrawn
 
 import lyceum_warp as lw
@@ -35,6 +42,10 @@ class Options(experiment.Options):
     """Numbers of worlds."""
     blocks: int = 20
     """Turns of ten steps of each environment."""
+    policy: tuple[Path, ...] = ()
+    """Folders of runs whose policies act with each object in 50 s, on both engines; worlds are those of each object."""
+    which: str = "last"
+    """Policy of each run: last, best, or the number of a saved iteration."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +57,14 @@ class Case:
     blocks: int
 
 
-def cases(options: Options) -> list[Case]:
+def cases(options: Options) -> list[Case | PolicyCase]:
+    if options.policy:
+        return [
+            PolicyCase(folder.name, gate.digest(folder, options), engine, device, number, seed)
+            for engine in choose(options.engines, ENGINES, what="engine")
+            for folder in options.policy for number in options.worlds for seed in options.seeds or (1,)
+            for device in ("cpu" if engine == "mujoco" else options.device,)
+        ]  # fmt: skip
     usual = ENGINES if options.device == "cpu" else ENGINES[1:]
     worlds, blocks = ((8,), 1) if options.short else (options.worlds, options.blocks)
     return [
@@ -57,11 +75,16 @@ def cases(options: Options) -> list[Case]:
     ]
 
 
-def estimate(case: Case) -> float:
+def estimate(case: Case | PolicyCase) -> float:
+    if isinstance(case, PolicyCase):
+        return 10.0 * case.worlds
     return 60.0 + case.blocks * case.worlds / 256
 
 
-def measure(case: Case, options: Options) -> dict[str, Any]:
+def measure(case: Case | PolicyCase, options: Options) -> dict[str, Any]:
+    if isinstance(case, PolicyCase):
+        folder = next(folder for folder in options.policy if gate.digest(folder, options) == case.policy)
+        return object_policies.measure(case, folder, options.which)
     envs = {}
     for name, task, objects in (("one", Stir, ["apple"]), ("many", CONTESTANTS[case.contestant], None)):
         lw.make(task, engine=case.engine, device=case.device, objects=objects)  # compile kernels
@@ -96,17 +119,22 @@ def tables(rows: Sequence[Row]) -> list[Table]:
          f"{row.result['steps_per_second']['many']:,.0f}", f"{row.result['ratio']:.1%}",
          *(f"{row.result['bytes_per_world'][name] / 1e3:,.0f}" for name in ("many", "one")),
          f"{row.result['faults_per_million']:.1f}"]
-        for row in rows
+        for row in rows if "policy" not in row.case
     ]  # fmt: skip
     title = "Steps of worlds with 48 meshes, beside worlds that all hold one of them; random actions."
-    return [Table(title, header, lines)] if lines else []
+    return [Table(title, header, lines)] * bool(lines) + object_policies.tables(policy_rows(rows))
+
+
+def policy_rows(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if "policy" in row.case]
 
 
 EXPERIMENT = Experiment(
     name="objects",
     conditions="Memory is the estimate of the engine.",
-    summary="Speed and memory of worlds that hold different objects.",
+    summary="Speed and memory of worlds that hold different objects, and policies that turn them.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
+    figure=lambda rows: object_policies.figure(policy_rows(rows)),
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -34,14 +34,22 @@ class Turns(lw.Gate):
     ) -> Iterator[dict[str, float]]:
         """Yield the numbers after 10 s and after 50 s."""
         env = worlds(WORLDS, **self.params)
-        total, drops = torch.zeros(WORLDS), torch.zeros(())
-        for step in range(1, STEPS + 1):
-            env.step(act(env.obs))
-            total += env.metrics[self.metric]
-            drops += env.done.count_nonzero()
-            if env.done.any():
-                env.rand_reset(mask=env.done.clone())
-            if step == PART:
-                yield {"first": total.mean().item()}
-        hours = WORLDS * STEPS * env.timestep / 3600.0
-        yield {"drops": drops.item() / hours, self.metric: total.mean().item()}
+        total, drops = turned(env, act, self.metric, PART)
+        yield {"first": total.mean().item()}
+        later = turned(env, act, self.metric, STEPS - PART)
+        hours = STEPS * env.timestep / 3600.0
+        yield {"drops": (drops + later[1]).mean().item() / hours, self.metric: (total + later[0]).mean().item()}
+
+
+def turned(
+    env: lw.Env, act: Callable[[torch.Tensor], torch.Tensor], metric: str, steps: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sum a metric over steps, and count the drops. Both results are (nworld,). A world starts again after a drop."""
+    total, drops = torch.zeros(2, env.nworld, device=env.obs.device)
+    for _ in range(steps):
+        env.step(act(env.obs))
+        total += env.metrics[metric]
+        drops += env.done
+        if env.done.any():
+            env.rand_reset(mask=env.done.clone())
+    return total, drops
