@@ -68,8 +68,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         for row in same:
             header += [f"{row.case['run']}: goals in 50 s", "at least one", "drops per hour"]
         title = (
-            f"Policies with each object on the {engine} engine, {worlds} worlds for 50 s each, with 95 % intervals over "
-            "the worlds. An object that falls starts again. Objects held in were in training."
+            f"Policies with each object on the {engine} engine, {worlds} worlds for 50 s each, with 95 % intervals. An "
+            "object that falls starts again. Objects held in were in training."
         )
         tables.append(Table(title, header, lines))
     return tables

@@ -182,12 +182,17 @@ def test_gate_counts_goals_and_drops(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_hand_holds_other_objects(shared_env: SharedEnv) -> None:
-    env = shared_env("leap_reorient", nworld=3, objects=["apple", "hammer", "mug"], **QUIET)
-    mass = env.field("body_mass")[:, env.model.body("cube").id]
-    assert mass.unique().numel() == 3
+    names = ["apple", "cubemedium", "hammer"]
+    env = shared_env("leap_objects", nworld=3, objects=names, fields=("ximat",), **QUIET)
     for _ in range(10):
         env.step(torch.zeros_like(env.action))
     assert not env.terminated.any() and sum(env.fault_counts.values()) == 0
+    sides = env.obs[:, env.obs_space.parts["object_sides"]].unflatten(1, (3, 3))
+    apple, cube, hammer = sides.norm(dim=2)
+    assert torch.allclose(cube, torch.tensor(0.065), atol=1e-4)
+    assert apple.max() < 1.2 * apple.min() and hammer.max() > 3.0 * hammer.min()
+    axes = env.field("ximat")[:, env.model.body("cube").id].reshape(3, 3, 3).mT
+    assert torch.allclose(sides, axes * sides.norm(dim=2, keepdim=True), atol=1e-5)
 
 
 def test_world_recovers_from_nan_among_many_contacts() -> None:

@@ -10,17 +10,15 @@ JOINTS = [f"{finger}_{joint}" for finger in FINGERS for joint in ("mcp", "rot", 
 JOINTS += ["th_cmc", "th_axl", "th_mcp", "th_ipl"]
 PARAMS = {"joints": lw.joints(*JOINTS), "tips": lw.sites(*(f"{finger}_tip" for finger in (*FINGERS, "th")))}
 MODEL = lw.playground_model("manipulation/leap_hand/xmls/scene_mjx_cube.xml")
-LONGEST = {
-    "airplane": 0.171, "alarmclock": 0.126, "apple": 0.1, "binoculars": 0.142, "bowl": 0.149, "camera": 0.116,
-    "coffeemug": 0.116, "cubemedium": 0.08, "cup": 0.1, "cylindermedium": 0.08, "duck": 0.107, "elephant": 0.136,
-    "flashlight": 0.139, "gamecontroller": 0.155, "hammer": 0.182, "hand": 0.149, "lightbulb": 0.085, "mouse": 0.117,
-    "mug": 0.116, "piggybank": 0.186, "pyramidmedium": 0.107, "spheremedium": 0.08, "stamp": 0.1,
-    "stanfordbunny": 0.163, "stapler": 0.123, "teapot": 0.236, "torusmedium": 0.08, "train": 0.114, "watch": 0.083,
-    "waterbottle": 0.137,
+SCALES = {
+    "airplane": 0.589, "alarmclock": 0.759, "apple": 0.747, "binoculars": 0.71, "bowl": 0.545, "camera": 0.888,
+    "cubemedium": 0.813, "cup": 0.726, "cylindermedium": 0.812, "duck": 0.741, "elephant": 0.619, "flashlight": 0.755,
+    "gamecontroller": 0.677, "hammer": 0.511, "hand": 0.682, "lightbulb": 0.865, "mouse": 0.897, "mug": 0.632,
+    "piggybank": 0.447, "pyramidmedium": 0.813, "spheremedium": 0.838, "stamp": 0.826, "stanfordbunny": 0.537,
+    "stapler": 0.855, "teapot": 0.415, "torusmedium": 1.173, "train": 0.752, "watch": 0.977, "waterbottle": 0.769,
 }  # fmt: skip
-"""Longest side of the bounding box of MyoSuite's objects that a hand of this size can turn, m."""
-SIDE = 0.085
-"""Longest side of all objects, m."""
+"""Factors for MyoSuite's objects. The box along the principal axes then has the volume of a cube of 6.5 cm, or a
+longest side of 10.5 cm if this makes the object smaller."""
 
 
 def edit(spec: mujoco.MjSpec) -> None:
@@ -43,8 +41,23 @@ class LeapReorient(reorienting.Reorient):
     objects = lw.Objects(
         "cube",
         {
-            name: lw.myosuite_objects(name, scale=SIDE / side, density=315, maxhullvert=32)[name]
-            for name, side in LONGEST.items()
+            name: lw.myosuite_objects(name, scale=scale, mass=0.1, maxhullvert=32)[name]
+            for name, scale in SCALES.items()
         },
         condim=3,
     )
+
+
+def edit_cube(spec: mujoco.MjSpec) -> None:
+    """Leave out the cube, so that the worlds hold the objects."""
+    edit(spec)
+    for geom in list(spec.body("cube").geoms):
+        spec.delete(geom)
+
+
+@lw.register
+class LeapObjects(LeapReorient):
+    """A LEAP hand turns many objects, each world another one, to goals."""
+
+    edit_model = staticmethod(edit_cube)
+    rewards = {**LeapReorient.rewards, "drop": -100.0}

@@ -15,6 +15,7 @@ from lyceum_warp.terms import absolute_power, pose_l2  # noqa: F401
 
 @wp.struct
 class World(rotating.World):
+    body_iquat: Row[lw.quat]
     qfrc_actuator: Row[float]
     mocap_quat: Row[lw.quat]
     target: Row[float] = lw.memory("joints")  # of the servos, rad
@@ -41,11 +42,13 @@ class Policy(rotating.Policy):
     target_error: Row[float] = lw.part("joints")  # rad
     object_position: Row[wp.vec3] = lw.part()  # from the palm's site
     object_axes: Row[wp.vec3] = lw.part(2)  # relative to the goal
+    object_sides: Row[wp.vec3] = lw.part(3)  # of the box with the object's mass and inertia, m
 
 
 @wp.struct
 class Critic(rotating.Critic):
     target_error: Row[float] = lw.part("joints")
+    object_sides: Row[wp.vec3] = lw.part(3)
 
 
 @wp.func
@@ -57,6 +60,17 @@ def goal_error(turn: lw.quat, s: World, p: Params) -> lw.quat:
 @wp.func
 def angle(s: World, p: Params) -> float:  # between object and goal, rad
     return lw.quat_angle(rotation(s, p), s.mocap_quat[p.goal])
+
+
+@wp.func
+def put_sides(sides: Row[wp.vec3], turn: lw.quat, s: World, p: Params):
+    """Write three sides of the box that has the object's mass and inertia, for an orientation of the object."""
+    body = p.object[0]
+    inertia = s.body_inertia[body]
+    m = lw.quat_to_mat(lw.quat_mul(turn, s.body_iquat[body]))
+    for i in range(3):
+        square = 6.0 * (inertia[0] + inertia[1] + inertia[2] - 2.0 * inertia[i]) / s.body_mass[body]
+        sides[i] = wp.sqrt(wp.max(square, 0.0)) * wp.vec3(m[0, i], m[1, i], m[2, i])
 
 
 # actions and observations
@@ -85,7 +99,9 @@ def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
     turn = rotation(s, p)
     for i in range(4):
         turn[i] += p.object_rotation_noise * lw.normal(rng)
-    put_axes(obs.object_axes, goal_error(wp.normalize(turn), s, p))
+    turn = wp.normalize(turn)
+    put_axes(obs.object_axes, goal_error(turn, s, p))
+    put_sides(obs.object_sides, turn, s, p)
 
 
 @wp.func
@@ -94,6 +110,7 @@ def observe_critic(s: World, p: Params, obs: Critic):
     for j in range(p.joints.shape[0]):
         obs.target_error[j] = obs.joint_position[j] - s.target[j]
     put_axes(obs.object_axes, goal_error(rotation(s, p), s, p))
+    put_sides(obs.object_sides, rotation(s, p), s, p)
 
 
 # between steps
