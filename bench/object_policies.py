@@ -14,7 +14,7 @@ import lyceum_warp as lw
 from lyceum_warp.binding import find_task
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.env import Player
-from lyceum_warp.tasks.hands.gates import STEPS, turned
+from lyceum_warp.tasks.hands.gates import turned
 from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
 
@@ -26,19 +26,21 @@ class PolicyCase:
     device: str
     worlds: int
     """Worlds for each object."""
+    steps: int
     seed: int
 
 
 def measure(case: PolicyCase, folder: Path, which: str) -> dict[str, Any]:
-    """Play 50 s with the parameters of the task's gate. A world whose object falls starts again."""
+    """Play with the parameters of the task's gate. A world whose object falls starts again."""
+    torch.set_num_threads(1)
     run = lw.Run.open(folder)
     task = find_task(run.task_name)
     names = list(task.objects.models)
     options = {"engine": case.engine, "device": case.device, "objects": names, "horizon": 0}
     env = run_worlds(run, options, task.gate.params, nworld=case.worlds * len(names))
     env.rand_reset(case.seed)
-    total, drops = turned(env, Player(lw.load(run, which=which), env), task.gate.metric, STEPS)
-    hours, held = STEPS * env.timestep / 3600.0, env.field("object").flatten()
+    total, drops = turned(env, Player(lw.load(run, which=which), env), task.gate.metric, case.steps)
+    hours, held = case.steps * env.timestep / 3600.0, env.field("object").flatten()
     parts = {name: held == index for name, index in env.task.objects.items()}
     return {
         "held_in": run.config["options"].get("objects") or [],
@@ -109,9 +111,10 @@ def figure(rows: Sequence[Row]) -> Any:
                 axes.barh(places, means, height, xerr=halves, color=colour, ecolor="0.3", error_kw={"linewidth": 0.7},
                           label=f"{row.case['run']}, {word}")  # fmt: skip
     panels[0].set_yticks([place + 0.4 - height / 2 for place in range(len(seen))], list(seen), fontsize="small")
-    panels[0].invert_yaxis()
-    panels[0].set_xlabel("goals in 50 s")
-    panels[1].set_xlabel("drops per hour")
+    panels[0].set_ylim(len(seen), -0.5)
+    for axes, label in zip(panels, ("goals in 50 s", "drops per hour"), strict=True):
+        axes.set_xlim(left=0.0)
+        axes.set_xlabel(label)
     plot.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     finish_axes(panels)
     return plot

@@ -29,6 +29,7 @@ from object_policies import PolicyCase
 from stirring import Stir, StirRedrawn
 
 import lyceum_warp as lw
+from lyceum_warp.tasks.hands.gates import STEPS
 
 ENGINES = ("mujoco", "warp")
 CONTESTANTS = {"48 objects": Stir, "48 objects, redrawn at resets": StirRedrawn}
@@ -59,11 +60,12 @@ class Case:
 
 def cases(options: Options) -> list[Case | PolicyCase]:
     if options.policy:
+        numbers, steps = ((2,), 20) if options.short else (options.worlds, STEPS)
+        devices = {"mujoco": "cpu", "warp": options.device}
         return [
-            PolicyCase(folder.name, gate.digest(folder, options), engine, device, number, seed)
+            PolicyCase(folder.name, gate.digest(folder, options), engine, devices[engine], number, steps, seed)
             for engine in choose(options.engines, ENGINES, what="engine")
-            for folder in options.policy for number in options.worlds for seed in options.seeds or (1,)
-            for device in ("cpu" if engine == "mujoco" else options.device,)
+            for folder in options.policy for number in numbers for seed in options.seeds or (1,)
         ]  # fmt: skip
     usual = ENGINES if options.device == "cpu" else ENGINES[1:]
     worlds, blocks = ((8,), 1) if options.short else (options.worlds, options.blocks)

@@ -7,6 +7,8 @@ from typing import Any
 import experiment
 import pytest
 
+import lyceum_warp as lw
+
 Result = dict[str, Any]
 
 
@@ -109,8 +111,18 @@ def test_short_run_stores_plausible_results_once(
     rows = experiment.read(tmp_path / "out.jsonl")
     check(*(row.result for row in rows))
     assert all(table.rows for table in definition.tables(rows))
-    if definition.figure is not None:
-        definition.figure(rows).savefig("figure.png")
+    if (figure := definition.figure and definition.figure(rows)) is not None:
+        figure.savefig("figure.png")
     capsys.readouterr()
     assert experiment.main(definition, arguments) == 0
     assert f"{definition.name}: {len(rows)} of {len(rows)} cases are stored" in capsys.readouterr().out
+
+
+def test_policy_acts_with_each_object(tmp_path: Path) -> None:
+    definition, out = experiment.load("objects"), tmp_path / "out.jsonl"
+    policy = str(lw.pretrained_run("leap_reorient"))
+    assert experiment.main(definition, ["--short", "--engines", "mujoco", "--policy", policy, "--out", str(out)]) == 0
+    rows = experiment.read(out)
+    (table,) = definition.tables(rows)
+    assert [line[0] for line in table.rows[-2:]] == ["waterbottle", "held out"] and len(table.rows) == 30
+    definition.figure(rows).savefig(tmp_path / "figure.png")
