@@ -79,6 +79,9 @@ ONE_STEP = {  #                         measured
     "humanoid_walk": (2e-7, 4e-7, 5e-5, 2e-4),  # as humanoid_stand
     "inverted_double_pendulum": (3e-8, 1e-7, 6e-7, 2e-6),  # 6.9e-9, 2.9e-8; 1.6e-7, 6.4e-7
     "inverted_pendulum": (6e-9, 2e-8, 2e-7, 6e-7),  # 1.8e-9, 6.5e-9; 5.4e-8, 1.8e-7
+    "leap_objects": (6e-5, 6e-3, 1.2e-2, 1.2),  # 1.5e-5, 1.5e-3; 3.1e-3, 2.9e-1
+    "leap_reorient": (7e-4, 1.5e-2, 1.2e-1, 3.5),  # 1.8e-4, 3.9e-3; 3.0e-2, 8.8e-1
+    "leap_rotate": (6e-4, 1.6e-2, 1.3e-1, 3.5),  # 1.5e-4, 4.1e-3; 3.3e-2, 8.7e-1
     "panda_lift": (3e-7, 4e-7, 5e-6, 1.2e-5),  # 8.0e-8, 1.2e-7; 1.5e-6, 3.4e-6
     "point_mass": (5e-8, 1.5e-7, 6e-8, 1.5e-7),  # 1.4e-8, 4.5e-8; 1.9e-8, 5.1e-8
     "pusher": (1.5e-7, 3e-7, 6e-7, 2e-6),  # 4.3e-8, 8.0e-8; 1.8e-7, 5.4e-7
