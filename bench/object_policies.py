@@ -17,6 +17,8 @@ from lyceum_warp.env import Player
 from lyceum_warp.tasks.hands.gates import turned
 from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
+COLOURS = (STYLES[1][0], STYLES[0][0], "0.7")
+
 
 @dataclasses.dataclass(frozen=True)
 class PolicyCase:
@@ -56,9 +58,13 @@ def interval(numbers: torch.Tensor) -> tuple[float, float]:
     return numbers.mean().item(), 1.96 * numbers.std().item() / len(numbers) ** 0.5
 
 
+def policy_rows(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if "policy" in row.case]
+
+
 def tables(rows: Sequence[Row]) -> list[Table]:
     tables = []
-    for (engine, worlds), same in grouped(rows, "engine", "worlds").items():
+    for (engine, worlds), same in grouped(policy_rows(rows), "engine", "worlds").items():
         seen = sorted_objects(same)
         groups = {name: [name] for name in seen}
         groups |= {f"held {word}": [name for name in seen if seen[name] == (word == "in")] for word in ("in", "out")}
@@ -94,27 +100,26 @@ def sorted_objects(rows: Sequence[Row]) -> dict[str, bool]:
 
 
 def figure(rows: Sequence[Row]) -> Any:
-    """Draw goals and drops with each object on the C engine. Policies without objects in training are grey."""
-    rows = sorted((row for row in rows if row.case["engine"] == "mujoco"), key=lambda row: not row.result["held_in"])
+    """Draw goals and drops with each object on the C engine."""
+    rows = [row for row in policy_rows(rows) if row.case["engine"] == "mujoco"]
     if not rows:
         return None
+    rows.sort(key=lambda row: not row.result["held_in"])
     seen, height = sorted_objects(rows), 0.8 / len(rows)
     plot = new_figure("goals with each object", 8.0, 0.22 * len(seen) + 1.0)
     panels = plot.subplots(1, 2, sharey=True)
-    for k, row in enumerate(rows):
-        groups = ((True, "held in", STYLES[1][0]), (False, "held out", STYLES[0][0]))
-        for held, word, colour in groups if row.result["held_in"] else ((None, "objects not in training", "0.7"),):
-            names = [name for name in seen if held in (None, seen[name])]
-            places = [list(seen).index(name) + k * height for name in names]
-            for axes, number in zip(panels, ("goals", "drops"), strict=True):
-                means, halves = zip(*(row.result[number][name] for name in names), strict=True)
-                axes.barh(places, means, height, xerr=halves, color=colour, ecolor="0.3", error_kw={"linewidth": 0.7},
-                          label=f"{row.case['run']}, {word}")  # fmt: skip
-    panels[0].set_yticks([place + 0.4 - height / 2 for place in range(len(seen))], list(seen), fontsize="small")
-    panels[0].set_ylim(len(seen), -0.5)
-    for axes, label in zip(panels, ("goals in 50 s", "drops per hour"), strict=True):
+    for axes, number in zip(panels, ("goals", "drops"), strict=True):
+        for k, row in enumerate(rows):
+            means, halves = zip(*(row.result[number][name] for name in seen), strict=True)
+            colours = COLOURS[:2] if row.result["held_in"] else COLOURS[2:] * 2
+            axes.barh([i + k * height for i in range(len(seen))], means, height, xerr=halves, ecolor="0.3",
+                      error_kw={"linewidth": 0.7}, color=[colours[not held] for held in seen.values()])  # fmt: skip
+        axes.set(xlabel=f"{number} {'in 50 s' if number == 'goals' else 'per hour'}", ylim=(len(seen), -0.5))
         axes.set_xlim(left=0.0)
-        axes.set_xlabel(label)
-    plot.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
+    panels[0].set_yticks([i + 0.4 - height / 2 for i in range(len(seen))], list(seen), fontsize="small")
+    for label, colour in zip(("held in", "held out", "no objects in training"), COLOURS, strict=True):
+        panels[0].barh([0], [0], color=colour, label=label)
+    names = f"from above: {', '.join(row.case['run'] for row in rows)}"
+    plot.legend(loc="outside upper center", ncols=3, frameon=False, title=names)
     finish_axes(panels)
     return plot

@@ -124,11 +124,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         for row in rows if "policy" not in row.case
     ]  # fmt: skip
     title = "Steps of worlds with 48 meshes, beside worlds that all hold one of them; random actions."
-    return [Table(title, header, lines)] * bool(lines) + object_policies.tables(policy_rows(rows))
-
-
-def policy_rows(rows: Sequence[Row]) -> list[Row]:
-    return [row for row in rows if "policy" in row.case]
+    return [Table(title, header, lines)] * bool(lines) + object_policies.tables(rows)
 
 
 EXPERIMENT = Experiment(
@@ -136,7 +132,7 @@ EXPERIMENT = Experiment(
     conditions="Memory is the estimate of the engine.",
     summary="Speed and memory of worlds that hold different objects, and policies that turn them.",
     cases=cases, estimate=estimate, measure=measure, tables=tables, options=Options,
-    figure=lambda rows: object_policies.figure(policy_rows(rows)),
+    figure=object_policies.figure,
 )  # fmt: skip
 
 if __name__ == "__main__":
