@@ -44,18 +44,18 @@ class Case:
 
 def cases(options: Options) -> list[Case]:
     return [
-        Case(options.task or lw.Run.open(folder).task_name, folder.name, digest(folder, options), seed, options.short)
-        for folder in options.policy for seed in options.seeds or (0,)
+        Case(options.task or lw.Run.open(folder).task_name, folder.name, policy, seed, options.short)
+        for folder in options.policy for policy in [digest(folder, options.which)] for seed in options.seeds or (0,)
     ]  # fmt: skip
 
 
-def digest(folder: Path, options: Options) -> str:
-    return hashlib.sha256(lw.Run.open(folder).policy_file(options.which).read_bytes()).hexdigest()[:16]
+def digest(folder: Path, which: str) -> str:
+    return hashlib.sha256(lw.Run.open(folder).policy_file(which).read_bytes()).hexdigest()[:16]
 
 
 def measure(case: Case, options: Options) -> dict[str, Any]:
     torch.set_num_threads(1)
-    folder = next(folder for folder in options.policy if digest(folder, options) == case.policy)
+    folder = next(folder for folder in options.policy if digest(folder, options.which) == case.policy)
     run = lw.Run.open(folder)
     env = run_worlds(run, {**options_on_cores(), "physics": "exact"}, {}, nworld=1, task=options.task)
     curriculum = None if options.task else lw.load_curriculum(run, which=options.which)

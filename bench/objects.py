@@ -63,7 +63,7 @@ def cases(options: Options) -> list[Case | PolicyCase]:
         numbers, steps = ((2,), 20) if options.short else (options.worlds, STEPS)
         devices = {"mujoco": "cpu", "warp": options.device}
         return [
-            PolicyCase(folder.name, gate.digest(folder, options), engine, devices[engine], number, steps, seed)
+            PolicyCase(folder.name, gate.digest(folder, options.which), engine, devices[engine], number, steps, seed)
             for engine in choose(options.engines, ENGINES, what="engine")
             for folder in options.policy for number in numbers for seed in options.seeds or (1,)
         ]  # fmt: skip
@@ -85,7 +85,7 @@ def estimate(case: Case | PolicyCase) -> float:
 
 def measure(case: Case | PolicyCase, options: Options) -> dict[str, Any]:
     if isinstance(case, PolicyCase):
-        folder = next(folder for folder in options.policy if gate.digest(folder, options) == case.policy)
+        folder = next(folder for folder in options.policy if gate.digest(folder, options.which) == case.policy)
         return object_policies.measure(case, folder, options.which)
     envs = {}
     for name, task, objects in (("one", Stir, ["apple"]), ("many", CONTESTANTS[case.contestant], None)):
