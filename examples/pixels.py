@@ -51,7 +51,8 @@ def main(
     settings = {"value_hidden": (128, 128), "epochs": 4, "gamma": 0.98, "entropy_coef": 0.0} | common
     if teacher:
         state_policy = train(lw.PPO(blind, config=lw.PPOConfig(**settings), seed=seed))
-        config = lw.DistillConfig(policy_groups=("camera",), log_std=-1.5, **common)
+        sees = {"policy_groups": ("camera",), "log_std": -1.5, "epochs": 4, "gradient_length": 6}
+        config = lw.DistillConfig(**sees, **common)
         policy = train(lw.Distill(env, config=config, teacher=state_policy, seed=seed))
     else:
         policy = train(lw.PPO(env, config=lw.PPOConfig(policy_groups=("camera",), **settings), seed=seed))
