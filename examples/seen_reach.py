@@ -1,0 +1,34 @@
+"""Reach a target that only cameras see. The teacher is a policy of the task reach, which knows the target's position.
+
+    lyceum-warp train reach --algorithm ppo --iterations 150 --nworld 2048 --device cuda --out runs/reach
+    lyceum-warp train examples/seen_reach.py --teacher runs/reach --device cuda --out runs/seen-reach
+    lyceum-warp eval runs/seen-reach --engine mujoco --episodes 256
+
+The student also reads the encoders of the arm's joints, as on a robot.
+"""
+
+import warp as wp
+
+import lyceum_warp as lw
+from lyceum_warp import Row
+from lyceum_warp.tasks import reach
+from lyceum_warp.tasks.reach import Params, World
+
+
+@wp.func
+def observe(s: World, p: Params, obs: Row[float]):
+    lw.put(obs, lw.put(obs, 0, s.qpos), s.qvel)
+
+
+@wp.func
+def observe_teacher(s: World, p: Params, obs: Row[float]):
+    reach.observe(s, p, obs)
+
+
+class SeenReach(reach.Reach):
+    obs = {"policy": {"position": 7, "velocity": 7}, "teacher": reach.Reach.obs}
+    cameras = (
+        lw.Camera("before", pos=(0.05, 1.2, 0.2), lookat=(0.05, 0.0, 0.0), group="before"),
+        lw.Camera("above", pos=(0.05, 0.0, 1.2), lookat=(0.05, 0.0, 0.0), group="above"),
+    )
+    training = lw.Training(algorithm="distill", settings={"hidden": (256, 128)}, iterations=150)
