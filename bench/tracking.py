@@ -33,7 +33,9 @@ import lyceum_warp as lw
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.engines import options_on_cores
 
-MARKS = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0)
+MARKS = (
+    0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0
+)  # fmt: skip
 """Minutes from process start at which policies are judged."""
 
 SAMPLING = {"adaptive": (), "uniform": ("--param", "failure_weight=0")}
@@ -152,7 +154,7 @@ def environment(case: Case, options: Options, folder: Path) -> Iterator[dict[str
             names = ("WARP_CACHE_PATH", "CUDA_CACHE_PATH", "TORCHINDUCTOR_CACHE_DIR")
             yield os.environ | {name: f"{spare}/{name}" for name in names}
             return
-        if not folder.exists():
+        if not list(options.runs.glob(f"{case.task}-{case.device}-{case.cache}-*/")):
             once = command(case, options, Path(spare) / "run")
             once[once.index("--iterations") + 1] = "1"
             records.run(once, dict(os.environ)).wait()
@@ -176,16 +178,24 @@ def policies(run: lw.Run, done: Sequence[Sequence[float]], minutes: float) -> It
 def tables(rows: Sequence[Row]) -> list[Table]:
     tables = []
     for (task, clips, device, flags), same in experiment.grouped(rows, "task", "clips", "device", "flags").items():
+        marks = sorted({one["minutes"] for row in same for one in row.result["policies"]})
         lines = []
-        for (sampling, seed), (row,) in sorted(experiment.grouped(same, "sampling", "seed").items()):
-            for one in row.result["policies"]:
-                lines.append([
-                    sampling, str(seed), f"{one['minutes']:g}", f"{one['samples'] / 1e6:.3g}",
-                    f"{one['failures']} of {row.result['clips']}", f"{one['score']:.3f}",
-                    *(f"{1000 * sum(one[name]) / len(one[name]):.0f}" for name in ("mpkpe", "r_mpkpe")),
-                ])  # fmt: skip
-        title = f"{task} on {device}, clips {clips}{f', `{flags}`' if flags else ''}: clips that fail on the C engine."
-        header = ["starts", "seed", "minutes", "million samples", "failed", "score", "MPKPE, mm", "R-MPKPE, mm"]
+        for (sampling, seed), several in sorted(experiment.grouped(same, "sampling", "seed").items()):
+            row = max(several, key=lambda row: row.case["minutes"])
+            policies = {one["minutes"]: one for one in row.result["policies"]}
+            *_, last = policies.values()
+            lines.append([
+                sampling, str(seed), *(str(policies[mark]["failures"]) if mark in policies else "" for mark in marks),
+                f"{last['samples'] / 1e6:.3g}", f"{last['score']:.3f}",
+                *(f"{1000 * sum(last[name]) / len(last[name]):.0f}" for name in ("mpkpe", "r_mpkpe")),
+            ])  # fmt: skip
+        title = (
+            f"{task} on {device}, clips {clips}{f', `{flags}`' if flags else ''}: how many of {same[0].result['clips']}"
+            " clips fail on the C engine by minutes from process start; samples, score and errors of the last policy."
+        )
+        header = [
+            "starts", "seed", *(f"{mark:g}" for mark in marks), "million samples", "score", "MPKPE, mm", "R-MPKPE, mm",
+        ]  # fmt: skip
         tables.append(Table(title, header, lines))
     return tables
 

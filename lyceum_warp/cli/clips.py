@@ -31,7 +31,12 @@ def clips_of_task(files: Sequence[Path], task: str, options: core.EnvOptions) ->
 
 
 def print_clips(
-    env: Env, policy: Policy, files: Sequence[Path], picture: Path | None = None, camera: viz.CameraChoice = None
+    env: Env,
+    policy: Policy,
+    files: Sequence[Path],
+    names: Sequence[str] = (),
+    picture: Path | None = None,
+    camera: viz.CameraChoice = None,
 ) -> None:
     """Play clips on the C engine under exact physics, and in the environment's own simulation, and print the errors.
 
@@ -39,11 +44,11 @@ def print_clips(
         env: An environment of a tracking task.
         policy: The policy.
         files: Files or folders of motions. By default, the environment's clips are played.
+        names: Names of the environment's clips.
         picture: Path of a picture of the worst moments.
         camera: Camera of the picture.
     """
     changes: dict[str, Any] = {}
-    names = None
     if files:
         changes["clips"] = clips = motions.load_clips(
             files, env.model, rate=1.0 / env.timestep, device=env.device.alias

@@ -105,7 +105,9 @@ class Eval:
         place = f"{self.folder} --pretrained" if self.pretrained else self.folder
         if self.clips is not None:
             picture = Path(f"{binding.file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
-            print_clips(env, policy, self.clips, picture if self.video else None, camera)
+            listed = run.task_folder / "tables/clips.txt"
+            names = listed.read_text().splitlines() if listed.is_file() and not self.param else ()
+            print_clips(env, policy, self.clips, names, picture if self.video else None, camera)
             say_entries(next=f"lyceum-warp view {place}")
             return
         curricula, origin_of_memory = self._curricula(run, which, env)

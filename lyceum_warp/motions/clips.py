@@ -32,7 +32,7 @@ class Clips:
 
     names: tuple[str, ...]
     """The names of the clips."""
-    qpos: tuple[np.ndarray, ...]
+    qpos: tuple[np.ndarray, ...] = dataclasses.field(repr=False)
     """The coordinates in each frame of each clip, (frames, nq): position (m) and rotation (w, x, y, z) of the base, and
     positions of the joints (rad)."""
     rate: float

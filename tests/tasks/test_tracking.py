@@ -1,6 +1,7 @@
 """Compare the tracking tasks with mjlab's formulas, computed anew from MuJoCo's own quantities."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -11,6 +12,7 @@ from conftest import SharedEnv
 from motion_files import go1_clip, write_csv, write_npz
 
 import lyceum_warp as lw
+from lyceum_warp.algos.common.symmetry import Reflected, reflections
 from lyceum_warp.motions import kinematics
 
 NOISES = dict.fromkeys(
@@ -243,6 +245,33 @@ def test_blind_robots_do_not_observe_position_and_velocity() -> None:
     assert env.obs_groups["critic"].shape[1] == 286
     env.step(torch.zeros(2, 29))
     assert env.metrics["r_mpkpe"].max() < 0.2
+
+
+MEMORY = dict(
+    qpos="qpos", qvel="qvel", last_action="last_action", previous_action="last_action", encoder_bias="joint_position"
+)
+
+
+@pytest.mark.parametrize("task", ["g1_tracking", "go1_tracking"])
+def test_observations_of_mirrored_robots_on_mirrored_clips_are_mirrored(task: str, shared_env: SharedEnv) -> None:
+    own: dict[str, Any] = {"randomness": 0.0, "imu": (0.01, 0.0, 0.02)}  # the velocimeter is in the plane of symmetry
+    env = shared_env(task, nworld=8, **own)
+    mirror = env.task.definition.mirror(env.model, SimpleNamespace(**env.task.params))
+    clips = np.array(env.task.params["clips"])
+    order, signs = mirror.parts["qpos"]
+    clips[:, 2:] = clips[:, 2:][:, order] * signs
+    images = lw.make(task, nworld=8, clips=clips, **own)
+    for _ in range(5):
+        env.step(0.3 * torch.randn(env.action.shape, generator=torch.Generator().manual_seed(0)))
+    obs, state = {name: rows.clone() for name, rows in env.obs_groups.items()}, env.get_state()
+    for name, part in env.state_space.split(state).items():
+        if name in MEMORY:
+            order, signs = mirror.parts[MEMORY[name]]
+            part.copy_(part[:, order] * torch.tensor(signs))
+    for group, rows in obs.items():
+        image = Reflected(reflections(env, group=group)["obs"])(rows)
+        torch.testing.assert_close(images.get_obs(state, group=group), image, atol=2e-5, rtol=1e-4)
+        assert (image - rows).abs().mean() > 0.05
 
 
 def test_evaluation_plays_each_clip_once(shared_env: SharedEnv) -> None:

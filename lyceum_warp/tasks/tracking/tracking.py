@@ -588,6 +588,21 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
     }
 
 
+def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
+    """Add the reference and the tracked bodies to ``walkers.mirror``."""
+    parts, flip, axes = walkers.mirror(model, p).parts, np.array([1, -1, 1]), np.array([1, -1, 1, -1, 1, -1])
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    places = data.xpos[p.bodies]
+    order = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2).argmin(1)
+    reference = {f"reference_{name}": parts[name] for name in ("joint_position", "joint_velocity")}
+    bodies = {
+        name: ((len(signs) * order[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(order)))
+        for name, signs in (("body_position", flip), ("body_rotation", axes))
+    }
+    return lw.Mirror({**parts, **reference, **bodies, "anchor_position": flip, "anchor_rotation": axes})
+
+
 def ghost(p: Any, state: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the coordinates of the reference."""
     return np.asarray(p.clips)[int(state["frame"][0]), 2:]
@@ -624,5 +639,5 @@ class Tracking(lw.Task):
         "mpkpe", "r_mpkpe", "joint_position_error", "joint_velocity_error", "end_position_error", "end_rotation_error",
         "base_height_error", "base_tilt_error",
     )  # fmt: skip
-    deployment, ghost = staticmethod(deployment), staticmethod(ghost)
+    deployment, ghost, mirror = staticmethod(deployment), staticmethod(ghost), staticmethod(mirror)
     cleared = ("sensordata",)  # a reset clears the forces

@@ -66,6 +66,8 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
+            if (rows := getattr(value, "names", None)) is not None:  # such as those of lw.Clips
+                files[f"{TABLES}/{name}.txt"] = "\n".join(rows).encode()
     return manifest, files
 
 
@@ -128,14 +130,18 @@ def is_table(value: Any) -> bool:
 
 
 def table_copies(run: Run) -> dict[str, Path]:
-    """Return the run's copies of those tables whose files are missing or have changed since the run began."""
+    """Return the run's copies of those tables that had no file, or whose files are missing or have changed."""
     tables = {name: value for name, value in run.config["params"].items() if is_table(value)}
     copies = {name: (run.task_folder / TABLES / f"{name}.npy").absolute() for name in tables}
     return {
         name: copy
         for name, copy in copies.items()
-        if copy.is_file() and not (Path(tables[name]).is_file() and filecmp.cmp(tables[name], copy, shallow=False))
+        if copy.is_file() and not (_has_file(tables[name]) and filecmp.cmp(tables[name], copy, shallow=False))
     }
+
+
+def _has_file(table: str) -> bool:
+    return Path(table).is_absolute() and Path(table).is_file()  # an array's name is no path
 
 
 def fit_copy(run: Run) -> dict[str, str]:
@@ -249,7 +255,7 @@ def note_changes(run: Run, env: Env, *, model: bool = True) -> None:
         table = run.config["params"][name]
         texts = {str(copy): f"the run's own copy is used, {copy}", table: "the new version is used"}
         text = texts.get(str(json_value(name, env.given_params.get(name))))
-        if text is not None and Path(table).is_file():
+        if text is not None and _has_file(table):
             log.warning("%s has changed since the run began: %s", table, text)
     if model and _model_changed(run, env):
         log.warning("the model of the task %r has changed since the run began: the new version is used", env.task.name)
