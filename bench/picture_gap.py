@@ -24,13 +24,15 @@ from lyceum_warp.training import Run
 RENDERERS = ("this package", "mujoco.Renderer, plain", "mujoco.Renderer")
 VISIBLE = {"rgb": 24, "depth": 0.05}
 """Differences that count: of 256 levels, and in metres."""
+UNSEEN = {"geom_friction", "body_ipos"}
+"""Fields of the model that no picture shows."""
 
 
 class Rendered:
     """A policy that gets the pictures of ``mujoco.Renderer`` instead of those of its environment."""
 
     def __init__(self, policy: Any, env: lw.Env, *, plain: bool) -> None:
-        if env.task.dynamics:
+        if {field.name for field in env.task.dynamics} - UNSEEN:
             raise Skipped(f"the models of {env.task.name!r} differ between worlds, and mujoco.Renderer has one model")
         self.policy, self.env = policy, env
         self.state_size, self.groups = policy.state_size, policy.groups

@@ -1,8 +1,9 @@
-"""Reach a target that only cameras see. The teacher is a policy of the task reach, which knows the target's position.
+r"""Reach a target that only cameras see. The teacher is a policy of the task reach, which knows the target's position.
 
-    lyceum-warp train reach --algorithm ppo --iterations 150 --nworld 2048 --device cuda --out runs/reach
-    lyceum-warp train examples/seen_reach.py --teacher runs/reach --device cuda --out runs/seen-reach
-    lyceum-warp eval runs/seen-reach --engine mujoco --episodes 256
+    lyceum-warp train reach --algorithm ppo --gamma 0.98 --entropy-coef 0 --nworld 4096 --iterations 250 \
+        --device cuda --out runs/reach
+    lyceum-warp train examples/seen_reach.py --teacher runs/reach --nworld 1024 --device cuda --out runs/seen-reach
+    lyceum-warp eval runs/seen-reach --engine mujoco --device cpu --episodes 64
 
 The student also reads the encoders of the arm's joints, as on a robot.
 """
@@ -31,4 +32,6 @@ class SeenReach(reach.Reach):
         lw.Camera("before", pos=(0.05, 1.2, 0.2), lookat=(0.05, 0.0, 0.0), group="before"),
         lw.Camera("above", pos=(0.05, 0.0, 1.2), lookat=(0.05, 0.0, 0.0), group="above"),
     )
-    training = lw.Training(algorithm="distill", settings={"hidden": (256, 128)}, iterations=150)
+    training = lw.Training(
+        algorithm="distill", settings={"hidden": (256, 128), "epochs": 4, "gradient_length": 6}, iterations=300
+    )

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
+import lyceum_warp as lw
 from lyceum_warp import cli
 from lyceum_warp.training import Run
 
@@ -121,3 +122,15 @@ def test_examples_use_public_names_only(path: Path) -> None:
     modules = set(re.findall(r"^(?:from|import) (lyceum_warp[\w.]*)", source, re.MULTILINE))
     assert modules <= {"lyceum_warp", "lyceum_warp.testing"}
     assert not re.search(r"\b(env|plan|npg)\._", source)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("name", "teacher"), [("seen_reach.py", "reach"), ("go1_depth.py", "go1_rough_velocity")])
+def test_students_that_see_have_the_observations_of_their_teachers(name: str, teacher: str) -> None:
+    env = lw.make(EXAMPLES / name, nworld=4, seed=1)
+    env.step(torch.zeros_like(env.action))
+    assert list(env.obs_spaces["teacher"].parts.items()) == list(lw.make(teacher).obs_space.parts.items())
+    assert not {"error", "height_scan", "linear_velocity"} & env.obs_space.parts.keys()
+    for camera in env.task.cameras:
+        picture = env.obs_groups[camera.group].float()
+        assert (picture[0] != picture[1]).any() and picture.std() > 0.0
