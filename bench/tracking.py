@@ -41,7 +41,8 @@ MARKS = (
 SAMPLING = {"adaptive": (), "uniform": ("--param", "failure_weight=0")}
 
 FLAGS = {
-    "cpu": "--nworld 128 --num-steps 32 --hidden 256 128 --value-hidden 256 128 --discardvisual",
+    "cpu": "--nworld 128 --num-steps 32 --hidden 256 128 --value-hidden 256 128 --discardvisual --symmetry exact "
+    "--desired-kl 0.1 --log-std -1.5 --entropy-coef 0.001 --param randomness=0.3",
     "cuda": "",
 }
 """Flags of `lyceum-warp train`, by device."""
