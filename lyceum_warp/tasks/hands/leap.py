@@ -60,4 +60,4 @@ class LeapObjects(LeapReorient):
     """A LEAP hand turns many objects, each world another one, to goals."""
 
     edit_model = staticmethod(edit_cube)
-    rewards = {**LeapReorient.rewards, "drop": -100.0}
+    rewards = {**LeapReorient.rewards, "drop": -30.0, "pose_l2": -0.015, "excess_l2": -0.02}
