@@ -1,7 +1,7 @@
 """Walk on rough ground by two depth cameras. The teacher is the policy of go1_rough_velocity, which scans the ground.
 
     lyceum-warp train examples/go1_depth.py --teacher go1_rough_velocity --device cuda --out runs/depth
-    lyceum-warp gate runs/depth
+    lyceum-warp eval runs/depth --engine mujoco --physics exact --memory level=5
 
 The cameras are on the trunk and see the ground before and behind the robot. A GRU remembers what is below it. The
 student also reads the encoders and the inertial sensor, but neither the linear velocity nor the scan.
@@ -32,4 +32,7 @@ def depth(name: str, side: float) -> lw.Camera:
 
 class Go1Depth(go1_rough.Go1RoughVelocity):
     cameras = (depth("ahead", 1.0), depth("behind", -1.0))
-    training = lw.Training(algorithm="distill", settings={"recurrent": 256}, iterations=200, physics="coarse")
+    training = lw.Training(
+        algorithm="distill", settings={"recurrent": 256, "epochs": 4, "gradient_length": 12}, iterations=100,
+        physics="coarse",
+    )  # fmt: skip
