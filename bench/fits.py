@@ -308,14 +308,7 @@ def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, 
         lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **settings)
         params_of["fit"] = trunk | {"fitted": folder, "fitted_draws": True}
     fitted = time.perf_counter()
-    env = lw.make(
-        "go1_velocity",
-        nworld=nworld,
-        device=options.device,
-        physics="coarse",
-        seed=case.seed,
-        **params_of[case.contestant],
-    )
+    env = lw.make("go1_velocity", nworld=nworld, device=options.device, seed=case.seed, **params_of[case.contestant])
     learner = lw.PPO(env, config=lw.PPOConfig(symmetry="exact", mean_every=0), seed=case.seed)
     while learner.iteration < iterations:
         next(learner)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 from hidden_robots import ARM, log_of
+from training_runs import QUIET
 
 import lyceum_warp as lw
+from lyceum_warp import cli
 from lyceum_warp.algos.common.policy_export import deployment_metadata
 from lyceum_warp.training import Configuration, Run
 
@@ -45,6 +47,11 @@ def startup(s: World, p: Params, rng: Row[wp.uint32]):
 class FittedArm(lw.Task):
     model, frame_skip, obs, horizon = "arm.xml", 2, {"position": 2}, 20
 """
+SMALL = [
+    "--num-steps", "4", "--nworld", "2", "--hidden", "8", "--value-hidden", "8", "--minibatches", "1",
+    "--mean-every", "0",
+    *QUIET,
+]  # fmt: skip
 NAMES = ["kp.*", "dof_damping.*", "body_ipos.lower[2]", "delay.ctrl.*"]
 
 
@@ -124,6 +131,21 @@ def test_run_keeps_a_copy_of_its_fit(fit: lw.Fit, task: str, tmp_path: Path) -> 
     assert metadata["fit"]["delays"]["elbow"] == pytest.approx(fit.value[3]) and json.dumps(metadata)
     verdict = lw.transfer(env.replicate(fitted=options.fitted), policy, 4, warp=False)
     assert "fitted by" in verdict.line and dataclasses.asdict(verdict)["fitted"] == options.fitted
+
+
+def test_training_with_a_fit_keeps_the_time_step_of_its_model(fit: lw.Fit, task: str, tmp_path: Path) -> None:
+    coarse = """    physics = {"coarse": lw.PhysicsOptions(frame_skip=1)}
+    training = lw.Training(algorithm="ppo", physics="coarse", exact_from=1)
+"""
+    file = tmp_path / "coarse_arm.py"
+    file.write_text(TASK + coarse)
+    (tmp_path / "arm.xml").write_text(ARM)
+    for name, flags in {"plain": [], "fitted": ["--fitted", str(fit.folder)]}.items():
+        command = ["train", str(file), "--out", str(tmp_path / name), "--iterations", "1", *SMALL, *flags]
+        assert cli.main(command) == 0
+    configs = [Run.open(tmp_path / name).config for name in ("plain", "fitted")]
+    assert [config["physics"].get("frame_skip", 2) for config in configs] == [1, 2]
+    assert [config["exact_from"] for config in configs] == [1, None]
 
 
 def changed(fit: lw.Fit, folder: Path, **content: Any) -> Path:
