@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from experiment import Row, Table, grouped
+from experiment import Row, Skipped, Table, grouped
 
 import lyceum_warp as lw
 from lyceum_warp.binding import find_task
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.env import Player
-from lyceum_warp.tasks.hands.gates import turned
+from lyceum_warp.tasks.hands.gates import Turns, turned
 from lyceum_warp.viz import STYLES, finish_axes, new_figure
 
 COLOURS = (STYLES[1][0], STYLES[0][0], "0.7")
@@ -37,6 +37,8 @@ def measure(case: PolicyCase, folder: Path, which: str) -> dict[str, Any]:
     torch.set_num_threads(1)
     run = lw.Run.open(folder)
     task = find_task(run.task_name)
+    if task.objects is None or not isinstance(task.gate, Turns):
+        raise Skipped(f"the task {run.task_name} of {folder} has no objects that a hand turns")
     names = list(task.objects.models)
     options = {"engine": case.engine, "device": case.device, "objects": names, "horizon": 0}
     env = run_worlds(run, options, task.gate.params, nworld=case.worlds * len(names))
@@ -45,7 +47,7 @@ def measure(case: PolicyCase, folder: Path, which: str) -> dict[str, Any]:
     hours, held = case.steps * env.timestep / 3600.0, env.field("object").flatten()
     parts = {name: held == index for name, index in env.task.objects.items()}
     return {
-        "held_in": run.config["options"].get("objects") or [],
+        "held_in": list(run_worlds(run, {}, {}, nworld=1).task.objects),
         "goals": {name: interval(total[part]) for name, part in parts.items()},
         "drops": {name: interval(drops[part] / hours) for name, part in parts.items()},
         "some": {name: (total[part] > 0.0).float().mean().item() for name, part in parts.items()},

@@ -3,7 +3,7 @@
     lyceum-warp bench objects --device cuda
     lyceum-warp bench objects --engines mujoco --worlds 256
     lyceum-warp bench objects --short
-    lyceum-warp bench objects --policy runs/objects lyceum_warp/pretrained/leap_reorient --device cuda
+    lyceum-warp bench objects --policy lyceum_warp/pretrained/leap_objects --engines mujoco --worlds 16
 
 A paddle stirs a mesh of MyoSuite (extra "menagerie") in a tray. Each mesh collides as its convex hull. The environment
 with one object and the environment with many take turns of ten steps with the same random actions. An object that

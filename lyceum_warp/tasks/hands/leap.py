@@ -1,4 +1,4 @@
-"""LeapRotate and LeapReorient: a LEAP hand turns a cube (MuJoCo Playground's scene), or objects of MyoSuite."""
+"""LeapRotate, LeapReorient and LeapObjects: a LEAP hand turns a cube (MuJoCo Playground's scene) or other objects."""
 
 import mujoco
 
@@ -57,7 +57,7 @@ def edit_cube(spec: mujoco.MjSpec) -> None:
 
 @lw.register
 class LeapObjects(LeapReorient):
-    """A LEAP hand turns many objects, each world another one, to goals."""
+    """A LEAP hand turns 29 objects of MyoSuite to goals, a different one in each world."""
 
     edit_model = staticmethod(edit_cube)
     rewards = {**LeapReorient.rewards, "drop": -30.0, "pose_l2": -0.015, "excess_l2": -0.02}
