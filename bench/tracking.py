@@ -178,7 +178,8 @@ def policies(run: lw.Run, done: Sequence[Sequence[float]], minutes: float) -> It
 
 def tables(rows: Sequence[Row]) -> list[Table]:
     tables = []
-    for (task, clips, device, flags), same in experiment.grouped(rows, "task", "clips", "device", "flags").items():
+    names = ("task", "clips", "device", "cache", "flags")
+    for (task, clips, device, _, flags), same in experiment.grouped(rows, *names).items():
         marks = sorted({one["minutes"] for row in same for one in row.result["policies"]})
         lines = []
         for (sampling, seed), several in sorted(experiment.grouped(same, "sampling", "seed").items()):

@@ -106,7 +106,8 @@ class Eval:
         if self.clips is not None:
             picture = Path(f"{binding.file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
             listed = run.task_folder / "tables/clips.txt"
-            names = listed.read_text().splitlines() if listed.is_file() and not self.param else ()
+            own = listed.is_file() and not any(text.startswith("clips=") for text in self.param)
+            names = listed.read_text().splitlines() if own else ()
             print_clips(env, policy, self.clips, names, picture if self.video else None, camera)
             say_entries(next=f"lyceum-warp view {place}")
             return

@@ -594,7 +594,11 @@ def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     places = data.xpos[p.bodies]
-    order = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2).argmin(1)
+    distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
+    order = distances.argmin(1)
+    if distances.min(1).max() > 0.005:
+        alone = model.body(p.bodies[int(distances.min(1).argmax())]).name
+        raise ValueError(f"the tracked body {alone!r} has no mirror image among them: track it on both sides")
     reference = {f"reference_{name}": parts[name] for name in ("joint_position", "joint_velocity")}
     bodies = {
         name: ((len(signs) * order[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(order)))

@@ -66,7 +66,8 @@ def task_copy(env: Env) -> tuple[dict[str, Any], dict[str, Path | bytes]]:
     for name, value in env.given_params.items():
         if (table := _table(value)) is not None:
             files[f"{TABLES}/{name}.npy"] = table if isinstance(table, Path) else _npy(table)
-            if (rows := getattr(value, "names", None)) is not None:  # such as those of lw.Clips
+            rows = getattr(value, "names", None) or [None]  # those of lw.Clips; a torch.Tensor's may be None
+            if all(isinstance(row, str) for row in rows):
                 files[f"{TABLES}/{name}.txt"] = "\n".join(rows).encode()
     return manifest, files
 
