@@ -252,6 +252,14 @@ MEMORY = dict(
 )
 
 
+def test_body_that_is_tracked_on_one_side_only_has_no_mirror_image(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_tracking", nworld=1)
+    params = SimpleNamespace(**env.task.params)
+    params.bodies = np.asarray(params.bodies)[:-1]
+    with pytest.raises(ValueError, match="'RR_hip' has no mirror image among them: track it on both sides"):
+        env.task.definition.mirror(env.model, params)
+
+
 @pytest.mark.parametrize("task", ["g1_tracking", "go1_tracking"])
 def test_observations_of_mirrored_robots_on_mirrored_clips_are_mirrored(task: str, shared_env: SharedEnv) -> None:
     own: dict[str, Any] = {"randomness": 0.0, "imu": (0.01, 0.0, 0.02)}  # the velocimeter is in the plane of symmetry
