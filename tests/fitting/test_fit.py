@@ -102,6 +102,8 @@ def test_windows_with_contacts_determine_mass_and_gain() -> None:
     fit = lw.fit(mujoco.MjSpec.from_string(HOPPING), log, names, samples=0, nthread=1, window=0.1, iterations=10)
     for name, x in coordinates(fit, fit.value).items():
         assert abs(x - truth[name]) < 0.03, name
+    low, high = coordinates(fit, fit.low), coordinates(fit, fit.high)
+    assert all(low[name] <= truth[name] <= high[name] for name in names)
 
 
 def test_default_fit_of_a_free_base_writes_a_folder(tmp_path: Path) -> None:
