@@ -16,9 +16,10 @@ _STEPS, _PARAMETER_STEP = (1e-6, 2e-5, 1e-5), 1e-4
 """Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
 _MEMORIES = (0.015, 0.1, 0.5)
 """Seconds of memory of the simulations that guess the initial states."""
-_JUMP = 0.003
-"""A prediction that a finite difference changes by this multiple of the noise has jumped. Smooth changes are smaller. A
-few jumps would outweigh them all, make steps much too short, and intervals too narrow."""
+_JUMP, _USUAL_CHANGES = 0.003, 30.0
+"""A prediction that a finite difference changes by the first multiple of the noise, and by the second multiple of the
+median change, has jumped. A few jumps would outweigh all smooth changes, make steps much too short, and intervals too
+narrow."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
 _SETTLE = 4
@@ -44,7 +45,8 @@ class Estimate:
     noise: np.ndarray
     """Standard deviation of each column's noise, (columns,)."""
     move: float = np.inf
-    """The last step's largest change of a parameter in standard deviations; infinite while the noise is not known."""
+    """The last step's largest change of a parameter in standard deviations, divided by the root of the number of
+    averaged steps; infinite while the noise is not known."""
     iteration: int = 0
     averaged: int = 0
     """Steps whose mean the parameters are."""
@@ -122,7 +124,9 @@ class LeastSquares:
         with np.errstate(invalid="ignore"):
             change = (rows[:, 1:] - rows[:, :1]) / at.noise
         # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
-        jumps = ~(np.abs(change) < _JUMP).all(axis=1, keepdims=True)
+        size = np.nan_to_num(np.abs(change), nan=np.inf)
+        usual = _USUAL_CHANGES * np.median(size, axis=(0, 2), keepdims=True)
+        jumps = (size > np.maximum(_JUMP, usual)).any(axis=1, keepdims=True)
         jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
@@ -140,10 +144,11 @@ class LeastSquares:
         near = steady and np.max(np.abs(self._step(at, linear, 0.0) - at.x) / deviation) < _NEAR
         result, move, averaged = at, 0.0, at.averaged + 1 if near else 0
         for damping in _DAMPINGS:
-            x = at.x + (self._step(at, linear, damping) - at.x) / max(1, averaged)
+            step = self._step(at, linear, damping) - at.x
+            x = at.x + step / max(1, averaged)
             trial, costs = self._guessed(dataclasses.replace(at, x=x), [self._settled(at, linear, x)])
             if linear.weight @ costs + self.prior(x[None])[0] < _SLACK * cost:
-                result, move = trial, float(np.max(np.abs(x - at.x) / deviation))
+                result, move = trial, float(np.max(np.abs(step) / deviation)) / max(1, averaged) ** 0.5
                 break
         move, iteration = move if steady else np.inf, at.iteration + 1
         return dataclasses.replace(result, noise=noise, move=move, iteration=iteration, averaged=averaged)
