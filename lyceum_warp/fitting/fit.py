@@ -37,8 +37,8 @@ _USUAL = {
 }  # fmt: skip
 """Standard deviations of the noise of usual sensors, by kind of measurement."""
 _SHARE_OF_SIGNAL = 0.02
-_CONVERGED = 0.1
-"""A fit ends if a step moves no parameter by this multiple of its standard deviation."""
+_CONVERGED = 0.3
+"""A fit ends if its last steps leave no parameter uncertain by this multiple of its standard deviation."""
 _KNOWN = 0.3
 """A parameter is determined if its posterior is narrower than this multiple of its prior."""
 _LARGE = 2.0

@@ -12,18 +12,25 @@ _HUBER, _CUT = 3.0, 1e4
 """Residuals count linearly beyond the first multiple of the noise, and are cut at the second."""
 _BAD, _POWER = 1.3, 3
 """A window whose cost exceeds the first multiple of the median counts less, by this power of the ratio."""
-_STEPS, _PARAMETER_STEP = (1e-5, 2e-4, 1e-4), 1e-3
+_STEPS, _PARAMETER_STEP = (1e-6, 2e-5, 1e-5), 1e-4
 """Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
 _MEMORIES = (0.015, 0.1, 0.5)
 """Seconds of memory of the simulations that guess the initial states."""
-_JUMP = 1.0
-"""A prediction that a finite difference changes by this multiple of the noise has jumped."""
+_JUMP, _USUAL_CHANGES = 0.003, 30.0
+"""A prediction that a finite difference changes by the first multiple of the noise, and by the second multiple of the
+median change, has jumped. A few jumps would outweigh all smooth changes, make steps much too short, and intervals too
+narrow."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
 _SETTLE = 4
 """Steps of the initial states alone, to predict windows with given parameters."""
 _STEADY = 0.03
 """The noise is known if its logarithm changes less."""
+_NEAR, _SLACK = 2.0, 1.01
+"""Steps below the first multiple of a standard deviation are averaged, because contacts make each of them uncertain. A
+step may increase the cost to the second multiple, because contacts change that, too."""
+_DRAWS = np.array([0.0] + 5 * [0.1, 0.3, 1.0])
+"""Draws of initial states, in multiples of their posterior's deviation."""
 _DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 1.0, 100.0)
 
 
@@ -38,8 +45,11 @@ class Estimate:
     noise: np.ndarray
     """Standard deviation of each column's noise, (columns,)."""
     move: float = np.inf
-    """The last step's largest change of a parameter in standard deviations; infinite while the noise is not known."""
+    """The last step's largest change of a parameter in standard deviations, divided by the root of the number of
+    averaged steps; infinite while the noise is not known."""
     iteration: int = 0
+    averaged: int = 0
+    """Steps whose mean the parameters are."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,7 +124,9 @@ class LeastSquares:
         with np.errstate(invalid="ignore"):
             change = (rows[:, 1:] - rows[:, :1]) / at.noise
         # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
-        jumps = ~(np.abs(change) < _JUMP).all(axis=1, keepdims=True)
+        size = np.nan_to_num(np.abs(change), nan=np.inf)
+        usual = _USUAL_CHANGES * np.median(size, axis=(0, 2), keepdims=True)
+        jumps = (size > np.maximum(_JUMP, usual)).any(axis=1, keepdims=True)
         jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
@@ -129,14 +141,17 @@ class LeastSquares:
         deviation = np.sqrt(
             np.diag(np.linalg.inv(linear.reduced()[1].sum(axis=0) + np.diag(self.parameters.std**-2.0)))
         )
-        result, move = at, 0.0
+        near = steady and np.max(np.abs(self._step(at, linear, 0.0) - at.x) / deviation) < _NEAR
+        result, move, averaged = at, 0.0, at.averaged + 1 if near else 0
         for damping in _DAMPINGS:
-            x = self._step(at, linear, damping)
+            step = self._step(at, linear, damping) - at.x
+            x = at.x + step / max(1, averaged)
             trial, costs = self._guessed(dataclasses.replace(at, x=x), [self._settled(at, linear, x)])
-            if linear.weight @ costs + self.prior(x[None])[0] < cost:
-                result, move = trial, float(np.max(np.abs(x - at.x) / deviation))
+            if linear.weight @ costs + self.prior(x[None])[0] < _SLACK * cost:
+                result, move = trial, float(np.max(np.abs(step) / deviation)) / max(1, averaged) ** 0.5
                 break
-        return dataclasses.replace(result, noise=noise, move=move if steady else np.inf, iteration=at.iteration + 1)
+        move, iteration = move if steady else np.inf, at.iteration + 1
+        return dataclasses.replace(result, noise=noise, move=move, iteration=iteration, averaged=averaged)
 
     def _guessed(self, at: Estimate, states: Sequence[np.ndarray]) -> tuple[Estimate, np.ndarray]:
         """Choose each window's best initial state among the given ones and guesses; return the windows' costs, too."""
@@ -147,16 +162,24 @@ class LeastSquares:
         return dataclasses.replace(at, states=best), costs.min(axis=0)
 
     def _settled(self, at: Estimate, linear: Linear, x: np.ndarray) -> np.ndarray:
-        """Move the initial states with the parameters, each by its own best damping.
+        """Move the initial states with the parameters, each by its own best damping and best draw of its posterior.
 
-        One bad contact must not stop the other windows.
+        One bad contact must not stop the other windows, and beside a contact only a draw finds the way.
         """
         gradient = (linear.by_state + np.einsum("wpk,p->wk", linear.b, x - at.x))[..., None]
         diagonal = np.eye(linear.c.shape[1]) * linear.c
         steps = [-np.linalg.solve(linear.c + mu * diagonal, gradient)[..., 0] for mu in _STATE_DAMPINGS]
-        changes = np.stack([*steps, np.zeros_like(steps[0])], axis=1)
-        choice = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes).argmin(axis=1)
-        return self.predictor.moved(at.states, changes[np.arange(len(changes)), choice])
+        best = self._best(at, x, np.stack([*steps, np.zeros_like(steps[0])], axis=1))
+        draws = np.random.default_rng(at.iteration).standard_normal((*best.shape, len(_DRAWS))) * _DRAWS
+        spread = np.linalg.cholesky(np.linalg.inv(linear.c)) @ draws
+        changes = self._best(at, x, best[:, None] + spread.swapaxes(1, 2))
+        return self.predictor.moved(at.states, changes)
+
+    def _best(self, at: Estimate, x: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Choose each window's best change of its initial state among (windows, changes, nx)."""
+        costs = self.costs(at, np.tile(x, (changes.shape[1], 1)), changes)
+        result: np.ndarray = changes[np.arange(len(changes)), costs.argmin(axis=1)]
+        return result
 
     def prediction(self, x: np.ndarray, noise: np.ndarray) -> np.ndarray:
         """Compute residuals with given parameters, after an estimate of the initial states alone."""

@@ -50,6 +50,13 @@ def test_fit_recovers_a_hidden_arm(arm: tuple[Fit, dict[str, Any], Path]) -> Non
     assert fit.held_out[1] < 1.1 < 3.0 < fit.held_out[0]
 
 
+def test_intervals_narrow_with_the_noise(arm: tuple[Fit, dict[str, Any], Path]) -> None:
+    log = log_of(ARM, PARAMETERS, TRUTH, controls(5.0), noise=0.05)
+    exact = lw.fit(mujoco.MjSpec.from_string(ARM), log, PARAMETERS, samples=8, nthread=1)
+    assert exact.determined.all()
+    assert ((exact.high - exact.low) < 0.2 * (arm[0].high - arm[0].low)).all()
+
+
 def test_fit_writes_a_folder_with_a_page(arm: tuple[Fit, dict[str, Any], Path]) -> None:
     fit, _, folder = arm
     content = json.loads((folder / "fit.json").read_text())
@@ -102,6 +109,8 @@ def test_windows_with_contacts_determine_mass_and_gain() -> None:
     fit = lw.fit(mujoco.MjSpec.from_string(HOPPING), log, names, samples=0, nthread=1, window=0.1, iterations=10)
     for name, x in coordinates(fit, fit.value).items():
         assert abs(x - truth[name]) < 0.03, name
+    low, high = coordinates(fit, fit.low), coordinates(fit, fit.high)
+    assert all(low[name] <= truth[name] <= high[name] for name in names)
 
 
 def test_default_fit_of_a_free_base_writes_a_folder(tmp_path: Path) -> None:
