@@ -386,7 +386,7 @@ class Train:
         """Return the task's suggestions, or the defaults if a flag chooses another algorithm."""
         assert self.task is not None
         suggested = binding.find_task(self.task).training
-        if self.env.fitted is not None:  # the values of a fit hold at the model's own time step
+        if "fitted" in arguments.given(self.env):  # the values of a fit hold at the model's own time step
             suggested = dataclasses.replace(suggested, physics=None, exact_from=None)
         return suggested if self.algorithm in (None, suggested.algorithm) else core.Training(algorithm=self.algorithm)
 
