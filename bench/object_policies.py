@@ -44,8 +44,8 @@ def measure(case: PolicyCase, folder: Path, which: str) -> dict[str, Any]:
     env = run_worlds(run, options, task.gate.params, nworld=case.worlds * len(names))
     env.rand_reset(case.seed)
     total, drops = turned(env, Player(lw.load(run, which=which), env), task.gate.metric, case.steps)
-    hours, held = case.steps * env.timestep / 3600.0, env.field("object").flatten()
-    parts = {name: held == index for name, index in env.task.objects.items()}
+    hours, objects = case.steps * env.timestep / 3600.0, env.field("object").flatten()
+    parts = {name: objects == index for name, index in env.task.objects.items()}
     return {
         "held_in": list(run_worlds(run, {}, {}, nworld=1).task.objects),
         "goals": {name: interval(total[part]) for name, part in parts.items()},

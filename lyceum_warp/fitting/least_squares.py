@@ -84,7 +84,7 @@ class LeastSquares:
     """A problem of robust least squares with one initial state per window (multiple shooting).
 
     The initial states are eliminated from the normal equations window by window, so that a step costs
-    1 + parameters + nx rollouts of the log.
+    1 + parameters + nx rollouts of the log, and about 20 more for the initial states after each step that is tried.
 
     Args:
         windows: The windows.
@@ -141,10 +141,10 @@ class LeastSquares:
         deviation = np.sqrt(
             np.diag(np.linalg.inv(linear.reduced()[1].sum(axis=0) + np.diag(self.parameters.std**-2.0)))
         )
-        near = steady and np.max(np.abs(self._step(at, linear, 0.0) - at.x) / deviation) < _NEAR
+        steps = [self._step(at, linear, damping) - at.x for damping in _DAMPINGS]
+        near = steady and np.max(np.abs(steps[0]) / deviation) < _NEAR
         result, move, averaged = at, 0.0, at.averaged + 1 if near else 0
-        for damping in _DAMPINGS:
-            step = self._step(at, linear, damping) - at.x
+        for step in steps:
             x = at.x + step / max(1, averaged)
             trial, costs = self._guessed(dataclasses.replace(at, x=x), [self._settled(at, linear, x)])
             if linear.weight @ costs + self.prior(x[None])[0] < _SLACK * cost:
