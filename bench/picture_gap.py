@@ -18,22 +18,23 @@ import lyceum_warp as lw
 from lyceum_warp.algos import EXACT, evaluation_seed
 from lyceum_warp.cli.evaluate import run_worlds
 from lyceum_warp.controllers import policy_episodes
+from lyceum_warp.core.model_fields import SEEN
 from lyceum_warp.engines import options_on_cores
 from lyceum_warp.training import Run
 
 RENDERERS = ("this package", "mujoco.Renderer, plain", "mujoco.Renderer")
 VISIBLE = {"rgb": 24, "depth": 0.05}
 """Differences that count: of 256 levels, and in metres."""
-UNSEEN = {"geom_friction", "body_ipos"}
-"""Fields of the model that no picture shows."""
 
 
 class Rendered:
     """A policy that gets the pictures of ``mujoco.Renderer`` instead of those of its environment."""
 
     def __init__(self, policy: Any, env: lw.Env, *, plain: bool) -> None:
-        if {field.name for field in env.task.dynamics} - UNSEEN:
-            raise Skipped(f"the models of {env.task.name!r} differ between worlds, and mujoco.Renderer has one model")
+        if seen := SEEN.intersection(field.name for field in env.task.dynamics):
+            raise Skipped(
+                f"worlds of {env.task.name!r} differ in {', '.join(sorted(seen))}, and mujoco.Renderer has one model"
+            )
         self.policy, self.env = policy, env
         self.state_size, self.groups = policy.state_size, policy.groups
         self.cameras = {camera.group: camera for camera in env.task.cameras if camera.group in policy.groups}

@@ -58,7 +58,7 @@ def sources(name: str) -> Sources:
     for group in env.task.layouts.obs:
         obs = env.get_obs(group=group)
         slopes = (obs[1:] - obs[:1]).double().numpy() / STEP
-        changed = np.abs(slopes) > 1e-3
+        changed = np.abs(slopes) > 1e-4
         indexed[group] = {}
         for index in np.flatnonzero(changed.sum(axis=0) == 1):
             row = int(changed[:, index].argmax())

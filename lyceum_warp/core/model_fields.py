@@ -76,6 +76,11 @@ OBJECT_FIELDS = ("object", *MESH_FIELDS)
 """Fields that differ between worlds only if the worlds hold different objects. ``object`` is the object's index, which
 is no field of MjModel."""
 
+SEEN = {*PICTURED, *MESH_FIELDS} | set(
+    "qpos0 body_pos body_quat jnt_pos jnt_axis geom_pos geom_quat geom_size cam_pos cam_quat".split()
+)
+"""Fields that can differ between worlds and that pictures show."""
+
 _OPTIONS = {"gravity", "magnetic", "wind", "density", "viscosity"}
 
 _COMPUTED = set(

@@ -4,11 +4,12 @@ from collections.abc import Iterable, Sequence
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 
 from lyceum_warp.core.cameras import Camera
-from lyceum_warp.core.model_fields import MESH_FIELDS
+from lyceum_warp.core.model_fields import MESH_FIELDS, SEEN
 from lyceum_warp.engines.base import Engine
 from lyceum_warp.engines.warp.sizes import data_bytes
 from lyceum_warp.engines.warp.varied_model import StaticGeoms, put_varied_model, set_meshes
@@ -16,8 +17,8 @@ from lyceum_warp.engines.warp.warp_engine import refusals
 from lyceum_warp.kernels.pictures import unpack_rgb
 from lyceum_warp.support.arrays import flat, torch_view
 
-_SEEN = ("body_pos", "body_quat", "qpos0", "jnt_pos", "jnt_axis", "geom_", "cam_", "light_", "mat_")
-"""Prefixes of the model fields that pictures depend on."""
+_FOLLOWING_MASSES = [int(mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM), int(mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODYCOM)]
+"""Modes of cameras and lights that follow a centre of mass."""
 
 _BOUNDS_BYTES = 160
 """Bytes per geom of a world for the hierarchy of bounding volumes."""
@@ -53,7 +54,7 @@ class Pictures:
             kind: [any((c.name, c.kind) == (name, kind) for c in cameras) for name in sizes]
             for kind in ("rgb", "depth", "segmentation")
         }
-        seen = [field for name, field in engine.dynamics.items() if name.startswith(_SEEN)]
+        seen = [field for name, field in engine.dynamics.items() if name in SEEN]
         with refusals(fix="use no cameras"), wp.ScopedDevice(engine.device):
             self._model = put_varied_model(model, seen, nworld)
             self._data = data = mjw.make_data(model, nworld=nworld, naconmax=1, njmax=1)
@@ -67,6 +68,9 @@ class Pictures:
             data.mocap_pos, data.mocap_quat = engine.arrays["mocap_pos"], engine.arrays["mocap_quat"].view(wp.quat)
         names = [field.name for field in seen if field.size and field.name not in MESH_FIELDS]
         self._rows = [(flat(engine.arrays[name]), flat(getattr(self._model, name))) for name in names]
+        modes = [*(model.camera(name).mode[0] for name in sizes), *model.light_mode]
+        masses = [mjw.com_pos] if np.isin(modes, _FOLLOWING_MASSES).any() else []
+        self._parts = [mjw.kinematics, *masses, mjw.camlight, mjw.flex]
         self._static = StaticGeoms(model, engine.dynamics, engine.device)
         self._everyone = wp.full(nworld, True, dtype=bool, device=engine.device)
         self.groups, self._packed = {}, []
@@ -76,10 +80,12 @@ class Pictures:
             start = int(addresses[camera.kind].numpy()[list(sizes).index(camera.name)])
             pixels = buffers[camera.kind][:, start : start + camera.width * camera.height]
             if camera.kind == "rgb":
-                colors = wp.zeros((*pixels.shape, 3), dtype=wp.uint8, device=engine.device)
+                colors = wp.zeros((nworld, 3 * pixels.shape[1] // 4), dtype=wp.uint32, device=engine.device)
                 self._packed.append((pixels, colors))
-                pixels = colors
-            self.groups[camera.group] = torch_view(pixels).view(nworld, camera.height, camera.width, -1)
+                view = torch_view(colors).view(torch.uint8)
+            else:
+                view = torch_view(pixels)
+            self.groups[camera.group] = view.view(nworld, camera.height, camera.width, -1)
 
     def render(self) -> None:
         """Render all pictures, by Warp launches only."""
@@ -88,11 +94,12 @@ class Pictures:
         with wp.ScopedDevice(self._engine.device):
             set_meshes(self._model, self._engine.arrays, self._engine.model.nmesh, self._everyone)
             self._static.place(self._model, self._data, self._everyone)
-            mjw.fwd_kinematics(self._model, self._data)
+            for part in self._parts:
+                part(self._model, self._data)
             mjw.refit_bvh(self._model, self._data, self._context)
             mjw.render(self._model, self._data, self._context)
             for packed, colors in self._packed:
-                wp.launch(unpack_rgb, packed.shape, [packed, colors])
+                wp.launch(unpack_rgb, (len(packed), packed.shape[1] // 4), [packed, colors])
 
 
 def _sizes(model: mujoco.MjModel, cameras: Iterable[Camera]) -> dict[str, tuple[int, int]]:

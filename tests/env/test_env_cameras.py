@@ -22,6 +22,17 @@ class Seen(Cartpole):
     cameras = (lw.Camera("side", 16, 16),)
 
 
+def add_follower(spec: mujoco.MjSpec) -> None:
+    spec.body("cart").add_camera(
+        name="follower", pos=(0.0, -3.0, 1.0), quat=(0.7, 0.7, 0.0, 0.0), mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM
+    )
+
+
+class Followed(Cartpole):
+    edit_model = staticmethod(add_follower)
+    cameras = (lw.Camera("follower", 16, 16, "segmentation"),)
+
+
 def differing(one: torch.Tensor, other: torch.Tensor, tolerance: float) -> float:
     """Compute the share of pixels that differ by more than a tolerance."""
     return ((one.float() - other.float()).abs().amax(-1) > tolerance).float().mean().item()
@@ -123,6 +134,17 @@ def test_worlds_may_differ_in_colours_and_fields_of_view(shared_env, engine: str
         assert torch.equal(before[0], after[0]) and not torch.equal(before[1], after[1]), name
         env.rand_reset(0)
         env.reset()
+
+
+def test_a_camera_may_follow_a_centre_of_mass() -> None:
+    env = lw.make(Followed, nworld=2)
+    env.reset()
+    state = env.get_state()
+    state[1, env.state_space.parts["qpos"].start] += 0.7
+    env.set_state(state)
+    moving = np.flatnonzero(env.model.geom_bodyid >= env.model.body("cart").id)
+    one, other = (np.isin(picture[..., 0].numpy(), moving) for picture in env.obs_groups["camera"])
+    assert one.any() and (one == other).all()
 
 
 def test_a_camera_with_a_pose_is_added_to_the_model() -> None:
