@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -102,17 +103,14 @@ class Predictor:
             qpos, qvel and act for each memory, (windows, nq + nv + na).
         """
         model, signals = self.parameters.model(x), self.parameters.signals(x)
-        return [self._tracked(windows, model, signals, memory) for memory in memories]
-
-    def _tracked(self, windows: Windows, model: mujoco.MjModel, signals: Signals, memory: float) -> np.ndarray:
         data, step = self._data, model.opt.timestep
-        states = np.empty((len(windows), model.nq + model.nv + model.na))
+        states = [np.empty((len(windows), model.nq + model.nv + model.na)) for _ in memories]
         gain, bias = (signals[name][model.nu :] for name in ("gain", "bias"))
         none = np.zeros((2, 0), int)
         columns = {name: self.sources.get(name, none) for name in ("qpos", "qvel")}
         # velocities that are not measured follow from positions
         change, derived = np.zeros(model.nv), ~np.isin(np.arange(model.nv), columns["qvel"][1])
-        for number in np.unique(windows.take):
+        for (guess, memory), number in itertools.product(zip(states, memories, strict=True), np.unique(windows.take)):
             take, members = self.log.takes[number], np.flatnonzero(windows.take == number)
             steps = round((windows.begin[members[-1]] - take.time[0]) / step) + 1
             whole = dataclasses.replace(windows.chosen(members[:1]), begin=take.time[:1], steps=steps)
@@ -138,7 +136,7 @@ class Predictor:
                         mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
                     last, sample = take.time[sample], sample + 1
                 if k in begins:
-                    states[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
+                    guess[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
                 data.ctrl[:] = controls[k]
                 mujoco.mj_step(model, data)
         return states
@@ -234,9 +232,9 @@ def _quaternions(columns: Sequence[Column], model: mujoco.MjModel) -> list[list[
     joints = zip(map(mujoco.mjtJoint, model.jnt_type), model.jnt_qposadr.tolist(), strict=True)
     starts = [("qpos", address + _QUATERNION[kind]) for kind, address in joints if kind in _QUATERNION]
     sensors = np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_FRAMEQUAT)
-    groups = [[(name, start + k) for k in range(4)]
-              for name, start in [*starts, *(("sensordata", int(model.sensor_adr[i])) for i in sensors)]]  # fmt: skip
-    return [[numbers[key] for key in group] for group in groups if all(key in numbers for key in group)]
+    starts += [("sensordata", int(model.sensor_adr[i])) for i in sensors]
+    groups = [[numbers.get((name, start + k), -1) for k in range(4)] for name, start in starts]
+    return [group for group in groups if -1 not in group]
 
 
 def _turn(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:
