@@ -111,9 +111,11 @@ def fit(
     count = len(windows) - round(held_out * len(windows))
     problem = LeastSquares(windows.chosen(slice(count)), predictor, groups)
     report = progress or (lambda stage, iteration, cost: None)
-    checkpoint = None if out is None else Path(out) / "estimate.npz"
-    if resume and checkpoint is not None and checkpoint.is_file():
-        at = _load(checkpoint, problem)
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    if resume and folder is not None and (folder / "estimate.npz").is_file():
+        at = _load(folder / "estimate.npz", problem)
     else:
         start = np.zeros(bound.size)
         if samples:
@@ -123,9 +125,8 @@ def fit(
         at = problem.begin(start, usual)
     while at.iteration < iterations and at.move >= _CONVERGED:
         at = problem.iterate(at)
-        if checkpoint is not None:
-            checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            with replaced(checkpoint) as path, path.open("wb") as file:
+        if folder is not None:
+            with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
                 np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
@@ -140,11 +141,11 @@ def fit(
         for label, (i, *_) in groups.items() if at.noise[i] > _LARGE * usual[i]
     ]  # fmt: skip
     covariance = problem.covariance(linear)
-    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, out)
-    if result.folder is not None:
-        _write(result, name, bound, covariance, at, seed)
+    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, folder)
+    if folder is not None:
+        _write(folder, result, name, bound, covariance, at, seed)
         times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-        write_report(result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
+        write_report(folder, result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
     return result
 
 
@@ -217,7 +218,7 @@ def _noise(log: Log, model: mujoco.MjModel) -> tuple[dict[str, np.ndarray], np.n
 
 def _result(
     bound: Parameters, covariance: np.ndarray, at: Estimate, linear: Linear, groups: Mapping[str, np.ndarray],
-    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, out: str | Path | None,
+    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, folder: Path | None,
 ) -> Fit:  # fmt: skip
     deviation = np.sqrt(np.diag(covariance))
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
@@ -235,15 +236,14 @@ def _result(
         bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
         covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
         rms, (nominal, fitted), bound.fields(at.x),
-        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds,
-        None if out is None else Path(out),
+        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds, folder,
     )  # fmt: skip
 
 
-def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at: Estimate, seed: int) -> None:
+def _write(
+    folder: Path, result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at: Estimate, seed: int
+) -> None:
     """Write fit.json and draws.npz, which ``lw.make(..., fitted=...)`` reads."""
-    folder = result.folder
-    assert folder is not None
     xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
     rows = [bound.fields(x) for x in np.clip(xs, bound.low, bound.high)]
     draws: dict[str, Any] = {f"{field}.{name}": np.array([row[field][name] for row in rows])
@@ -252,7 +252,6 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
         field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value
         for field in dataclasses.fields(result) if field.name not in ("folder", "correlation")
     }  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
     with replaced(folder / "draws.npz") as path, path.open("wb") as file:
         np.savez_compressed(file, **draws)
     with replaced(folder / "fit.json") as path:
