@@ -65,9 +65,7 @@ def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
             rows.append((number, begin, time, np.where(time[:, None] < lead - 1e-6, np.nan, take.measured[inside])))
             begin = take.time[np.searchsorted(take.time, begin + steps * step - 1e-6)]
     if not rows:
-        raise ValueError(
-            f"no take of the log has the {seconds:g} s of a window: record longer takes, or shorten the window"
-        )
+        raise ValueError(f"no take has the {seconds:g} s of a window: record longer takes, or shorten the window")
     most = max(len(row[2]) for row in rows)
     time, measured = np.zeros((len(rows), most)), np.full((len(rows), most, len(log.columns)), np.nan)
     for i, row in enumerate(rows):
@@ -124,16 +122,14 @@ class Predictor:
                 now = take.time[0] + k * step
                 while sample < len(take.time) and take.time[sample] < now + 0.5 * step:
                     pull = 1.0 - np.exp(-(take.time[sample] - last) / memory)
-                    for name, part in (("qpos", data.qpos.copy()), ("qvel", data.qvel.copy())):
-                        source, places = columns[name]
+                    position, velocity = data.qpos.copy(), data.qvel.copy()
+                    for part, (source, places) in ((position, columns["qpos"]), (velocity, columns["qvel"])):
                         part[places] = np.where(np.isnan(seen := measured[sample, source]), part[places], seen)
-                        if name == "qvel":
-                            data.qvel += pull * (part - data.qvel)
-                            continue
-                        mujoco.mj_normalizeQuat(model, part)
-                        mujoco.mj_differentiatePos(model, change, pull, data.qpos, part)
-                        data.qvel += 0.5 * derived * change / memory
-                        mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
+                    mujoco.mj_normalizeQuat(model, position)
+                    mujoco.mj_differentiatePos(model, change, pull, data.qpos, position)
+                    data.qvel += 0.5 * derived * change / memory
+                    data.qvel += pull * (velocity - data.qvel)
+                    mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
                     last, sample = take.time[sample], sample + 1
                 if k in begins:
                     guess[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
