@@ -16,7 +16,7 @@ from lyceum_warp.binding import compile_model, find_task, task_spec
 from lyceum_warp.core import FIT_FORMAT, MOVED_INERTIA, EnvOptions, ModelFile, Task, load_spec
 from lyceum_warp.env import Env
 from lyceum_warp.fitting.least_squares import Estimate, LeastSquares, Linear, search
-from lyceum_warp.fitting.log import Column, Controls, Log, LogSource, read_log
+from lyceum_warp.fitting.log import Controls, Log, LogSource, read_log
 from lyceum_warp.fitting.parameters import Parameter, Parameters
 from lyceum_warp.fitting.report import write_report
 from lyceum_warp.fitting.result import Fit
@@ -111,9 +111,11 @@ def fit(
     count = len(windows) - round(held_out * len(windows))
     problem = LeastSquares(windows.chosen(slice(count)), predictor, groups)
     report = progress or (lambda stage, iteration, cost: None)
-    checkpoint = None if out is None else Path(out) / "estimate.npz"
-    if resume and checkpoint is not None and checkpoint.is_file():
-        at = _load(checkpoint, problem)
+    folder = None if out is None else Path(out)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    if resume and folder is not None and (folder / "estimate.npz").is_file():
+        at = _load(folder / "estimate.npz", problem)
     else:
         start = np.zeros(bound.size)
         if samples:
@@ -123,21 +125,27 @@ def fit(
         at = problem.begin(start, usual)
     while at.iteration < iterations and at.move >= _CONVERGED:
         at = problem.iterate(at)
-        if checkpoint is not None:
-            checkpoint.parent.mkdir(parents=True, exist_ok=True)
-            with replaced(checkpoint) as path, path.open("wb") as file:
+        if folder is not None:
+            with replaced(folder / "estimate.npz") as path, path.open("wb") as file:
                 np.savez(file, names=bound.names, begin=problem.windows.begin, **dataclasses.asdict(at))
         report("fit", at.iteration, at.move)
     linear = problem.linearize(at)
     held = LeastSquares(windows.chosen(slice(count, None)), predictor, {}) if count < len(windows) else problem
     errors = [held.prediction(x, at.noise) for x in (np.zeros(bound.size), at.x)]
-    notes = [*data.notes, *_notes(groups, usual, at, held=held is not problem)]
+    notes = [*data.notes]
+    if held is problem:
+        notes.append("no window was held back: errors of prediction are those of the fitted windows")
+    notes += [
+        f"the errors of {label} are {at.noise[i] / usual[i]:.1f} times a sensor's usual noise: the model lacks "
+        "something, or the log has other units or another order"
+        for label, (i, *_) in groups.items() if at.noise[i] > _LARGE * usual[i]
+    ]  # fmt: skip
     covariance = problem.covariance(linear)
-    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, out)
-    if result.folder is not None:
-        _write(result, name, bound, covariance, at, seed)
+    result = _result(bound, covariance, at, linear, groups, errors, notes, time.perf_counter() - began, folder)
+    if folder is not None:
+        _write(folder, result, name, bound, covariance, at, seed)
         times = problem.windows.begin[:, None] + compiled.opt.timestep * problem.windows.time
-        write_report(result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
+        write_report(folder, result, name, times, np.where(problem.seen, linear.residuals, np.nan), groups)
     return result
 
 
@@ -194,41 +202,23 @@ def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], 
 
 
 def _noise(log: Log, model: mujoco.MjModel) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Group the columns by kind, and get each column's first noise."""
-    kinds = np.array([_kind(column, model) for column in log.columns])
+    """Group the columns by kind of measurement, and get each column's first noise."""
+    sensors = np.repeat(model.sensor_type, model.sensor_dim)
+    names = {("sensordata", i): mujoco.mjtSensor(kind).name.removeprefix("mjSENS_").lower()
+             for i, kind in enumerate(sensors)}  # fmt: skip
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        parts = {"qpos": ["position"] * 3 + ["rotation"] * 4, "qvel": ["velocity"] * 3 + ["angular velocity"] * 3}
+        for field, start in (("qpos", model.jnt_qposadr[j]), ("qvel", model.jnt_dofadr[j])):
+            names |= {(field, start + k): f"base {part}" for k, part in enumerate(parts[field])}
+    kinds = np.array([names.get((column.field, column.index), column.field) for column in log.columns])
     groups = {str(kind): np.flatnonzero(kinds == kind) for kind in dict.fromkeys(kinds)}
     spread = np.nanstd(np.concatenate([take.measured for take in log.takes]), axis=0)
     return groups, np.array([_USUAL.get(k, _SHARE_OF_SIGNAL * spread[i]) for i, k in enumerate(kinds)])
 
 
-def _kind(column: Column, model: mujoco.MjModel) -> str:
-    """Name the kind of a column's measurement."""
-    if column.field == "sensordata":
-        sensor = int(np.searchsorted(model.sensor_adr, column.index, side="right")) - 1
-        return str(mujoco.mjtSensor(model.sensor_type[sensor]).name).removeprefix("mjSENS_").lower()
-    if column.field in ("qpos", "qvel"):
-        address = model.jnt_qposadr if column.field == "qpos" else model.jnt_dofadr
-        joint = int(np.searchsorted(address, column.index, side="right")) - 1
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            parts = {"qpos": ("position", "rotation"), "qvel": ("velocity", "angular velocity")}[column.field]
-            return f"base {parts[int(column.index - address[joint] >= 3)]}"
-    return column.field
-
-
-def _notes(groups: Mapping[str, np.ndarray], usual: np.ndarray, at: Estimate, *, held: bool) -> list[str]:
-    notes = [] if held else ["no window was held back: errors of prediction are those of the fitted windows"]
-    for label, group in groups.items():
-        if (ratio := at.noise[group[0]] / usual[group[0]]) > _LARGE:
-            notes.append(
-                f"the errors of {label} are {ratio:.1f} times a sensor's usual noise: the model lacks something, or "
-                "the log has other units or another order"
-            )
-    return notes
-
-
 def _result(
     bound: Parameters, covariance: np.ndarray, at: Estimate, linear: Linear, groups: Mapping[str, np.ndarray],
-    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, out: str | Path | None,
+    errors: Sequence[np.ndarray], notes: Sequence[str], seconds: float, folder: Path | None,
 ) -> Fit:  # fmt: skip
     deviation = np.sqrt(np.diag(covariance))
     ends = [np.clip(at.x + sign * 1.96 * deviation, bound.low, bound.high) for sign in (0.0, -1.0, 1.0)]
@@ -246,15 +236,14 @@ def _result(
         bound.names, [c.kind for c in bound.coordinates], value, low, high, deviation < _KNOWN * bound.std, directions,
         covariance / np.outer(deviation, deviation), {k: float(at.noise[group[0]]) for k, group in groups.items()},
         rms, (nominal, fitted), bound.fields(at.x),
-        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds,
-        None if out is None else Path(out),
+        {name: float(delay[i]) for name, i in bound.actuators.items() if delay[i] > 0.0}, notes, seconds, folder,
     )  # fmt: skip
 
 
-def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at: Estimate, seed: int) -> None:
+def _write(
+    folder: Path, result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at: Estimate, seed: int
+) -> None:
     """Write fit.json and draws.npz, which ``lw.make(..., fitted=...)`` reads."""
-    folder = result.folder
-    assert folder is not None
     xs = np.random.default_rng(seed).multivariate_normal(at.x, covariance, size=DRAWS, method="eigh")
     rows = [bound.fields(x) for x in np.clip(xs, bound.low, bound.high)]
     draws: dict[str, Any] = {f"{field}.{name}": np.array([row[field][name] for row in rows])
@@ -263,7 +252,6 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
         field.name: value.tolist() if isinstance(value := getattr(result, field.name), np.ndarray) else value
         for field in dataclasses.fields(result) if field.name not in ("folder", "correlation")
     }  # fmt: skip
-    folder.mkdir(parents=True, exist_ok=True)
     with replaced(folder / "draws.npz") as path, path.open("wb") as file:
         np.savez_compressed(file, **draws)
     with replaced(folder / "fit.json") as path:
@@ -272,13 +260,10 @@ def _write(result: Fit, name: str, bound: Parameters, covariance: np.ndarray, at
 
 def _load(path: Path, problem: LeastSquares) -> Estimate:
     """Read the estimate of an unfinished fit."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        names, begin = arrays.pop("names").tolist(), arrays.pop("begin")
-        at = Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})
-    except Exception as error:  # numpy and zipfile raise many types of errors
-        raise ValueError(f"{path} is damaged ({error}): delete it to start again") from error
-    if names != problem.parameters.names or not np.array_equal(begin, problem.windows.begin):
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    if arrays.pop("names").tolist() != problem.parameters.names or not np.array_equal(
+        arrays.pop("begin"), problem.windows.begin
+    ):
         raise ValueError(f"{path} belongs to another log, model or parameters: choose another folder")
-    return at
+    return Estimate(**{key: value.item() if value.ndim == 0 else value for key, value in arrays.items()})

@@ -138,10 +138,10 @@ class LeastSquares:
         linear = self.linearize(at)
         cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
         steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
-        deviation = np.sqrt(
-            np.diag(np.linalg.inv(linear.reduced()[1].sum(axis=0) + np.diag(self.parameters.std**-2.0)))
-        )
-        steps = [self._step(at, linear, damping) - at.x for damping in _DAMPINGS]
+        prior, (gradient, information) = self.parameters.std**-2.0, (part.sum(axis=0) for part in linear.reduced())
+        gradient, information = gradient + prior * at.x, information + np.diag(prior)
+        deviation = np.sqrt(np.diag(np.linalg.inv(information)))
+        steps = [self._step(at.x, gradient, information, damping) for damping in _DAMPINGS]
         near = steady and np.max(np.abs(steps[0]) / deviation) < _NEAR
         result, move, averaged = at, 0.0, at.averaged + 1 if near else 0
         for step in steps:
@@ -227,17 +227,14 @@ class LeastSquares:
         covariance: np.ndarray = scale[:, None] * inverse * scale if count >= 2 * p else inverse
         return covariance
 
-    def _step(self, at: Estimate, linear: Linear, damping: float) -> np.ndarray:
+    def _step(self, x: np.ndarray, gradient: np.ndarray, information: np.ndarray, damping: float) -> np.ndarray:
         """Solve the damped normal equations of the parameters within their bounds."""
-        prior, low, high = self.parameters.std**-2.0, self.parameters.low, self.parameters.high
-        gradient, whole = (part.sum(axis=0) for part in linear.reduced())
-        gradient, whole = gradient + prior * at.x, whole + np.diag(prior)
-        whole[np.diag_indices(len(whole))] *= 1.0 + damping
-        held = ((at.x <= low) & (gradient > 0.0)) | ((at.x >= high) & (gradient < 0.0))
-        whole[held], whole[:, held], gradient[held] = 0.0, 0.0, 0.0
-        whole[held, held] = 1.0
-        x: np.ndarray = np.clip(at.x - np.linalg.solve(whole, gradient), low, high)
-        return x
+        low, high = self.parameters.low, self.parameters.high
+        free = ((x > low) | (gradient <= 0.0)) & ((x < high) | (gradient >= 0.0))
+        whole = np.where(np.outer(free, free), information, 0.0)
+        whole[np.diag_indices(len(x))] = np.where(free, (1.0 + damping) * np.diag(information), 1.0)
+        step: np.ndarray = np.clip(x - np.linalg.solve(whole, free * gradient), low, high) - x
+        return step
 
     def _noise(self, at: Estimate, linear: Linear) -> np.ndarray:
         """Estimate the noise of each group of columns from the median of the residuals."""

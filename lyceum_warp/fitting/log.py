@@ -77,10 +77,11 @@ def read_log(source: LogSource, model: mujoco.MjModel, controls: Controls | None
     columns: tuple[Column, ...] = ()
     for name, table in _tables(source):
         quantities, take = _take(name, table, model, controls)
-        if quantities != (columns := columns or quantities):
-            odd = {column.name for column in columns} ^ {column.name for column in quantities}
+        columns = columns or quantities
+        if odd := {column.name for column in {*columns} ^ {*quantities}}:
             raise ValueError(f"{name} measures other quantities than the first take: {', '.join(sorted(odd))}")
-        takes += _cut(name, take, notes)
+        order = [quantities.index(column) for column in columns]
+        takes += _cut(name, dataclasses.replace(take, measured=take.measured[:, order]), notes)
     if not takes:
         raise ValueError("there is no log: pass a file, an episode or a mapping of arrays")
     log = Log(columns, tuple(takes), tuple(notes))
@@ -143,7 +144,7 @@ def _take(
         if array.ndim not in (1, 2) or len(array) != len(time):
             raise ValueError(f"{name}: {key!r} has shape {array.shape} for {len(time)} times: pass one row per time")
         array = array.reshape(len(time), -1)
-        if key in ("action", "ctrl") and not np.isfinite(array).all():
+        if key.partition(".")[0] in ("action", "ctrl") and not np.isfinite(array).all():
             row = int(np.argwhere(~np.isfinite(array))[0, 0])
             raise ValueError(f"{name}: {key!r} is not finite in row {row}: repeat the last control, or cut there")
         if key == "action" and controls is not None:
@@ -164,7 +165,9 @@ def _take(
             if np.isinf(values).any() or np.isnan(values).all():
                 raise ValueError(f"{name}: the column {label!r} has no numbers, or infinite ones: leave it out")
             if np.nanmax(values) == np.nanmin(values):
-                raise ValueError(f"{name}: the column {label!r} is always {values[0]:g}: is the sensor connected?")
+                raise ValueError(
+                    f"{name}: the column {label!r} is always {np.nanmax(values):g}: is the sensor connected?"
+                )
     if np.isnan(control).any():
         missing = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_ACTUATOR, int(np.isnan(control[0]).argmax()))
         raise ValueError(f"{name} lacks controls of the actuator {missing!r}: add the column 'ctrl.{missing}'")

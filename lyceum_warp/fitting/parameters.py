@@ -5,7 +5,7 @@ import dataclasses
 import fnmatch
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import mujoco
 import numpy as np
@@ -16,10 +16,14 @@ from lyceum_warp.support.suggestions import did_you_mean
 from lyceum_warp.support.validate import finite_number
 
 _NAME = re.compile(r"(?P<field>[a-z0-9_]+)\.(?P<pattern>.+?)(?:\[(?P<column>\d+)\])?")
-_SERVO = {
-    "kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)), "kd": (("actuator_biasprm", 2, -1.0),)
+_INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+_Part: TypeAlias = tuple[str, int | None, float]
+_TOGETHER: dict[str, list[_Part]] = {
+    "kp": [("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)], "kd": [("actuator_biasprm", 2, -1.0)],
+    "body_mass": [("body_mass", None, 1.0), ("body_inertia", None, 1.0)],
+    "inertia": [(name, None, 1.0) for name in _INERTIAL],
 }  # fmt: skip
-"""Fields, columns and signs of the gains of position servos."""
+"""Model fields, columns and signs of what changes together."""
 _SIGNALS = {"delay": (0.02, 0.0, 0.05), "gain": (0.1, -np.log(10.0), np.log(10.0)), "bias": (0.02, -np.inf, np.inf)}
 """The prior's deviation and the bounds of parameters of signals. A gain is a factor."""
 _SIGNED = {"body_ipos": 0.02, "body_pos": 0.01, "geom_pos": 0.01, "site_pos": 0.01, "jnt_pos": 0.01, "qpos_spring": 0.1}
@@ -29,7 +33,6 @@ _FROM_ZERO = {"dof_armature": 0.02, "dof_damping": 0.5, "dof_frictionloss": 0.5,
 _FACTOR, _RANGE, _INERTIA = 0.5, np.log(10.0), 0.2
 _FACTORS = ("factor", "gain")
 """Kinds of coordinates that are logarithms."""
-_INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
 
 
 @document_attributes
@@ -124,11 +127,12 @@ class Parameters:
     def _add(self, parameter: Parameter) -> None:
         match = _NAME.fullmatch(parameter.name)
         assert match is not None
-        field, fields = match["field"], (*VARYING_FIELDS, *_SERVO, *_SIGNALS, "inertia")
+        field, fields = match["field"], dict.fromkeys((*VARYING_FIELDS, *_TOGETHER, *_SIGNALS))
         if field not in fields:
             raise ValueError(f"the parameter {parameter.name!r} can't be fitted: {did_you_mean(field, fields)}")
-        model_field = {"inertia": "body_mass", "kp": "actuator_gainprm", "kd": "actuator_gainprm"}.get(field, field)
-        names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, model_field)
+        column = None if match["column"] is None else int(match["column"])
+        parts = _TOGETHER.get(field, [(field, column, 1.0)])
+        names = list(self._signals) if field in _SIGNALS else element_names(self.nominal, parts[0][0])
         wanted = match["pattern"].split(",")
         for pattern in wanted:
             if not fnmatch.filter(names, pattern):
@@ -138,51 +142,42 @@ class Parameters:
         base = [self.nominal.joint(j).name for j in np.flatnonzero(self.nominal.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
         hidden = set(base) - set(wanted) if field.startswith("dof_") else set()
         names = [name for name in names if name not in hidden and any(fnmatch.fnmatchcase(name, p) for p in wanted)]
-        rows = np.asarray(getattr(self.nominal, model_field)) if field not in _SIGNALS else np.zeros(0)
-        width = rows.size // max(1, len(rows))
-        column = None if match["column"] is None else int(match["column"])
+        width = 0 if field in _SIGNALS else getattr(self.nominal, parts[0][0])[0].size
         if column is not None and column >= width:
             raise ValueError(f"the parameter {parameter.name!r} is out of range: {field} has {width} columns")
         apart = parameter.each or field == "inertia"
         for label, members in [(name, [name]) for name in names] if apart else [(match["pattern"], names)]:
-            full = f"{field}.{label}"
+            full = f"{field}.{label}" + ("" if column is None else f"[{column}]")
             if field in _SIGNALS:
                 signals = [i for name in members for i in self._signals[name]]
                 self._append(parameter, full, field, *_SIGNALS[field], signals=signals)
-            elif field == "inertia":
-                writes = self._writes([(name, None, 1.0) for name in _INERTIAL], members)
-                nominal = {name: getattr(self.nominal, name) for name in _INERTIAL}
-                if np.linalg.eigvalsh(_pseudo_inertia(nominal, writes[0][1][0]))[0] <= 0.0:
-                    raise ValueError(f"the body {label!r} has no physical inertia: fit its body_mass, or correct it")
-                for k in range(10):
-                    self._append(parameter, f"{full}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
+            elif field in _SIGNED and column is None:
+                for k in range(width):
+                    self._add_field(parameter, f"{full}[{k}]", field, members, [(field, k, 1.0)])
             else:
-                for one in range(width) if field in _SIGNED and column is None else [column]:
-                    self._add_field(parameter, full if one is None else f"{full}[{one}]", field, members, one)
+                self._add_field(parameter, full, field, members, parts)
 
-    def _add_field(self, parameter: Parameter, name: str, field: str, members: list[str], column: int | None) -> None:
-        with_inertia = [("body_inertia", None, 1.0)] if field == "body_mass" else []
-        writes = self._writes(_SERVO.get(field, [(field, column, 1.0), *with_inertia]), members)
-        if field in _SIGNED:
+    def _add_field(self, parameter: Parameter, name: str, field: str, members: list[str], parts: list[_Part]) -> None:
+        writes = []
+        for part, column, sign in parts:
+            self.touched.setdefault(part, set()).update(members)
+            values = np.asarray(getattr(self.nominal, part))
+            grid = np.arange(values.size).reshape(len(values), -1)
+            rows = np.concatenate([grid[elements(self.nominal, part, member)] for member in members])
+            writes.append((part, rows.ravel() if column is None else rows[:, column], sign))
+        if field == "inertia":
+            nominal = {part: getattr(self.nominal, part) for part in _INERTIAL}
+            if np.linalg.eigvalsh(_pseudo_inertia(nominal, writes[0][1][0]))[0] <= 0.0:
+                raise ValueError(f"the body {members[0]!r} has no physical inertia: fit its body_mass, or correct it")
+            for k in range(10):
+                self._append(parameter, f"{name}[{k}]", field, _INERTIA, -np.inf, np.inf, writes=writes)
+        elif field in _SIGNED:
             self._append(parameter, name, "shift", _SIGNED[field], -np.inf, np.inf, writes=writes)
-        elif any(getattr(self.nominal, field).reshape(-1)[places].any() for field, places, _ in writes):
+        elif any(getattr(self.nominal, part).reshape(-1)[places].any() for part, places, _ in writes):
             self._append(parameter, name, "factor", _FACTOR, -_RANGE, _RANGE, writes=writes)
         else:
-            least = 0.0 if field in NOT_NEGATIVE or field in _SERVO else -np.inf
+            least = 0.0 if field in (*NOT_NEGATIVE, "kp", "kd") else -np.inf
             self._append(parameter, name, "shift", _FROM_ZERO.get(field, 1.0), least, np.inf, writes=writes)
-
-    def _writes(
-        self, fields: Iterable[tuple[str, int | None, float]], names: Sequence[str]
-    ) -> list[tuple[str, np.ndarray, float]]:
-        """Get the flat indices of elements in fields."""
-        writes = []
-        for field, column, sign in fields:
-            self.touched.setdefault(field, set()).update(names)
-            values = np.asarray(getattr(self.nominal, field))
-            grid = np.arange(values.size).reshape(len(values), -1)
-            rows = np.concatenate([grid[elements(self.nominal, field, name)] for name in names])
-            writes.append((field, rows.ravel() if column is None else rows[:, column], sign))
-        return writes
 
     def _append(
         self, parameter: Parameter, name: str, kind: str, std: float, low: float, high: float, **more: Any

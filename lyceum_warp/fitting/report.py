@@ -13,19 +13,18 @@ from lyceum_warp.viz import LINE, finish_axes, new_figure, save_figure
 
 
 def write_report(
-    fit: Fit, name: str, times: np.ndarray, residuals: np.ndarray, groups: Mapping[str, np.ndarray]
-) -> Path:
+    folder: Path, fit: Fit, name: str, times: np.ndarray, residuals: np.ndarray, groups: Mapping[str, np.ndarray]
+) -> None:
     """Write the pictures, and report.html, which contains them.
 
     Args:
+        folder: Where to write.
         fit: The fit.
         name: Name of the model.
         times: Times of the samples in seconds, (windows, samples).
         residuals: In multiples of the noise, (windows, samples, columns).
         groups: Columns of each kind of measurement.
     """
-    folder = fit.folder
-    assert folder is not None
     correlations = new_figure("a fit", 3.0 + 0.25 * len(fit.names), 2.0 + 0.25 * len(fit.names))
     axes = correlations.subplots()
     correlations.colorbar(axes.imshow(fit.correlation, cmap="RdBu_r", vmin=-1.0, vmax=1.0))
@@ -45,4 +44,4 @@ def write_report(
     ):
         data = base64.b64encode(save_figure(figure, folder / file).read_bytes()).decode()
         parts.append(f"<h2>{title}</h2><img alt='{title}' style='max-width: 100%' src='data:image/png;base64,{data}'>")
-    return html_page(folder / "report.html", f"Fit of {name}", parts)
+    html_page(folder / "report.html", f"Fit of {name}", parts)

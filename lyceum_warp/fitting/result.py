@@ -59,9 +59,8 @@ class Fit:
             for name, kind, value, low, high, known in zip(*columns, self.determined, strict=True)
         ]
         for weights in self.directions:
-            lines.append(
-                f"can't be told apart: {', '.join(f'{weight:+.2f} {name}' for name, weight in weights.items())}"
-            )
+            named = (f"{weight:+.2f} {name}" for name, weight in weights.items())
+            lines.append(f"can't be told apart: {', '.join(named)}")
         lines.append("errors of prediction in windows held back:")
         for name, (nominal, fitted) in self.errors.items():
             lines.append(f"{name}: {nominal:.3g} nominal, {fitted:.3g} fitted, noise {self.noise[name]:.3g}")

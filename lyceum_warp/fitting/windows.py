@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -64,9 +65,7 @@ def cut_windows(log: Log, parameters: Parameters, seconds: float) -> Windows:
             rows.append((number, begin, time, np.where(time[:, None] < lead - 1e-6, np.nan, take.measured[inside])))
             begin = take.time[np.searchsorted(take.time, begin + steps * step - 1e-6)]
     if not rows:
-        raise ValueError(
-            f"no take of the log has the {seconds:g} s of a window: record longer takes, or shorten the window"
-        )
+        raise ValueError(f"no take has the {seconds:g} s of a window: record longer takes, or shorten the window")
     most = max(len(row[2]) for row in rows)
     time, measured = np.zeros((len(rows), most)), np.full((len(rows), most, len(log.columns)), np.nan)
     for i, row in enumerate(rows):
@@ -102,17 +101,14 @@ class Predictor:
             qpos, qvel and act for each memory, (windows, nq + nv + na).
         """
         model, signals = self.parameters.model(x), self.parameters.signals(x)
-        return [self._tracked(windows, model, signals, memory) for memory in memories]
-
-    def _tracked(self, windows: Windows, model: mujoco.MjModel, signals: Signals, memory: float) -> np.ndarray:
         data, step = self._data, model.opt.timestep
-        states = np.empty((len(windows), model.nq + model.nv + model.na))
+        states = [np.empty((len(windows), model.nq + model.nv + model.na)) for _ in memories]
         gain, bias = (signals[name][model.nu :] for name in ("gain", "bias"))
         none = np.zeros((2, 0), int)
         columns = {name: self.sources.get(name, none) for name in ("qpos", "qvel")}
         # velocities that are not measured follow from positions
         change, derived = np.zeros(model.nv), ~np.isin(np.arange(model.nv), columns["qvel"][1])
-        for number in np.unique(windows.take):
+        for (guess, memory), number in itertools.product(zip(states, memories, strict=True), np.unique(windows.take)):
             take, members = self.log.takes[number], np.flatnonzero(windows.take == number)
             steps = round((windows.begin[members[-1]] - take.time[0]) / step) + 1
             whole = dataclasses.replace(windows.chosen(members[:1]), begin=take.time[:1], steps=steps)
@@ -126,19 +122,17 @@ class Predictor:
                 now = take.time[0] + k * step
                 while sample < len(take.time) and take.time[sample] < now + 0.5 * step:
                     pull = 1.0 - np.exp(-(take.time[sample] - last) / memory)
-                    for name, part in (("qpos", data.qpos.copy()), ("qvel", data.qvel.copy())):
-                        source, places = columns[name]
+                    position, velocity = data.qpos.copy(), data.qvel.copy()
+                    for part, (source, places) in ((position, columns["qpos"]), (velocity, columns["qvel"])):
                         part[places] = np.where(np.isnan(seen := measured[sample, source]), part[places], seen)
-                        if name == "qvel":
-                            data.qvel += pull * (part - data.qvel)
-                            continue
-                        mujoco.mj_normalizeQuat(model, part)
-                        mujoco.mj_differentiatePos(model, change, pull, data.qpos, part)
-                        data.qvel += 0.5 * derived * change / memory
-                        mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
+                    mujoco.mj_normalizeQuat(model, position)
+                    mujoco.mj_differentiatePos(model, change, pull, data.qpos, position)
+                    data.qvel += 0.5 * derived * change / memory
+                    data.qvel += pull * (velocity - data.qvel)
+                    mujoco.mj_integratePos(model, data.qpos, change, pull * pull)
                     last, sample = take.time[sample], sample + 1
                 if k in begins:
-                    states[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
+                    guess[begins[k]] = np.concatenate([data.qpos, data.qvel, data.act])
                 data.ctrl[:] = controls[k]
                 mujoco.mj_step(model, data)
         return states
@@ -234,9 +228,9 @@ def _quaternions(columns: Sequence[Column], model: mujoco.MjModel) -> list[list[
     joints = zip(map(mujoco.mjtJoint, model.jnt_type), model.jnt_qposadr.tolist(), strict=True)
     starts = [("qpos", address + _QUATERNION[kind]) for kind, address in joints if kind in _QUATERNION]
     sensors = np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_FRAMEQUAT)
-    groups = [[(name, start + k) for k in range(4)]
-              for name, start in [*starts, *(("sensordata", int(model.sensor_adr[i])) for i in sensors)]]  # fmt: skip
-    return [[numbers[key] for key in group] for group in groups if all(key in numbers for key in group)]
+    starts += [("sensordata", int(model.sensor_adr[i])) for i in sensors]
+    groups = [[numbers.get((name, start + k), -1) for k in range(4)] for name, start in starts]
+    return [group for group in groups if -1 not in group]
 
 
 def _turn(predicted: np.ndarray, measured: np.ndarray) -> np.ndarray:

@@ -5,10 +5,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from hidden_robots import ARM, HOPPING, log_of
+from hidden_robots import ARM, HOPPING, NOISE, log_of
 
 import lyceum_warp as lw
 from lyceum_warp.fitting import Fit
+from lyceum_warp.fitting.windows import Predictor, Windows
 
 TRUTH = {
     "kp.shoulder": 0.2, "kp.elbow": -0.2, "kd.*": 0.15, "dof_armature.*": 0.25, "body_mass.lower": -0.25,
@@ -111,6 +112,30 @@ def test_windows_with_contacts_determine_mass_and_gain() -> None:
         assert abs(x - truth[name]) < 0.03, name
     low, high = coordinates(fit, fit.low), coordinates(fit, fit.high)
     assert all(low[name] <= truth[name] <= high[name] for name in names)
+
+
+def test_small_jumps_of_predictions_neither_stop_a_fit_nor_narrow_its_intervals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    smooth = Predictor.predict
+
+    def jumping(self: Predictor, windows: Windows, states: np.ndarray, xs: np.ndarray, *more: Any) -> np.ndarray:
+        # a number that grows with the parameters and falls by 0.2 times the noise, as the time from a foot's contact
+        # to the end of its substep: few of the finite differences meet a fall
+        phase = 20.0 * xs.sum(axis=1)[:, None, None] + 1e4 * windows.measured[:, None]
+        late = 0.2 * np.repeat([NOISE["qpos"], NOISE["qvel"]], 2) * (phase % 1.0 - 0.5)
+        return smooth(self, windows, states, xs, *more) + late
+
+    truth = {"kp.*": 0.2, "dof_damping.*": -0.2, "body_mass.lower": 0.2}
+    log = log_of(ARM, list(truth), truth, controls(4.0))
+    widths = []
+    for predict in (smooth, jumping):
+        monkeypatch.setattr(Predictor, "predict", predict)
+        fit = lw.fit(mujoco.MjSpec.from_string(ARM), log, list(truth), samples=0, nthread=1)
+        for name, x in coordinates(fit, fit.value).items():
+            assert abs(x - truth[name]) < 0.02, name
+        widths.append(np.log(fit.high / fit.low))
+    assert (widths[1] > 0.5 * widths[0]).all()
 
 
 def test_default_fit_of_a_free_base_writes_a_folder(tmp_path: Path) -> None:

@@ -48,6 +48,16 @@ WRONG: dict[str, tuple[Callable[[Log], Log], str]] = {
     "another field": (lambda log: {**log, "qpo": log["qpos"]}, "the column 'qpo' is unknown: did you mean qpos"),
     "no controls": (lambda log: {k: v for k, v in log.items() if k != "ctrl"}, "add the column 'ctrl.shoulder'"),
     "NaN in controls": (with_value("ctrl", 7, np.nan), "'ctrl' is not finite in row 7"),
+    "NaN in one control": (
+        lambda log: (
+            {k: v for k, v in log.items() if k != "ctrl"}
+            | {
+                f"ctrl.{name}": np.where(np.arange(600) == 7, np.nan, log["ctrl"][:, 1])
+                for name in ("shoulder", "elbow")
+            }
+        ),
+        "'ctrl.shoulder' is not finite in row 7",
+    ),
     "a column of NaN": (lambda log: log | {"qvel": np.full_like(log["qvel"], np.nan)}, "has no numbers"),
     "infinite": (with_value("qvel", 3, np.inf), "infinite"),
     "a constant": (lambda log: log | {"qvel": np.zeros_like(log["qvel"])}, "is always 0.*connected"),
@@ -84,6 +94,13 @@ def test_gaps_and_several_recordings_become_takes(recorded: Log) -> None:
     read = read_log([late, recorded], MODEL)
     assert [len(take.time) for take in read.takes] == [200, 400, 600]
     assert "1 gaps, the longest of 2.01 s" in read.notes[0]
+
+
+def test_recordings_may_order_their_columns_differently(recorded: Log) -> None:
+    read = read_log([recorded, dict(reversed(recorded.items()))], MODEL)
+    assert np.array_equal(read.takes[0].measured, read.takes[1].measured)
+    with pytest.raises(ValueError, match=r"take 1 measures other quantities.*: qvel\[0\], qvel\[1\]"):
+        read_log([recorded, {name: values for name, values in recorded.items() if name != "qvel"}], MODEL)
 
 
 def test_saved_episode_is_a_log(tmp_path: Path) -> None:
