@@ -157,7 +157,7 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
         return [*train, "--resume", str(folder), *COMMON]
     until = ("--gate-every", "10") if case.target is None else ("--target-return", str(case.target))
     return [
-        *train, case.task, *case.flags.split(), "--device", device, "--seed", str(case.seed), *until,
+        *train, case.task, "--device", device, "--seed", str(case.seed), *until, *case.flags.split(),
         "--out", str(folder), *COMMON,
     ]  # fmt: skip
 
