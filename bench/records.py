@@ -46,7 +46,7 @@ FEWER_OBSERVATIONS = (
 )  # fmt: skip
 """Command-line flags for Gymnasium's humanoid with only positions and velocities as observations."""
 FEW_WORLDS = (
-    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32",
+    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32", "--gate-every", "30",
     "--hidden", "128", "128", "--value-hidden", "128", "128",
 )  # fmt: skip
 STRONG_TRACKING = (
