@@ -13,6 +13,7 @@ seconds is stored as well. Medians count it as slower than every run that reache
 
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -45,7 +46,7 @@ FEWER_OBSERVATIONS = (
 )  # fmt: skip
 """Command-line flags for Gymnasium's humanoid with only positions and velocities as observations."""
 FEW_WORLDS = (
-    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32",
+    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32", "--gate-every", "30",
     "--hidden", "128", "128", "--value-hidden", "128", "128",
 )  # fmt: skip
 STRONG_TRACKING = (
@@ -120,6 +121,8 @@ class Options(experiment.Options):
     """Seconds after which a run is stored without having reached its target."""
     runs: Path = Path("runs/records")
     """Folder in which the runs are stored."""
+    flags: str = ""
+    """More flags for `lyceum-warp train`, as in --flags="--nworld 8192 --num-steps 12"."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -141,7 +144,8 @@ def cases(options: Options) -> list[Case]:
             raise ValueError(f"{task} has no target on {kind}: give --device {next(iter(RECORDS[task]))}")
     seeds = options.seeds or range(1 if options.short else 3)
     return [
-        Case(task, 20.0 if options.short and target else target, seed, cache, kind, " ".join(flags))
+        Case(task, 20.0 if options.short and target else target, seed, cache, kind,
+             " ".join((*flags, *options.flags.split())))
         for task in tasks if kind in RECORDS[task] for target, flags in [RECORDS[task][kind]]
         for seed in seeds for cache in options.cache
     ]  # fmt: skip
@@ -153,7 +157,7 @@ def command(case: Case, folder: Path, device: str) -> list[str]:
         return [*train, "--resume", str(folder), *COMMON]
     until = ("--gate-every", "10") if case.target is None else ("--target-return", str(case.target))
     return [
-        *train, case.task, *case.flags.split(), "--device", device, "--seed", str(case.seed), *until,
+        *train, case.task, "--device", device, "--seed", str(case.seed), *until, *case.flags.split(),
         "--out", str(folder), *COMMON,
     ]  # fmt: skip
 
@@ -190,15 +194,21 @@ def measure(case: Case, options: Options) -> dict[str, Any]:
 def cache(case: Case, options: Options, folder: Path) -> Iterator[dict[str, str]]:
     if case.cache == "warm":
         if not folder.exists():
-            with tempfile.TemporaryDirectory() as spare:
-                once = command(case, Path(spare) / "run", options.device)
-                once[once.index("--iterations") + 1] = "1"
-                run(once, dict(os.environ)).wait()
+            fill_cache(dataclasses.replace(case, seed=0), options.device)
         yield dict(os.environ)
         return
     with tempfile.TemporaryDirectory() as empty:
         caches = {"WARP_CACHE_PATH": "warp", "CUDA_CACHE_PATH": "cuda", "TORCHINDUCTOR_CACHE_DIR": "inductor"}
         yield os.environ | {name: f"{empty}/{folder}" for name, folder in caches.items()}
+
+
+@functools.cache
+def fill_cache(case: Case, device: str) -> None:
+    """Run one iteration, once for all seeds."""
+    with tempfile.TemporaryDirectory() as spare:
+        once = command(case, Path(spare) / "run", device)
+        once[once.index("--iterations") + 1] = "1"
+        run(once, dict(os.environ)).wait()
 
 
 def run(command: Sequence[str], environment: dict[str, str]) -> "subprocess.Popen[bytes]":

@@ -28,6 +28,8 @@ from lyceum_warp.training.runs.task_copy import run_env
 
 _SEEDS = 2
 """Number of seeds with which a policy must pass."""
+_PAUSE = 3.0
+"""Least time between two tests for which training waits, in durations of the first."""
 
 
 class _Tester:
@@ -71,10 +73,12 @@ class PassGate(Callback):
     Subprocesses test the newest policy while training continues, so that training ends some iterations after the policy
     that passes. That policy is kept in a numbered file of the run's folder. Every verdict is a line of ``gate.jsonl``,
     with the seconds that the test took. Each test uses a new seed. On four cores or more, both seeds are tested at the
-    same time. On fewer, the second seed is only tested if the policy passes with the first.
+    same time. On fewer, the second seed is only tested if the policy passes with the first. If training also needs
+    these few cores, it waits for the tests, and then continues for at least three times as long as they took.
 
     Args:
-        every: Iterations between policies to test. While a test lasts, the next ones are left out.
+        every: Iterations between policies to test. While a test or the pause after it lasts, the next ones are left
+            out.
 
     Raises:
         ValueError: ``every`` is not a positive number, the task has no gate, or its code is not a file of its own.
@@ -100,15 +104,23 @@ class PassGate(Callback):
         self._tested: int | None = None
         cores = cpu_cores()
         count = _SEEDS if cores >= 4 else 1
-        self._testers = [_Tester(run.folder, max(1, (cores - 1) // count)) for _ in range(count)]
+        self._waits, self._due = count == 1 and learner.env.device.is_cpu, 0.0
+        free = cores if self._waits else max(1, (cores - 1) // count)
+        self._testers = [_Tester(run.folder, free) for _ in range(count)]
 
     def __call__(self, iteration: Iteration) -> bool:
         """Read verdicts if there are some, and test the next policy if none is being tested."""
         if self._tested is not None and self._passed(wait=False):
             return True
-        if self._tested is None and iteration.iteration % self.every == 0:
+        began = time.perf_counter()
+        if self._tested is None and iteration.iteration % self.every == 0 and began >= self._due:
             self._test(iteration.iteration)
-        return self._tested is not None and iteration.iteration >= self._last and self._passed(wait=True)
+        if self._tested is None or not (self._waits or iteration.iteration >= self._last):
+            return False
+        passed = self._passed(wait=True)
+        ended = time.perf_counter()
+        self._due = ended + _PAUSE * (ended - began)
+        return passed
 
     def _test(self, number: int) -> None:
         learner, path = self._learner, self._run.numbered(number)

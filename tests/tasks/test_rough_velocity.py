@@ -97,6 +97,35 @@ def test_robots_start_at_their_level_and_reach_higher_levels_by_walking(task: st
     assert commanded.any() and (memory("level")[commanded] == 2).all()
 
 
+@pytest.mark.quick("go1_rough_velocity")
+@pytest.mark.parametrize("task", TASKS)
+def test_robot_that_leaves_its_patch_goes_on_one_level_higher_in_the_same_episode(task: str, env: lw.Env) -> None:
+    middles = torch.from_numpy(TERRAIN.origins)
+    column = env.state_space.split(env.get_state())["column"][:, 0].long()
+    for level in range(2):
+        walking = env.get_state()
+        env.state_space.split(walking)["drawn_velocity"][:] = torch.tensor([1.0, 0.0, 0.0])
+        env.set_state(walking)
+        for world in range(NWORLD):
+            x, y, _ = middles[level, column[world]].tolist()
+            put(env, world, x, y + 0.5 * TERRAIN.patch + 0.1)
+        joints = env.field("qpos")[:, 7:].clone()
+        env.step()
+        position = env.field("qpos")
+        away = position[:, :2] - middles[level + 1, column, :2]
+        assert (away.abs() <= 0.5 + 1e-5).all() and (position[:, 7:] - joints).abs().max() < 0.2
+        assert not env.done.any() and (env.episode_step == level + 1).all()
+        assert (parts(env, "critic")["foot_height"] > -0.02).all() and (env.metrics["terrain_level"] == level).all()
+    env.rand_reset()
+    levels = env.state_space.split(env.get_state())["level"][:, 0]
+    assert (levels == 2.0).all()  # a fall after a rise does not lower the level
+    env.set_params(climbing=False)
+    put(env, 0, *(middles[2, column[0], :2] + 0.6 * TERRAIN.patch).tolist())
+    env.step()
+    env.set_params(climbing=True)
+    assert (env.field("qpos")[0, :2] - middles[2, column[0], :2]).min() > 4.0
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_robot_outside_the_field_ends_the_episode(task: str, env: lw.Env) -> None:
     state = env.get_state()

@@ -21,6 +21,7 @@ class World(walking.World):
     column: Row[float] = lw.lasting_memory()
     walked: Row[float] = lw.lasting_memory()  # distance from the patch's centre, m
     commanded: Row[float] = lw.lasting_memory()  # commanded distance of an episode, m
+    climbed: Row[float] = lw.memory()  # 1 if the level has risen in this episode
 
 
 @wp.struct
@@ -28,6 +29,7 @@ class Params(walking.Params):
     terrain: wp.array2d[float] = lw.height_field("terrain")  # heights of the ground, m
     origins: wp.array2d[wp.vec3] = TERRAIN.origins  # middle of each patch, by level and column, m
     patch: float = TERRAIN.patch  # side of a patch, m
+    climbing: bool = True  # whether a robot that leaves its patch goes on in the middle of a patch of the next level
     episode_seconds: float = 20.0  # duration of a whole episode, for the commanded distance, s
     scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)  # points of the height scan around the robot, m
     scan_noise: float = 0.1  # largest, m
@@ -93,8 +95,29 @@ def observe_critic(s: World, p: Params, obs: Critic):
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
     walking.advance(s0, action, s1, p, rng)
     c = walking.command(s1, p)
-    distance = p.episode_seconds * wp.length(wp.vec2(c[0], c[1]))
+    distance = wp.where(s1.climbed[0] > 0.0, 0.0, p.episode_seconds * wp.length(wp.vec2(c[0], c[1])))
     lw.follow_walk(s1.level, s1.column, s1.walked, s1.commanded, p.origins, base(s1), distance)
+
+
+@wp.func
+def move(s: World, p: Params, way: wp.vec3):
+    """Move a robot horizontally and as high as no foot gets deeper into the ground than before."""
+    rise = float(-1e6)
+    for foot in range(p.feet.shape[0]):
+        x, _ = walking.foot_motion(s, p, foot)
+        rise = wp.max(rise, ground(x + way, s, p) - ground(x, s, p))
+    lw.put(s.qpos, 0, base(s) + wp.vec3(way[0], way[1], rise))
+
+
+@wp.func
+def event(s: World, p: Params, rng: Row[wp.uint32]):
+    walking.event(s, p, rng)
+    if p.climbing and s.walked[0] > 0.5 * p.patch:
+        level = lw.next_level(int(s.level[0]), s.walked[0], 0.0, p.patch, p.origins.shape[0], rng)
+        s.level[0] = float(level)
+        s.climbed[0] = 1.0
+        move(s, p, p.origins[level, int(s.column[0])] + lw.uniform(rng, p.start_low, p.start_high) - base(s))
+        lw.follow_walk(s.level, s.column, s.walked, s.commanded, p.origins, base(s), 0.0)
 
 
 @wp.func
