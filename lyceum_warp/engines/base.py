@@ -139,8 +139,12 @@ class Engine(abc.ABC):
         The step reads ``ctrl`` and the other fields whose ``written`` is True.
         """
 
-    def step_phases(self, nstep: int) -> list[Phase]:
-        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately."""
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
+
+        Consecutive parts of a step are ``first``, ``last``, or neither. Until the last part, the fields of the position
+        and velocity stages may be outdated.
+        """
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod

@@ -156,11 +156,13 @@ class Worlds(Resets):
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step's substeps."""
-        skip = self.task.frame_skip if substeps is None else substeps
+        engine, skip = self.engine, self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
-            return self.engine.step_phases(skip)
-        substep = [*self.engine.step_phases(1), Phase("substep", partial(self._substep, kernel), by_world=True)]
-        return substep * skip
+            return engine.step_phases(skip)
+        between = Phase("substep", partial(self._substep, kernel), by_world=True)
+        whole = any(engine.fields[name].refresh for name in self.task.source.read_in_substeps & engine.fields.keys())
+        parts = [engine.step_phases(1, first=whole or i == 0, last=whole or i == skip - 1) for i in range(skip)]
+        return [phase for part in parts for phase in (*part, between)]
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
         """List the phases that start episodes in the worlds of ``mask``."""
