@@ -149,9 +149,7 @@ class Worlds(Resets):
             Phase("judge", self._judge_step, by_world=True),
         ]
         if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
-            args = [self.transition, self.outcome.done_reason, self._shares, self.sums]
-            tally = partial(launch_worlds, kernel, self.nworld, args, self.device)
-            phases.append(Phase("tally", tally))  # on a CPU, atomic additions need one thread
+            phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
         return phases
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
@@ -278,6 +276,11 @@ class Worlds(Resets):
         launch_parts(kernels.observe_worlds, parts, self.nworld, args, self.device)
         if parts > 1:
             args = [mask, finite, self.final_obs, self.obs]
+    def _tally(self, kernel: wp.Kernel) -> None:
+        args = [self.transition, self.outcome.done_reason, self._shares]
+        launch_worlds(kernel, self.nworld, args, self.device)
+        launch_lanes(self.task.kernels.add_tallies, self.nworld, [self._shares, self.sums], self.device)
+
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
