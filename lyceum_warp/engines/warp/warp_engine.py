@@ -97,7 +97,7 @@ class WarpEngine(Engine):
         # the parts that the next step can skip, because the last step or restart has computed them
         moves_mocap = any(self.fields[name].written for name in ("mocap_pos", "mocap_quat") if name in self.fields)
         current_parts = () if moves_mocap else self._current_parts or ()
-        self._shared = tuple(part for part in current_parts if part in forward.POSITION)
+        self._shared = tuple(part for part in current_parts if part in forward.SKIPPED)
         self._conditional = Conditional(device)
         # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
         self._partial = self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
