@@ -79,6 +79,8 @@ class Engine(abc.ABC):
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     estimated_bytes: int = 0
     """The estimate of ``bytes_per_world``; 0 if the engine has none."""
+    refreshes_all: bool = False
+    """Whether ``refresh`` computes all derived fields in every world, and ``refresh_current`` does the same."""
     state_size: int
     """The number of floats in one world's state: the integration state, ``snapshots`` and the model fields."""
 

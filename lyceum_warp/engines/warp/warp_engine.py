@@ -101,6 +101,9 @@ class WarpEngine(Engine):
         self._conditional = Conditional(device)
         # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
         self._partial = self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
+        if self._current_parts and self._partial is None:
+            fields = [field for field in self.snapshots if field.reset > Stage.NONE]
+            self.refreshes_all = self._reset_parts == self._current_parts and not fields
         self._settling: PartialForward | None = None
         self.apply_model(self._everyone)
 
