@@ -165,7 +165,7 @@ def environment(case: Case, options: Options, folder: Path) -> Iterator[dict[str
 def policies(run: lw.Run, done: Sequence[Sequence[float]], minutes: float) -> Iterator[tuple[float, Path]]:
     """Yield each mark and the last policy that was saved before it. The clock runs only while the command runs."""
     files = sorted((file.stat().st_mtime, file) for file in (run.folder / "policies").glob("*.pt"))
-    for mark in [mark for mark in MARKS if mark <= minutes]:
+    for mark in [*(mark for mark in MARKS if mark < minutes), minutes]:
         left, wall = 60.0 * mark, done[-1][1] + 60.0
         for start, end in done:
             if left <= end - start:

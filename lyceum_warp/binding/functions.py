@@ -14,7 +14,7 @@ from lyceum_warp.binding.parts import parts_of
 from lyceum_warp.binding.sources import is_struct, name_of, overloads, source_of
 from lyceum_warp.binding.task_terms import Terms
 from lyceum_warp.binding.variants import Variant, merged, variant_of
-from lyceum_warp.binding.writes import Rights, check_reads, check_writes, written_fields
+from lyceum_warp.binding.writes import Rights, check_reads, check_writes, trace, written_fields
 from lyceum_warp.core.fields import INITIAL, INPUTS, is_data_field
 from lyceum_warp.core.model_fields import is_model_field
 from lyceum_warp.core.spaces import OWN_PARTS
@@ -84,6 +84,12 @@ class TaskSource:
     def written(self) -> dict[str, frozenset[str]]:
         """The fields and the parts of memory that each function writes."""
         return {name: written_fields(f) if f is not None else frozenset() for name, f in self.functions.items()}
+
+    @functools.cached_property
+    def read_in_substeps(self) -> frozenset[str]:
+        """The fields of World that ``substep`` reads or may read."""
+        function = self.functions["substep"]
+        return frozenset() if function is None else written_fields(function) | trace(function).reads.keys()
 
     @property
     def drawn_between_steps(self) -> frozenset[str]:

@@ -79,6 +79,8 @@ class Engine(abc.ABC):
     """The number of floats in one world's integration state (mjSTATE_INTEGRATION)."""
     estimated_bytes: int = 0
     """The estimate of ``bytes_per_world``; 0 if the engine has none."""
+    refreshes_all: bool = False
+    """Whether ``refresh`` computes all derived fields in every world, and ``refresh_current`` does the same."""
     state_size: int
     """The number of floats in one world's state: the integration state, ``snapshots`` and the model fields."""
 
@@ -139,8 +141,12 @@ class Engine(abc.ABC):
         The step reads ``ctrl`` and the other fields whose ``written`` is True.
         """
 
-    def step_phases(self, nstep: int) -> list[Phase]:
-        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately."""
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+        """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
+
+        Consecutive parts of a step are ``first``, ``last``, or neither. Until the last part, the fields of the position
+        and velocity stages may be outdated.
+        """
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 
     @abc.abstractmethod

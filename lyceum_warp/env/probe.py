@@ -132,13 +132,13 @@ class _Run:
         self._ctrl = self._rows((1, task.model.nu), values=self._one(worlds.engine.ctrl))
         self._metrics = self._rows((1, len(task.metrics)))
         self._streams = self._rows((len(self.groups), 1), wp.uint32)
-        self._sums = self._rows((1, worlds.sums.size))
         with wp.ScopedDevice(worlds.device):
-            self._totals = wp.zeros(worlds.sums.size, dtype=wp.int64)
+            no_sums, self._totals = wp.zeros((1, worlds.sums.size), dtype=float), wp.zeros_like(worlds.sums)
             self._no_fault = wp.zeros(1, dtype=int)
             self._yes, self._no = wp.full(1, True, dtype=bool), wp.full(1, False, dtype=bool)
             self._findings = zeros_of(step_types.Findings, 1, fault=(worlds.judged_parts, 1))
             self._transition.counters = zeros_of(step_types.Counters, 1, rng=(0, 1))
+        self._sums = self._rows((1, worlds.sums.size), values=no_sums)
         self._transition.counters.rng = self._streams.array
         self._transition.action = self._action.array
 
@@ -166,8 +166,9 @@ class _Run:
         yield from self._written_fields("advance")
         if shared is not None:
             declared = f"Sums declares {self._sums.size}"
-            self._launch(kernels.tally_worlds, t, self._no_fault, self._sums.array, self._totals)
+            self._launch(kernels.tally_worlds, t, self._no_fault, self._sums.array)
             yield self._checked("tally", self._sums, "sums", declared)
+            self._launch(kernels.add_tallies, self._sums.array, self._totals, 1)
             self._launch(kernels.share_memory, self._totals, self._sums.array, t.params, shared.array)
             yield self._checked("share", self._sums, "sums", declared)
             yield self._checked("share", shared, "shared", f"Shared declares {shared.size}")

@@ -109,17 +109,20 @@ class Worlds(Resets):
             phases = [phase for part in parts for phase in part]
             return [self._merged(mask, phases)] if skip and phases else phases
 
-        restarting, observe = self.restarting, self._observe_phases()
-        restart, refresh = self.restart_phases(restarting, randomly=True), self.refresh_phases(restarting)
-        if (kernel := self.task.kernels.run_events) is None:
-            episodes = only(restarting, restart, refresh, observe)
+        restarting, events = self.restarting, list[Phase]()
+        if (kernel := self.task.kernels.run_events) is not None:
+            moved = only(self._physics_changed, self._moved_phases())
+            events = [Phase("event", partial(self._event, kernel)), *moved]
+        outdated = self._outdated if events else restarting
+        restart = self.restart_phases(restarting, randomly=True)
+        observe = [Phase("observe", partial(self._observe, outdated), by_world=True)]
+        if events and not self.engine.refreshes_all:
+            episodes = [*only(restarting, restart, self.refresh_phases(restarting)), *observe]
         else:
-            events = [
-                Phase("event", partial(self._event, kernel)), *only(self._physics_changed, self._moved_phases()),
-            ]  # fmt: skip
-            episodes = [*only(restarting, restart), *events, *only(restarting, refresh), *observe]
+            episodes = only(outdated, restart, self.refresh_phases(outdated), observe)
         final = [Phase("final pictures", self._keep_final_pictures)] if self._final_pictures else []
-        return [*self.transition_phases(substeps), *only(restarting, final), *episodes, *self.picture_phases()]
+        ends = [*self.transition_phases(substeps), *only(restarting, final)]
+        return [*ends, *events, *episodes, *self.picture_phases()]
 
     def picture_phases(self) -> list[Phase]:
         """List the phase that renders the pictures of all worlds, if there are cameras."""
@@ -149,18 +152,18 @@ class Worlds(Resets):
             Phase("judge", self._judge_step, by_world=True),
         ]
         if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
-            args = [self.transition, self.outcome.done_reason, self._shares, self.sums]
-            tally = partial(launch_worlds, kernel, self.nworld, args, self.device)
-            phases.append(Phase("tally", tally))  # on a CPU, atomic additions need one thread
+            phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
         return phases
 
     def physics_phases(self, substeps: int | None = None) -> list[Phase]:
         """List the phases of a step's substeps."""
-        skip = self.task.frame_skip if substeps is None else substeps
+        engine, skip = self.engine, self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
-            return self.engine.step_phases(skip)
-        substep = [*self.engine.step_phases(1), Phase("substep", partial(self._substep, kernel), by_world=True)]
-        return substep * skip
+            return engine.step_phases(skip)
+        between = Phase("substep", partial(self._substep, kernel), by_world=True)
+        whole = any(engine.fields[name].refresh for name in self.task.source.read_in_substeps & engine.fields.keys())
+        parts = [engine.step_phases(1, first=whole or i == 0, last=whole or i == skip - 1) for i in range(skip)]
+        return [phase for part in parts for phase in (*part, between)]
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:
         """List the phases that start episodes in the worlds of ``mask``."""
@@ -175,14 +178,9 @@ class Worlds(Resets):
         phases, changed = [], self._physics_changed
         if any(field.name in self.task.writes["event"] for field in self.task.dynamics):
             phases.append(Phase("event dynamics", partial(self.engine.apply_model, changed), engine=True))
-        if self.engine.stage > Stage.NONE:
+        if self.engine.stage > Stage.NONE and not self.engine.refreshes_all:
             phases.append(Phase("event refresh", partial(self.engine.refresh_current, changed), engine=True))
         return phases
-
-    def _observe_phases(self) -> list[Phase]:
-        """List the phases that write new observations after a restart or an event."""
-        changed = self.restarting if self.task.kernels.run_events is None else self._outdated
-        return [Phase("observe", partial(self._observe, changed), by_world=True)]
 
     def read_phases(self) -> list[Phase]:
         """List the phases that write all states into ``state``."""
@@ -277,6 +275,11 @@ class Worlds(Resets):
         if parts > 1:
             args = [mask, finite, self.final_obs, self.obs]
             launch_lanes(kernels.replace_observations, self.nworld, args, self.device)
+
+    def _tally(self, kernel: wp.Kernel) -> None:
+        args = [self.transition, self.outcome.done_reason, self._shares]
+        launch_worlds(kernel, self.nworld, args, self.device)
+        launch_lanes(self.task.kernels.add_tallies, self.nworld, [self._shares, self.sums], self.device)
 
     def _judge_state(self, *, keep_reason: bool = False) -> None:
         # a state that was set without a check may be invalid; its world then keeps the last valid observation

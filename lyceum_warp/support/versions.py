@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import importlib.metadata
-import os
 import platform
 import shutil
 import subprocess
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+from lyceum_warp.support.machine import cpu_cores
 
 _PACKAGES = ("lyceum-warp", "mujoco", "mujoco-warp", "warp-lang", "torch", "numpy", "gymnasium")
 
@@ -30,7 +31,7 @@ def versions(device: str = "cpu") -> dict[str, Any]:
     with contextlib.suppress(OSError, StopIteration):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         entries["cpu"] = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    entries["cores"] = os.cpu_count()
+    entries["cores"] = cpu_cores()
     if device.startswith("cuda") and torch.cuda.is_available():
         entries["gpu"] = torch.cuda.get_device_name(device)
         entries["cuda"] = torch.version.cuda

@@ -100,9 +100,9 @@ def kind(request: pytest.FixtureRequest) -> type[Engine]:
     return engine
 
 
-def make(kind: type[Engine], sensors: str, equality: str = "none") -> Engine:
+def make(kind: type[Engine], sensors: str, equality: str = "none", names: str = FIELDS) -> Engine:
     model = model_of(sensors, equality)
-    fields = [describe(model, name) for name in ("qpos", "qvel", *FIELDS.split())]
+    fields = [describe(model, name) for name in ("qpos", "qvel", *names.split())]
     sizes = {} if kind is MujocoEngine else {"nconmax": 64, "njmax": 256}
     engine = kind(model, 4, wp.get_device("cpu"), fields, **sizes)
     begin(engine, everyone(engine), 0)
@@ -155,6 +155,20 @@ def test_acceleration_sensors_keep_their_values_from_the_last_substep(kind: type
     put(engine, before, only(engine, 1))
     engine.refresh_current(everyone(engine))
     np.testing.assert_array_equal(shown(engine)["sensordata"][1], left[1])
+
+
+@pytest.mark.quick("mujoco-mixed", "warp-mixed")
+@pytest.mark.parametrize("names", ["xpos", "xpos cvel", FIELDS], ids=["positions", "velocities", "sensors"])
+@pytest.mark.parametrize("sensors", ["mixed", "histories"])
+def test_parts_of_a_step_equal_the_whole_step(kind: type[Engine], sensors: str, names: str) -> None:
+    whole, parts = (make(kind, sensors, names=names) for _ in range(2))
+    for _ in range(3):
+        whole.step(3)
+        for i in range(3):
+            for phase in parts.step_phases(1, first=i == 0, last=i == 2):
+                phase.run()
+        np.testing.assert_array_equal(state_of(parts), state_of(whole))
+        check_current(parts)
 
 
 def test_worlds_that_share_an_mjdata_have_separate_fields() -> None:

@@ -1,5 +1,6 @@
 from typing import Any
 
+import full_task
 import pytest
 import torch
 import warp as wp
@@ -13,6 +14,20 @@ from lyceum_warp.graphs.workers import Workers
 from lyceum_warp.kernels.step_types import OUTCOMES
 
 ENGINES = ["mujoco", "warp"]
+
+
+class CountsPositions(Full):
+    @staticmethod
+    @wp.func
+    def substep(s: full_task.World, p: full_task.Params):
+        s.travel[0] = s.travel[0] + s.qpos[0]
+
+
+class CountsPlaces(Full):
+    @staticmethod
+    @wp.func
+    def substep(s: full_task.World, p: full_task.Params):
+        s.travel[0] = s.travel[0] + s.site_xpos[p.top][0]
 
 
 def outcomes_with_faults(
@@ -68,6 +83,17 @@ def test_results_do_not_depend_on_how_threads_divide_the_worlds(monkeypatch: pyt
     assert len(shared) > 20 and set(shared) == {3}
     assert counts == same_counts
     assert all(torch.equal(a, b) for a, b in zip(together, apart, strict=True))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_substeps_see_current_fields(engine: str) -> None:
+    envs = [lw.make(task, nworld=3, engine=engine) for task in (CountsPositions, CountsPlaces)]
+    for _ in range(4):
+        sums = []
+        for env in envs:
+            env.step(torch.ones_like(env.action))
+            sums.append(env.state_space.split(env.get_state())["travel"])
+    assert torch.equal(*sums) and (sums[0] != 0.0).all()
 
 
 def test_random_numbers_depend_on_the_world_index_over_all_processes() -> None:

@@ -104,8 +104,9 @@ class MujocoEngine(Engine):
         self._state_fields = [field for field in fields if field.name in STATE_FIELDS]
         self._derived = [field for field in fields if field.name not in STATE_FIELDS]
         current = [field for field in self._derived if field.refresh > Stage.NONE]
-        positions = bool(current) and all(DERIVED_FIELDS.get(field.name) == Stage.POSITION for field in current)
-        self._apart = positions or (bool(current) and any(field.lagged for field in fields))
+        free = {*(name for name, stage in DERIVED_FIELDS.items() if stage == Stage.POSITION), "cvel"}
+        touchless = bool(current) and all(field.name in free for field in current)
+        self._apart = touchless or (bool(current) and any(field.lagged for field in fields))
         """Whether a separate call of ``forward`` computes derived fields."""
         # `forward` may replace other fields by values of another world
         before = [field for field in self._derived if field not in current or field.snapshot]
@@ -113,9 +114,10 @@ class MujocoEngine(Engine):
         # `forward` updates some of their elements
         self._after_forward = [field for field in self._before_forward if field in current]
         self._after_step = [field for field in fields if field.name != "ctrl" and field not in self._before_forward]
-        # positions do not depend on contacts, so skip collision detection, the slowest part of this stage
-        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if positions else 0
-        self._disabled = self.batch.expand("opt.disableflags") if positions else np.zeros(0, dtype=int)
+        self._after_part = [field for field in self._after_step if field not in current] + self._before_forward
+        # these fields do not depend on contacts, so skip collision detection, the slowest part of the stages
+        without = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT.value if touchless else 0
+        self._disabled = self.batch.expand("opt.disableflags") if touchless else np.zeros(0, dtype=int)
         self._step_flags, self._forward_flags = self._disabled.copy(), self._disabled | without
         self._early_columns = np.isin(np.arange(self.model.nsensordata), early_sensor_columns(self.model))
 
@@ -169,20 +171,22 @@ class MujocoEngine(Engine):
         for call in self._steps[nstep]:
             call()
 
-    def step_phases(self, nstep: int) -> list[Phase]:
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+        fields = self._after_step if last else self._after_part
         return [
             Phase("inputs", self._take_inputs, by_world=True),
-            Phase("physics", partial(self._advance, nstep), engine=True),
-            Phase("fields", partial(self._read, self._after_step, self._everyone), by_world=True),
+            Phase("physics", partial(self._advance, nstep, last), engine=True),
+            Phase("fields", partial(self._read, fields, self._everyone), by_world=True),
         ]
 
     def _take_inputs(self) -> None:
         for field in self._inputs:
             launch_rows(widen, self._everyone, flat(self.arrays[field.name]), self._sources[field.name])
 
-    def _advance(self, nstep: int) -> None:
-        call_batch(self.batch, self.batch.step, nstep=nstep, stage=Stage.NONE if self._apart else self.stage)
-        if self._apart:
+    def _advance(self, nstep: int, last: bool) -> None:
+        stage = self.stage if last and not self._apart else Stage.NONE
+        call_batch(self.batch, self.batch.step, nstep=nstep, stage=stage)
+        if last and self._apart:
             self._copy(self._before_forward)
             self._disabled[...] = self._forward_flags
             try:

@@ -22,12 +22,12 @@ from lyceum_warp.support.upstream import forward_functions
 
 Part = Callable[[mjw.Model, mjw.Data], None]
 
-POSITION: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon)
-"""The parts with which a substep or a forward pass begins. They depend only on positions."""
+SKIPPED: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon, mjw.com_vel)
+"""The parts that a substep can skip. They depend only on positions and velocities."""
 
 
 def step(model: mjw.Model, data: mjw.Data, done: Collection[Part] = ()) -> None:
-    """Advance every world of a Data by one substep. Skip the parts in ``done``, which must be parts of ``POSITION``."""
+    """Advance every world of a Data by one substep. Skip the parts in ``done``, which must be parts of ``SKIPPED``."""
     _without(frozenset(done))["step"](model, data)
 
 
@@ -79,7 +79,7 @@ def _without(done: frozenset[Part]) -> dict[str, Callable[..., None]]:
 
     driver = types.SimpleNamespace(collision=collision)
     fwd_position = _copy("fwd_position", fwd_kinematics=fwd_kinematics, collision_driver=driver)
-    inner = _copy("_forward", fwd_position=fwd_position)
+    inner = _copy("_forward", fwd_position=fwd_position, fwd_velocity=_copy("fwd_velocity", smooth=smooth))
     forward = _copy("forward", _forward=inner)
     runge_kutta_forward = _without(frozenset())["_forward"] if done else inner
     step = _copy("step", forward=forward, rungekutta4=_copy("rungekutta4", _forward=runge_kutta_forward))

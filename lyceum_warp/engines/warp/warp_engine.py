@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Collection, Iterable, Iterator
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -16,6 +17,7 @@ from lyceum_warp.engines.warp import forward, sizes, varied_model
 from lyceum_warp.engines.warp.forward import Part, PartialForward, forward_parts
 from lyceum_warp.engines.warp.group import Conditional, group_size
 from lyceum_warp.engines.warp.sizes import data_bytes, probe_sizes, warn_of_unknown_sizes
+from lyceum_warp.graphs.capture import Phase
 from lyceum_warp.kernels import faults
 from lyceum_warp.kernels.state import copy_columns, copy_rows, narrow, widen, zero_columns
 from lyceum_warp.support.arrays import alias, flat, launch_rows, repeated
@@ -95,10 +97,13 @@ class WarpEngine(Engine):
         # the parts that the next step can skip, because the last step or restart has computed them
         moves_mocap = any(self.fields[name].written for name in ("mocap_pos", "mocap_quat") if name in self.fields)
         current_parts = () if moves_mocap else self._current_parts or ()
-        self._shared = tuple(part for part in current_parts if part in forward.POSITION)
+        self._shared = tuple(part for part in current_parts if part in forward.SKIPPED)
         self._conditional = Conditional(device)
         # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
         self._partial = self._group_of_worlds() if self._is_partial() and self._reset_parts is None else None
+        if self._current_parts and self._partial is None:
+            fields = [field for field in self.snapshots if field.reset > Stage.NONE]
+            self.refreshes_all = self._reset_parts == self._current_parts and not fields
         self._settling: PartialForward | None = None
         self.apply_model(self._everyone)
 
@@ -167,12 +172,16 @@ class WarpEngine(Engine):
 
     # physics
 
-    def step(self, nstep: int) -> None:
+    def step(self, nstep: int, *, first: bool = True, last: bool = True) -> None:
         with self._on_device():
             for i in range(nstep):
-                forward.step(self.m, self.d, self._shared if i == 0 else ())
+                forward.step(self.m, self.d, self._shared if first and i == 0 else ())
         self._copy_snapshots(self._everyone, self.snapshots)
-        self.refresh_current(self._everyone)
+        if last:
+            self.refresh_current(self._everyone)
+
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+        return [Phase("physics", partial(self.step, nstep, first=first, last=last), engine=True)]
 
     def _forward(
         self, parts: Collection[Part] | None, stage: Stage, data: mjw.Data | None = None, model: mjw.Model | None = None
