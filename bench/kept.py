@@ -1,8 +1,9 @@
 """Compare the step time of an environment with the step time of its physics engine alone, on the same states.
 
-The environment and the bare engine (the engine without a task) take turns of ten steps, from the same states. The bare
-engine is ``mujoco.batch.Batch.step`` or one graph of ``mujoco_warp.step``. ``kept`` is the bare engine's step time
-divided by the environment's step time, and ``added`` is their difference.
+The environment takes ten steps, and then the same steps again, each after a step of the bare engine (the engine without
+a task) from the same state, with the same controls and model fields. The bare engine is ``mujoco.batch.Batch.step`` or
+one graph of ``mujoco_warp.step``. ``kept`` is the bare engine's step time divided by the environment's step time, and
+``added`` is their difference.
 """
 
 import statistics
@@ -13,15 +14,15 @@ from typing import Any
 import contestants
 import mujoco
 import mujoco_warp as mjw
-import numpy as np
 import torch
 import warp as wp
 from mujoco.batch import Batch
 
 import lyceum_warp as lw
 from lyceum_warp.engines.c.mujoco_engine import MujocoEngine
+from lyceum_warp.engines.c.world_models import WorldModels
 from lyceum_warp.engines.warp.warp_engine import WarpEngine
-from lyceum_warp.support.arrays import torch_view
+from lyceum_warp.support.arrays import flat, torch_view
 
 BLOCK = 10
 """Steps per turn."""
@@ -34,26 +35,26 @@ def next_controls(env: lw.Env) -> torch.Tensor:
 
 
 class BareC:
-    """``mujoco.batch.Batch`` alone, on the states of an environment's C engine."""
+    """``mujoco.batch.Batch`` alone, on the states and model fields of an environment's C engine."""
 
     def __init__(self, env: lw.Env) -> None:
         self.env, engine = env, env.engine
         assert isinstance(engine, MujocoEngine)
         self.rows = engine.batch.state
         self.batch = Batch(engine.batch.model, env.nworld, engine.nthread)
+        self.models = WorldModels(self.batch, engine.dynamics.values())
+        self.values = {name: flat(engine.arrays[name]).numpy() for name in engine.dynamics}
 
-    def snapshot(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.rows.copy(), next_controls(self.env).numpy()
-
-    def load(self, snapshot: tuple[np.ndarray, np.ndarray]) -> None:
-        self.batch.state[:], self.batch.ctrl[:] = snapshot
+    def load(self) -> None:
+        self.models.apply(self.values)
+        self.batch.state[:], self.batch.ctrl[:] = self.rows, next_controls(self.env).numpy()
 
     def step(self) -> None:
         self.batch.step(nstep=self.env.task.frame_skip)
 
 
 class BareWarp:
-    """A graph of ``mujoco_warp.step`` alone, on the states of an environment's Warp engine."""
+    """A graph of ``mujoco_warp.step`` alone, on the states and model fields of an environment's Warp engine."""
 
     def __init__(self, env: lw.Env) -> None:
         self.env, engine = env, env.engine
@@ -68,16 +69,12 @@ class BareWarp:
                     mjw.step(self.m, self.d)
         self.graph = capture.graph
 
-    def snapshot(self) -> tuple[wp.array, torch.Tensor]:
+    def load(self) -> None:
         with wp.ScopedDevice(self.env.device):
             state = wp.zeros((self.env.nworld, self.engine.integration_size), dtype=float)
             mjw.get_state(self.engine.m, self.engine.d, state, self.spec)
-        return state, next_controls(self.env)
-
-    def load(self, snapshot: tuple[wp.array, torch.Tensor]) -> None:
-        with wp.ScopedDevice(self.env.device):
-            mjw.set_state(self.m, self.d, snapshot[0], self.spec)
-        wp.to_torch(self.d.ctrl).copy_(snapshot[1])
+            mjw.set_state(self.m, self.d, state, self.spec)
+        wp.to_torch(self.d.ctrl).copy_(next_controls(self.env))
         synchronize(self.env)
 
     def step(self) -> None:
@@ -98,6 +95,17 @@ def seconds(env: lw.Env, function: Callable[[], object]) -> float:
     function()
     synchronize(env)
     return time.perf_counter() - start
+
+
+def seconds_of_bare(env: lw.Env, bare: BareC | BareWarp, actions: list[torch.Tensor]) -> float:
+    """Return the seconds of the bare engine's steps; the environment takes each step after the bare engine."""
+    total = 0.0
+    for t in range(BLOCK):
+        env.action.copy_(actions[t])
+        bare.load()
+        total += seconds(env, bare.step)
+        env.step()
+    return total
 
 
 def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **place: Any) -> dict[str, Any]:
@@ -128,15 +136,7 @@ def measure(task: str, nworld: int, blocks: int, policy: str | None = None, **pl
         start = env.get_state()
         time_env = seconds(env, block)
         env.set_state(start)
-        snapshots = []
-        for t in range(BLOCK):
-            env.action.copy_(actions[t])
-            snapshots.append(bare.snapshot())
-            env.step()
-        time_bare = 0.0
-        for snapshot in snapshots:
-            bare.load(snapshot)
-            time_bare += seconds(env, bare.step)
+        time_bare = seconds_of_bare(env, bare, actions)
         if repetition >= warm:
             env_seconds.append(time_env / BLOCK)
             bare_seconds.append(time_bare / BLOCK)

@@ -150,15 +150,7 @@ def speed(case: Case) -> dict[str, Any]:
         start = env.get_state()
         time_env = kept.seconds(env, block)
         env.set_state(start)
-        snapshots = []
-        for t in range(kept.BLOCK):
-            env.action.copy_(actions[t])
-            snapshots.append(bare.snapshot())
-            env.step()
-        time_bare = 0.0
-        for snapshot in snapshots:
-            bare.load(snapshot)
-            time_bare += kept.seconds(env, bare.step)
+        time_bare = kept.seconds_of_bare(env, bare, actions)
         if repetition >= 2:
             env_seconds.append(time_env / kept.BLOCK)
             bare_seconds.append(time_bare / kept.BLOCK)

@@ -20,10 +20,11 @@ def is_out_of_range(x: float) -> bool:
 @wp.func
 def row_in_range(row: wp.array[float], lane: int, lanes: int) -> bool:
     """Return whether every element that this thread reads is smaller than 1e10 in magnitude."""
-    for i in range(lane, row.shape[0], lanes):  # noqa: SIM110 (Warp has no all())
+    valid = bool(True)
+    for i in range(lane, row.shape[0], lanes):  # without an early return, a GPU loads several elements at a time
         if is_out_of_range(row[i]):
-            return False
-    return True
+            valid = False
+    return valid
 
 
 @wp.func

@@ -58,10 +58,10 @@ def _make_act(task: TaskCode) -> None:
         if wp.static("control" in task.written):
             task.functions.control(task.view(t.after, w), t.action[w], task.params_of(t, w), ctrl_out[w])
             for i in range(ctrl_out.shape[1]):
-                if wp.isnan(ctrl_out[w, i]):
+                value = ctrl_out[w, i]
+                if wp.isnan(value):
                     fault = fault | NAN
-                    ctrl_out[w, i] = 0.0
-                ctrl_out[w, i] = wp.clamp(ctrl_out[w, i], range_in[i, 0], range_in[i, 1])
+                ctrl_out[w, i] = wp.clamp(wp.where(wp.isnan(value), 0.0, value), range_in[i, 0], range_in[i, 1])
         else:
             for i in range(ctrl_out.shape[1]):
                 ctrl_out[w, i] = control_of(t.action[w, i], i, range_in, scale_in)

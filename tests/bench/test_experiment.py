@@ -100,6 +100,12 @@ def test_results_of_other_machines_and_versions_are_not_reused(
         row = lines(path)[-1]
 
 
+def test_results_count_the_cores_that_the_process_may_use(toy: Any, tmp_path: Path) -> None:
+    with experiment.cores(1):
+        toy.main("--out", tmp_path / "toy.jsonl", "--contestants", "ours")
+    assert lines(tmp_path / "toy.jsonl")[0]["provenance"]["cores"] == 1
+
+
 def test_failing_case_does_not_stop_other_cases(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "toy.jsonl"
     assert toy.main("--out", path, "--contestants", "ours", "--seeds", 14) == 1

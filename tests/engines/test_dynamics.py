@@ -116,6 +116,18 @@ def test_worlds_with_their_own_models_step_like_plain_mujoco(engine: type[Engine
         np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
 
 
+def test_bare_model_has_the_worlds_fields() -> None:
+    engine = make(WarpEngine, *DRAWN)
+    assert isinstance(engine, WarpEngine)
+    model, data = engine.bare()
+    draw(engine)
+    for _ in range(5):
+        mjw.step(model, data)
+    engine.step(5)
+    np.testing.assert_array_equal(data.qpos.numpy(), engine.arrays["qpos"].numpy())
+    assert np.ptp(data.qpos.numpy(), axis=0).max() > 1e-3
+
+
 @pytest.mark.parametrize("engine", ENGINES)
 def test_restored_nominal_values_give_the_steps_of_the_shared_model(engine: type[Engine]) -> None:
     made, shared = make(engine, *DRAWN), make(engine)

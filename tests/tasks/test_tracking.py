@@ -247,9 +247,7 @@ def test_blind_robots_do_not_observe_position_and_velocity() -> None:
     assert env.metrics["r_mpkpe"].max() < 0.2
 
 
-MEMORY = dict(
-    qpos="qpos", qvel="qvel", last_action="last_action", previous_action="last_action", encoder_bias="joint_position"
-)
+MEMORY = dict(qpos="qpos", qvel="qvel", last_action="last_action", encoder_bias="joint_position")
 
 
 def test_body_that_is_tracked_on_one_side_only_has_no_mirror_image(shared_env: SharedEnv) -> None:

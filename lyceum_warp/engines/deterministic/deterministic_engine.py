@@ -50,7 +50,7 @@ class DeterministicEngine(WarpEngine):
         return _TIMES_THE_MEMORY * super().bytes_per_world(model, fields, dynamics, **options)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone.
+        """Make another Data of the same size, and a Model with this engine's arrays, to benchmark MuJoCo Warp alone.
 
         Their launches do not share scratch memory. A graph of their step therefore takes about a hundred times the
         memory of this engine's graph.

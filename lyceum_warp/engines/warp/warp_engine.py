@@ -1,6 +1,7 @@
 """Step worlds by MuJoCo Warp in float32, on a CUDA device or on the CPU: the Warp engine."""
 
 import contextlib
+import copy
 from collections.abc import Callable, Collection, Iterable, Iterator
 from functools import partial
 from typing import Any
@@ -120,8 +121,10 @@ class WarpEngine(Engine):
         return wp.ScopedDevice(self.device)
 
     def bare(self) -> tuple[mjw.Model, mjw.Data]:
-        """Make another Model and Data with the same options and sizes, to benchmark MuJoCo Warp alone."""
-        return self._put_model(), self._make_data(self.nworld)
+        """Make another Data of the same size, and a Model with this engine's arrays, to benchmark MuJoCo Warp alone."""
+        model = copy.copy(self.m)
+        model.opt, model.callback = copy.copy(self.m.opt), copy.copy(self.m.callback)
+        return model, self._make_data(self.nworld)
 
     # memory
 

@@ -22,7 +22,7 @@ import warp as wp
 import lyceum_warp as lw
 from lyceum_warp import Row, clip_tables, terms, walkers
 from lyceum_warp.tasks.tracking import gates
-from lyceum_warp.terms import action_rate_l2, joint_limits  # noqa: F401
+from lyceum_warp.terms import joint_limits  # noqa: F401
 
 
 @wp.struct
@@ -55,7 +55,6 @@ class World:
     collision_time: Row[float] = lw.memory()  # seconds of contact between parts of the robot in the episode so far
     push_timer: Row[float] = lw.memory()  # seconds until a push
     last_action: Row[float] = lw.memory("joints")
-    previous_action: Row[float] = lw.memory("joints")
     encoder_bias: Row[float] = lw.lasting_memory("joints")  # rad
     shared: Shared
 
@@ -230,6 +229,11 @@ def body_velocity(errors: Errors, body_velocity_std: float) -> float:
 @wp.func
 def body_spin(errors: Errors, body_spin_std: float) -> float:
     return wp.exp(-errors.spin / (body_spin_std * body_spin_std))
+
+
+@wp.func
+def action_rate_l2(s0: World, action: Row[float]) -> float:
+    return terms.action_rate_l2(action, s0.last_action)
 
 
 @wp.func
@@ -434,7 +438,6 @@ def substep(s: World, p: Params):
 
 @wp.func
 def advance(s0: World, action: Row[float], s1: World, p: Params, rng: Row[wp.uint32]):
-    lw.put(s1.previous_action, 0, s0.last_action)
     lw.put(s1.last_action, 0, action)
     terms.run_timer(s1.push_timer, p.dt)
     s1.frame[0] = float(next_row(s0, p))
