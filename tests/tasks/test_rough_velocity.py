@@ -100,6 +100,7 @@ def test_robots_start_at_their_level_and_reach_higher_levels_by_walking(task: st
 @pytest.mark.quick("go1_rough_velocity")
 @pytest.mark.parametrize("task", TASKS)
 def test_robot_that_leaves_its_patch_goes_on_one_level_higher_in_the_same_episode(task: str, env: lw.Env) -> None:
+    env.set_params(climbing=True)
     middles = torch.from_numpy(TERRAIN.origins)
     column = env.state_space.split(env.get_state())["column"][:, 0].long()
     for level in range(2):
@@ -122,7 +123,6 @@ def test_robot_that_leaves_its_patch_goes_on_one_level_higher_in_the_same_episod
     env.set_params(climbing=False)
     put(env, 0, *(middles[2, column[0], :2] + 0.6 * TERRAIN.patch).tolist())
     env.step()
-    env.set_params(climbing=True)
     assert (env.field("qpos")[0, :2] - middles[2, column[0], :2]).min() > 4.0
 
 

@@ -29,7 +29,7 @@ class Params(walking.Params):
     terrain: wp.array2d[float] = lw.height_field("terrain")  # heights of the ground, m
     origins: wp.array2d[wp.vec3] = TERRAIN.origins  # middle of each patch, by level and column, m
     patch: float = TERRAIN.patch  # side of a patch, m
-    climbing: bool = True  # whether a robot that leaves its patch goes on in the middle of a patch of the next level
+    climbing: bool = False  # whether a robot that leaves its patch goes on in the middle of a patch of the next level
     episode_seconds: float = 20.0  # duration of a whole episode, for the commanded distance, s
     scan: wp.array[wp.vec2] = lw.scan_grid(1.6, 1.0)  # points of the height scan around the robot, m
     scan_noise: float = 0.1  # largest, m
