@@ -173,6 +173,17 @@ class Plant:
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
         self.wanted = [*self.robot.parameters, *(TRUNK if ground else ()), DELAY]
         self.bound, self.rng = Parameters(self.wanted, model), np.random.default_rng(seed)
+        self._draw(kind)
+        while not self._holds(seed):  # servos may be unstable with a long delay
+            self._draw(kind)
+        base = ([0.003] * 3 + [0.002] * 4, [0.05] * 3 + [0.02] * 3) if ground else ([], [])
+        joints = len(self.home)
+        self.noise = np.array([*base[0], *[0.002] * joints, *base[1], *[0.05] * joints])
+        # errors are relative to the value, and those of a trunk's centre relative to 0.1 m
+        self.scale = np.where(["body_ipos" in name for name in self.bound.names], 0.1, self.values)
+
+    def _draw(self, kind: str) -> None:
+        """Draw the values, and make the model with them."""
         draws = [self.rng.uniform(*RANGES[c.kind]) if c.kind in RANGES
                  else self.rng.uniform(-0.02, 0.02) if c.low < 0.0 else self.rng.uniform(0.05, 0.3)
                  for c in self.bound.coordinates]  # fmt: skip
@@ -182,19 +193,20 @@ class Plant:
         if kind == "wrong":
             self.model.opt.timestep /= 2
             self.model.geom_solref[:, 0] *= 1.5
-            bodies = [self.model.body(name).id for name in element_names(model, "body_mass")
+            bodies = [self.model.body(name).id for name in element_names(self.model, "body_mass")
                       if name.endswith(self.robot.heavier)]  # fmt: skip
             self.model.body_mass[bodies] *= 1.03
             self.model.body_inertia[bodies] *= 1.03
             mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
-        base = ([0.003] * 3 + [0.002] * 4, [0.05] * 3 + [0.02] * 3) if ground else ([], [])
-        joints = len(self.home)
-        self.noise = np.array([*base[0], *[0.002] * joints, *base[1], *[0.05] * joints])
-        # errors are relative to the value, and those of a trunk's centre relative to 0.1 m
-        self.scale = np.where(["body_ipos" in name for name in self.bound.names], 0.1, self.values)
 
-    def log(self, seconds: float, seed: int) -> dict[str, np.ndarray]:
-        """Move the robot by test motions, and log it."""
+    def _holds(self, seed: int) -> bool:
+        """Return whether the joints stay in their ranges, or less than 0.5 rad beyond, in short test motions."""
+        positions = self._move(6.0, seed)[1][:, self.model.nq - len(self.home) : self.model.nq]
+        low, high = self.model.jnt_range[-len(self.home) :].T
+        return bool(((low - 0.5 < positions) & (positions < high + 0.5)).all())
+
+    def _move(self, seconds: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the controls of test motions, and the positions and velocities in which each substep begins."""
         reach = 0.12 if self.ground else 0.4
         same: dict[str, Any] = {"frequencies": (0.2, 4.0), "seed": seed}
         moves = [lw.excitation(self.home - reach, self.home + reach, kind, seconds=seconds / 3, **same)
@@ -208,12 +220,16 @@ class Plant:
         start = np.empty(mujoco.mj_stateSize(self.model, full))
         mujoco.mj_getState(self.model, data, start, full)
         rows, _ = mujoco.rollout.rollout(self.model, data, start[None], delayed(control, substep, self.delay)[None])
-        rows = np.concatenate([start[None], rows[0, :-1]])[:: round(each / substep), 1:]
+        return control, np.concatenate([start[None], rows[0, :-1]])[:: round(each / substep), 1:]
+
+    def log(self, seconds: float, seed: int) -> dict[str, np.ndarray]:
+        """Move the robot by test motions, and log it."""
+        control, rows = self._move(seconds, seed)
         rows = rows + self.noise * self.rng.standard_normal(rows.shape)
-        nq, repeat = self.model.nq, round(STEP / each)
+        nq, each = self.model.nq, self.bound.nominal.opt.timestep
         return {
-            "time": each * np.arange(len(rows)), "ctrl": np.repeat(control, repeat, axis=0), "qpos": rows[:, :nq],
-            "qvel": rows[:, nq:],
+            "time": each * np.arange(len(rows)), "ctrl": np.repeat(control, round(STEP / each), axis=0),
+            "qpos": rows[:, :nq], "qvel": rows[:, nq:],
         }  # fmt: skip
 
     def half_widths(self, log: dict[str, np.ndarray], window: float) -> np.ndarray:

@@ -123,7 +123,8 @@ class Placement(OptionFlags, options=[EnvOptions], omit=(*NO_FLAGS, "horizon")):
     cameras: Annotated[str | None, tyro.conf.arg(metavar="NAME:WxH:KIND,...")] = None
     """Cameras of the model whose pictures are observations, such as side or side:64x64,top:84x84:depth; each kind is
     rgb (the default), depth or segmentation. The group of observations is "camera", or with several cameras the name,
-    and _KIND unless it is rgb: side,top_depth. By default, the cameras are those of the run or the task."""
+    and _KIND unless it is rgb: side,top_depth. By default, the cameras are those of the run or the task; "" means
+    none."""
 
 
 class EnvFlags(
@@ -185,8 +186,8 @@ _CAMERA = re.compile(r"([^:]+)(?::(\d+)x(\d+))?(?::([a-z]+))?")
 
 
 def cameras(text: str) -> tuple[Camera, ...]:
-    """Parse cameras, such as side:64x64,top:84x84:depth."""
-    entries = text.split(",")
+    """Parse cameras, such as side:64x64,top:84x84:depth. An empty text means no cameras."""
+    entries = text.split(",") if text else []
     parsed: list[Camera] = []
     for entry in entries:
         if (match := _CAMERA.fullmatch(entry)) is None:

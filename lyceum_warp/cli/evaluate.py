@@ -105,8 +105,8 @@ class Eval:
         place = f"{self.folder} --pretrained" if self.pretrained else self.folder
         if self.clips is not None:
             picture = Path(f"{binding.file_name(env.task.name)}.png") if self.pretrained else run.folder / "clips.png"
-            file, other = run.task_folder / "tables/clips.txt", any(text.startswith("clips=") for text in self.param)
-            names = file.read_text().splitlines() if file.is_file() and not other else ()
+            other = any(text.startswith("clips=") for text in self.param)
+            names = [] if other else training.table_rows(run, "clips")
             print_clips(env, policy, self.clips, names, picture if self.video else None, camera)
             say_entries(next=f"lyceum-warp view {place}")
             return

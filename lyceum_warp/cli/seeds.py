@@ -27,6 +27,8 @@ def train_and_show(command: Any, folder: Path) -> int:
         runs = training.train_seeds(
             command.task, folder, seeds, jobs=command.jobs, watch=lambda runs: live.update(_progress(runs)), **settings
         )
+    if not any((run.folder / "metrics.csv").exists() for run in runs):
+        return 1  # the table has the errors
     groups = training.group_runs(training.read_curves([folder]))
     print_groups(groups)
     figure = tried(training.comparison_figure, groups, folder / "curves.png")

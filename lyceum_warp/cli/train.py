@@ -243,7 +243,8 @@ class Train:
             viz.find_camera(learner.env.model, camera)
             callbacks: list[Callable[[Any], object]] = [*self._callbacks(settings), *more]
         total = configuration.iterations
-        hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}"
+        again = f" --algorithm {configuration.algorithm}" if ".py:" in configuration.algorithm else ""
+        hint = f"continue with\n  lyceum-warp train --resume {folder} --iterations {total}{again}"
         if source is not None and self.go_on and self.resume and _is_complete(source, total, settings):
             if team.leads:
                 say(f"the run in {folder} is complete")
@@ -338,6 +339,13 @@ class Train:
         """Return the configuration of the ``source`` run, or the task's defaults, with the given flags applied."""
         base = self._suggestion(team) if source is None else training.Configuration.of(source)
         algorithm = self.algorithm or base.algorithm
+        if source is not None and self.algorithm is None:
+            own = source.config.get("learner")  # older runs and those of a program lack it
+            if own is not None or algorithm not in training.ALGORITHMS:
+                raise ValueError(
+                    f"the run in {source.folder} was trained by {own or algorithm}, a learner of your own: add "
+                    f"--algorithm path/to/{own or 'file.py:Class'}"
+                )
         if algorithm == "sac" and self.network is not None:
             raise ValueError("sac takes no --network: omit it, or use --algorithm ppo or npg")
         flags = self._given("nworld", "seed") | arguments.given(self.env) | arguments.given(self.physics)

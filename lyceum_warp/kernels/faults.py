@@ -95,7 +95,7 @@ def pool_overflow(
 def faults_of_fields(
     mask_in: wp.array[bool],
     qpos_in: wp.array2d[float],
-    qvel_in: wp.array2d[float],
+    qvel_inout: wp.array2d[float],
     act_in: wp.array2d[float],
     overflow_in: wp.array[int],
     contact_bits: int,
@@ -108,12 +108,17 @@ def faults_of_fields(
 
     Contacts of a geom whose position is NaN leave NaN in rows of the Jacobian. The solver multiplies unused rows by
     zero, and NaN times zero is NaN. So the Jacobian of a world with NaN is cleared.
+
+    A step turns a quaternion with NaN into a valid one. So a velocity becomes NaN, too, and stays so in the next steps.
     """
     w = wp.tid()
     if not mask_in[w]:
         return
     fault = int(0)
-    if not (row_in_range(qpos_in[w], 0, 1) and row_in_range(qvel_in[w], 0, 1) and row_in_range(act_in[w], 0, 1)):
+    placed = row_in_range(qpos_in[w], 0, 1)
+    if not placed:
+        qvel_inout[w, 0] = wp.nan
+    if not (placed and row_in_range(qvel_inout[w], 0, 1) and row_in_range(act_in[w], 0, 1)):
         fault = NAN
         for i in range(jacobian_out.shape[1]):
             for j in range(jacobian_out.shape[2]):

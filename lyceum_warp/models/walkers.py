@@ -154,7 +154,7 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
     Raises:
         ValueError: A joint or a foot has no partner, or the default pose or the scale of actions is not symmetric.
     """
-    data, name = _straight(model), functools.partial(_name, model, _JOINT)
+    data, name = straight(model), functools.partial(_name, model, _JOINT)
     flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
     hinges = np.arange(1, model.njnt)
     partner, sign = np.zeros(model.njnt, int), np.ones(model.njnt)
@@ -226,19 +226,19 @@ def leg_dof(model: mujoco.MjModel, p: Any) -> np.ndarray:
 
 def leg_axes(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Get the axes of ``leg_joints``, (feet, joints of the longest leg, 3)."""
-    data = _straight(model)
+    data = straight(model)
     return data.xaxis[leg_joints(model, p)]
 
 
 def leg_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Get the positions of ``leg_joints`` relative to the previous joint of the leg, or to the base, in m."""
-    anchors = _straight(model).xanchor[leg_joints(model, p)]
+    anchors = straight(model).xanchor[leg_joints(model, p)]
     return np.diff(anchors, axis=1, prepend=0.0)
 
 
 def foot_offsets(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Get each foot's position relative to its last joint, (feet, 3) in m."""
-    data = _straight(model)
+    data = straight(model)
     return np.array([data.site_xpos[foot] - data.xanchor[_last_joint(model, foot)] for foot in p.feet])
 
 
@@ -252,7 +252,7 @@ def soles(model: mujoco.MjModel, p: Any) -> np.ndarray:
     Raises:
         ValueError: A foot has no geom in ``foot_geoms``.
     """
-    data = _straight(model)
+    data = straight(model)
     spheres = []
     for foot in p.feet:
         geoms = [geom for geom in p.foot_geoms if model.geom_bodyid[geom] == model.site_bodyid[foot]]
@@ -330,7 +330,8 @@ def _last_joint(model: mujoco.MjModel, foot: int) -> int:
     return leg_of(model, int(model.site_bodyid[foot]))[-1]
 
 
-def _straight(model: mujoco.MjModel) -> mujoco.MjData:
+def straight(model: mujoco.MjModel) -> mujoco.MjData:
+    """Compute the kinematics with the base at the origin and all hinges at 0."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]] = 0.0
     start = int(model.jnt_qposadr[0])

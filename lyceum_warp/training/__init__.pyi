@@ -50,6 +50,7 @@ from lyceum_warp.training.runs.task_copy import (
     json_value as json_value,
     note_changes as note_changes,
     run_env as run_env,
+    table_rows as table_rows,
     task_copy as task_copy,
 )
 from lyceum_warp.training.seeds import SeedRun as SeedRun, flag_words as flag_words, train_seeds as train_seeds

@@ -1,5 +1,6 @@
 """Train a task with several seeds, each in a process of its own."""
 
+import contextlib
 import ctypes
 import dataclasses
 import os
@@ -25,7 +26,7 @@ class SeedRun:
     state: str = "waiting"
     """"waiting", "training", "complete", "stopped" or "failed"."""
     error: str = ""
-    """The last line of a failed run's output."""
+    """The last line of a failed run's output, or the exception that ended it."""
 
 
 def train_seeds(
@@ -53,7 +54,8 @@ def train_seeds(
         seeds: The number of seeds, counted from 0, or the seeds themselves.
         jobs: Number of runs that train at the same time. Each has its share of the CPU cores, and, with
             ``device="cuda"``, the next GPU in turn.
-        watch: Called about five times a second with all runs.
+        watch: Called about five times a second with all runs. An exception that it raises ends the call, after all
+            runs have finished their iterations and are saved.
         settings: Options of ``lyceum-warp train``, such as ``iterations=60`` for ``--iterations 60``. A dict gives
             several values by name: ``param={"ctrl_cost_weight": 0.05}``.
 
@@ -66,18 +68,20 @@ def train_seeds(
     places = list(_places(min(whole_number("jobs", jobs, low=1), len(runs)), settings.get("device")))
     Path(folder).mkdir(parents=True, exist_ok=True)
     waiting, active = [*runs], dict[int, tuple[SeedRun, subprocess.Popen[bytes]]]()
-    with postponed() as signals:
+    with postponed() as signals, contextlib.ExitStack() as started:
         while active or (waiting and not signals):
             # until a run has begun, it trains alone: what one run refuses, all others would refuse, too
-            alone = active and not any((run.folder / "checkpoint.pt").exists() for run in runs)
+            alone = active and not _begun(runs)
             if waiting and not signals and not alone and len(active) < len(places):
                 slot = min(set(range(len(places))) - active.keys())
                 active[slot] = waiting[0], _start(waiting.pop(0), arguments, *places[slot])
+                started.callback(active[slot][1].wait)
+                started.callback(active[slot][1].terminate)
             time.sleep(0.2)
             for slot, (run, process) in list(active.items()):
                 if process.poll() is not None:
                     del active[slot]
-                    _conclude(run, process.returncode)
+                    _conclude(run, process.returncode, refused=process.returncode == 2 and not _begun(runs))
                 elif signals and run.state == "training":
                     process.terminate()
                     run.state = "stopped"
@@ -142,7 +146,11 @@ def _start(
         )  # fmt: skip
 
 
-def _conclude(run: SeedRun, code: int) -> None:
+def _begun(runs: Sequence[SeedRun]) -> bool:
+    return any((run.folder / "checkpoint.pt").exists() for run in runs)
+
+
+def _conclude(run: SeedRun, code: int, *, refused: bool) -> None:
     """Note how a run has ended."""
     if code == 0:
         run.state = "complete"
@@ -151,7 +159,10 @@ def _conclude(run: SeedRun, code: int) -> None:
         log = run.folder.with_suffix(".log")
         lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
-        if code == 2 and not (run.folder / "checkpoint.pt").exists():  # refused: this line says everything
+        _, found, trace = "\n".join(["", *lines]).rpartition("\nTraceback")
+        if code == 1 and found and run.error == lines[-1]:  # the exception's notes are the last lines
+            run.error = next((line for line in trace.splitlines()[1:] if not line.startswith(" ")), run.error)
+        if refused:  # this line says everything
             log.unlink()
             if not any(log.parent.iterdir()):
                 log.parent.rmdir()

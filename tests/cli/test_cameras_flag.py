@@ -17,6 +17,7 @@ SMALL = "--iterations 2 --nworld 4 --horizon 12 --mean-every 0 --hidden 8 --chan
 
 
 def test_flag_gives_sizes_kinds_and_groups() -> None:
+    assert cameras("") == ()
     assert cameras("side") == (lw.Camera("side"),)
     assert cameras("side:32x24:depth") == (lw.Camera("side", 32, 24, "depth"),)
     assert cameras("side,side:depth,top:16x8:rgb") == (
@@ -32,6 +33,21 @@ def test_flag_gives_sizes_kinds_and_groups() -> None:
 def test_invalid_cameras_print_one_line(text: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["train", "cartpole", "--algorithm", "ppo", "--cameras", text]) == 2
     refused(capsys, *words)
+
+
+def test_learner_without_eyes_is_refused_and_empty_flag_omits_the_cameras_of_a_task(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = tmp_path / "seen.py"
+    task.write_text(
+        "import lyceum_warp as lw\nfrom lyceum_warp.tasks.point_mass import PointMass\n\n\n"
+        "class Seen(PointMass):\n    cameras = (lw.Camera('above', 16, 16),)\n"
+    )
+    words = ["train", str(task), "--algorithm", "npg", *SMALL[:6], "--no-plot", "--out", str(tmp_path / "run")]
+    assert cli.main(words) == 2
+    refused(capsys, "NPG cannot learn from cameras", "cameras=[]", "--cameras ''")
+    assert cli.main([*words, "--cameras", ""]) == 0
+    assert cli.main(["train", "--resume", str(tmp_path / "run"), "--iterations", "3", "--no-plot"]) == 0
 
 
 def test_pictures_of_saved_episodes_teach_a_policy_that_eval_and_view_show(

@@ -111,6 +111,19 @@ def test_overflow_of_a_contact_sensor_in_the_warp_engine_is_an_engine_warning() 
 
 
 @pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("number", [np.nan, 1e11])
+def test_bad_number_in_a_quaternion_is_a_fault(number: float, engine: str) -> None:
+    env, clean = (lw.make("ant", engine=engine, nworld=N) for _ in range(2))
+    for each in (env, clean):
+        each.reset()
+    state, start = env.get_state(), env.state_space.parts["qpos"].start
+    state[BAD, start + 4] = number
+    env.set_state(state, torch.arange(N) == BAD, check=False)
+    assert Done.NAN in step_both(env, clean, 3)
+    assert env.fault_counts["nan"] == 1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
 def test_faults_print_and_log_nothing_over_150_steps(
     engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

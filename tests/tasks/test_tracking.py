@@ -1,5 +1,6 @@
 """Compare the tracking tasks with mjlab's formulas, computed anew from MuJoCo's own quantities."""
 
+import copy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -256,6 +257,14 @@ def test_body_that_is_tracked_on_one_side_only_has_no_mirror_image(shared_env: S
     params.bodies = np.asarray(params.bodies)[:-1]
     with pytest.raises(ValueError, match="'RR_hip' has no mirror image among them: track it on both sides"):
         env.task.definition.mirror(env.model, params)
+
+
+def test_mirror_image_does_not_depend_on_where_the_base_begins(shared_env: SharedEnv) -> None:
+    env = shared_env("go1_tracking", nworld=1)
+    model, params = copy.copy(env.model), SimpleNamespace(**env.task.params)
+    model.qpos0[1] = 0.3
+    moved, mirror = (env.task.definition.mirror(each, params).parts["body_position"] for each in (model, env.model))
+    np.testing.assert_array_equal(moved, mirror)
 
 
 @pytest.mark.parametrize("task", ["g1_tracking", "go1_tracking"])

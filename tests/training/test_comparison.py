@@ -120,6 +120,9 @@ def test_commands_take_classes_from_a_file(tmp_path: Path, capsys: pytest.Captur
     run.amend(idle={"noise": 0.5})  # as a run made in Python has it
     assert cli.main([*words, "--out", str(out), "--iterations", "4"]) == 0
     assert run.rows()[-1]["mean_return"] == 0.5
+    for source in ("--resume", "--from"):  # without --algorithm
+        assert cli.main(["train", source, str(out), "--iterations", "5"]) == 2
+        refused(capsys, "was trained by mine.py:Idle", "add --algorithm path/to/mine.py:Idle")
     assert cli.main([*words, *TINY[:2], "--out", str(tmp_path / "x")]) == 2
     assert cli.main([*words[:3], f"{file}:Mean", "--out", str(tmp_path / "x")]) == 2
     assert "mine.py:Mean is not a subclass of Learner" in capsys.readouterr().err

@@ -2,6 +2,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from training_runs import QUIET, TINY, metrics, refused, train
 
 import lyceum_warp as lw
-from lyceum_warp import cli
+from lyceum_warp import cli, training
 from lyceum_warp.support.intervals import bootstrap_interval, interquartile_mean
 from lyceum_warp.training import flag_words
 
@@ -47,6 +48,52 @@ def test_interrupted_seeds_continue_with_the_same_command(tmp_path: Path, monkey
     )  # fmt: skip
     assert [run.state for run in runs] == ["complete"]
     assert len(metrics(tmp_path / "x" / "seed-0")) == done + 1
+
+
+LEARNER = """
+import lyceum_warp as lw
+
+class Fragile(lw.NPG):
+    def __init__(self, env, *networks, seed=0, **options):
+        if seed == 1:
+            raise ValueError("seed 1 is refused")
+        super().__init__(env, *networks, seed=seed, **options)
+
+    def __next__(self):
+        if self.seed == 0:
+            raise RuntimeError("seed 0 breaks")
+        return super().__next__()
+"""
+
+
+@pytest.mark.long
+def test_failed_seeds_say_why_and_an_exception_of_watch_ends_the_others(tmp_path: Path) -> None:
+    (tmp_path / "fragile.py").write_text(LEARNER)
+    seen: list[Sequence[training.SeedRun]] = []
+
+    def watch(runs: Sequence[training.SeedRun]) -> None:
+        seen[:] = [runs]
+        if (runs[2].folder / "metrics.csv").exists():
+            raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        lw.train_seeds(
+            "point_mass", tmp_path / "x", 3, watch=watch, algorithm=f"{tmp_path}/fragile.py:Fragile", iterations=10_000,
+            nworld=2, plot=False,
+        )  # fmt: skip
+    assert [run.state for run in seen[0]] == ["failed", "failed", "training"]
+    assert [run.error for run in seen[0]] == ["RuntimeError: seed 0 breaks", "seed 1 is refused", ""]
+    assert "interrupted by SIGTERM" in seen[0][2].folder.with_suffix(".log").read_text()
+
+
+def test_command_prints_the_table_if_all_seeds_have_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = training.SeedRun(0, tmp_path / "seed-0", "failed", "it breaks")
+    monkeypatch.setattr(training, "train_seeds", lambda *words, watch, **settings: watch([failed]) or [failed])
+    assert cli.main(["train", "point_mass", "--seeds", "1", "--out", str(tmp_path)]) == 1
+    shown = capsys.readouterr()
+    assert "it breaks" in shown.out and shown.err == ""
 
 
 @pytest.mark.long

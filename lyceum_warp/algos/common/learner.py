@@ -143,7 +143,9 @@ class Learner(abc.ABC):
                 f"first_world={self.own_worlds.start}, not {env.first_world}"
             )
         if env.task.cameras and not self.sees:
-            raise ValueError(f"{type(self).__name__} cannot learn from cameras: make the environment with cameras=[]")
+            raise ValueError(
+                f"{type(self).__name__} cannot learn from cameras: make the environment with cameras=[] (--cameras '')"
+            )
         if not env.autoreset:
             raise ValueError(
                 f"{type(self).__name__} needs an environment that resets automatically: make the environment with "

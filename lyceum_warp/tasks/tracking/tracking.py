@@ -594,9 +594,7 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
 def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
     """Add the reference and the tracked bodies to ``walkers.mirror``."""
     parts, flip, axes = walkers.mirror(model, p).parts, np.array([1, -1, 1]), np.array([1, -1, 1, -1, 1, -1])
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    places = data.xpos[p.bodies]
+    places = walkers.straight(model).xpos[p.bodies]
     distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
     order = distances.argmin(1)
     if distances.min(1).max() > 0.005:

@@ -62,8 +62,10 @@ def describe(learner: Learner) -> dict[str, Any]:
     seed = {} if learner.seed == options.seed else {f"{learner.algorithm}_seed": learner.seed}
     task = env.task.definition
     weights = {name: float(env.given_params.get(name, weight)) for name, weight in task.rewards.items()}
-    cls = type(getattr(learner.policy, "network", None))
-    network = {} if not (files := [*class_sources(cls)]) else {"network": f"{files[0]}:{cls.__name__}"}
+    own = {"learner": type(learner), "network": type(getattr(learner.policy, "network", None))}
+    classes = {
+        name: f"{next(iter(files))}:{cls.__name__}" for name, cls in own.items() if (files := class_sources(cls))
+    }
     return {
         "algorithm": learner.algorithm,
         "task": spelled_task(env.task.definition),
@@ -78,7 +80,7 @@ def describe(learner: Learner) -> dict[str, Any]:
         "threads": torch.get_num_threads(),
         "seed": options.seed,
         **seed,
-        **network,
+        **classes,
         learner.algorithm: learner.settings(),
     }
 

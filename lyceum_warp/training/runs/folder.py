@@ -42,7 +42,7 @@ _ENTRIES: dict[str, Any] = {
     "save_every": _COUNT, "video_every": _COUNT, "tensorboard": bool, "target_return": float | int | None,
     "reached": {"iteration": _COUNT, "return": float | int}, "exact_from": int | None, "gate_every": _COUNT,
     "passed": {"iteration": _COUNT, "tries": _COUNT}, "versions": dict, "resumed": list, "wandb": str | None,
-    "terms": {"rewards": dict, "ends": list}, "network": str,
+    "terms": {"rewards": dict, "ends": list}, "network": str, "learner": str,
     "kept": {
         "name": str, "file": str, "model": str, "model_given": bool, "source_hash": str, "model_hash": str,
         "modules": dict, "program": bool,

@@ -141,6 +141,12 @@ def table_copies(run: Run) -> dict[str, Path]:
     }
 
 
+def table_rows(run: Run, table: str) -> list[str]:
+    """Return the names of the rows of a run's table, such as those of its clips. The list is empty if it has none."""
+    file = run.task_folder / TABLES / f"{table}.txt"
+    return file.read_text().splitlines() if file.is_file() else []
+
+
 def _has_file(table: str) -> bool:
     return Path(table).is_absolute() and Path(table).is_file()  # an array's name is no path
 
