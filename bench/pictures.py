@@ -177,7 +177,8 @@ def gap_tables(rows: Sequence[Row]) -> list[Table]:
     ]  # fmt: skip
     title = (
         "The picture gap: returns of the same episodes on the C engine, with pictures of this package and of "
-        "mujoco.Renderer; plain: without shadows, reflections and antialiasing."
+        "mujoco.Renderer; plain: without shadows, reflections and antialiasing; of another world: how much the policy "
+        "needs its eyes."
     )
     return [Table(title, header, lines)] if lines else []
 

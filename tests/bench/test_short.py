@@ -5,6 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import experiment
+import mujoco
+import numpy as np
+import picture_gap
 import pytest
 
 import lyceum_warp as lw
@@ -126,3 +129,15 @@ def test_policy_acts_with_each_object(tmp_path: Path) -> None:
     (table,) = definition.tables(rows)
     assert [line[0] for line in table.rows[-2:]] == ["waterbottle", "held out"] and len(table.rows) == 30
     definition.figure(rows).savefig(tmp_path / "figure.png")
+
+
+def test_tiles_are_the_ground() -> None:
+    env = lw.make("go1_rough_velocity", nworld=1, engine="mujoco")
+    rng, heights = np.random.default_rng(0), []
+    points = rng.uniform((-80.0, -40.0, 20.0), (80.0, 40.0, 20.0), (200, 3))
+    for model in (env.model, picture_gap.tiled(env)):
+        data, geom = mujoco.MjData(model), np.zeros(1, np.int32)
+        mujoco.mj_kinematics(model, data)
+        heights.append([mujoco.mj_ray(model, data, point, [0.0, 0.0, -1.0], None, 1, -1, geom) for point in points])
+    assert np.ptp(heights[0]) > 0.5
+    np.testing.assert_allclose(*heights, atol=1e-5)
