@@ -180,6 +180,10 @@ class _Reader:
         where = self.source.place(node)
         self.trace.writes[Write(place.position, place.field, target, self.source.name, where, replaced, use)] = None
 
+    def _note_read(self, place: _Place | None, node: ast.AST) -> None:
+        if place and place.field:
+            self.trace.reads.setdefault(place.field, f"{self.source.name} ({self.source.place(node)})")
+
     def _read(self, node: ast.AST) -> _Place | None:
         """Record the writes of a syntax node. If the node is an expression, return its ``_Place``."""
         if isinstance(node, ast.Name):
@@ -194,8 +198,8 @@ class _Reader:
         if isinstance(node, ast.Subscript):
             self._read_all(node, [node.slice])
             owner = self._read(node.value)
-            if owner and owner.field and isinstance(node.ctx, ast.Load):
-                self.trace.reads.setdefault(owner.field, f"{self.source.name} ({self.source.place(node)})")
+            if isinstance(node.ctx, ast.Load):
+                self._note_read(owner, node)
             return owner and owner.element(node.slice)
         if isinstance(node, ast.Call):
             self._call(node)
@@ -249,7 +253,9 @@ class _Reader:
                 self._call_helper(overload, node)
         elif kind == "builtin" and callee.key in _READERS:
             for argument in arguments:
-                self._read(argument)
+                place = self._read(argument)
+                if callee.key != "len":
+                    self._note_read(place, node)
         elif kind == "other":
             self._read_all(node, [node.func, *arguments], elements=callee is wp.address_of)
         elif kind != "static":

@@ -201,6 +201,15 @@ def test_changing_a_copy_of_an_argument_is_not_a_write() -> None:
     assert {write.target for write in trace(reads_only).writes} == {"obs"}
 
 
+@wp.func
+def searches(s: World, p: Params) -> int:
+    return wp.lower_bound(s.qpos, 0.5) + len(s.qvel)
+
+
+def test_search_in_a_row_reads_it() -> None:
+    assert trace(searches).reads.keys() == {"qpos"}
+
+
 def made_with(row_name: str, helper: Any) -> Any:
     @wp.func
     def enclosing(s: World, p: Params):
