@@ -159,8 +159,8 @@ def _conclude(run: SeedRun, code: int, *, refused: bool) -> None:
         log = run.folder.with_suffix(".log")
         lines = log.read_text(errors="replace").strip().splitlines() or [f"exit code {code}"]
         run.error = lines[-1].removeprefix("lyceum-warp: ")
-        _, found, trace = "\n".join(["", *lines]).rpartition("\nTraceback")
-        if code == 1 and found and run.error == lines[-1]:  # the exception's notes are the last lines
+        _, mark, trace = "\n".join(["", *lines]).rpartition("\nTraceback")
+        if code == 1 and mark and run.error == lines[-1]:  # the exception's notes are the last lines
             run.error = next((line for line in trace.splitlines()[1:] if not line.startswith(" ")), run.error)
         if refused:  # this line says everything
             log.unlink()

@@ -28,8 +28,7 @@ class Params(walking.BipedParams):
     stance_share: float = 0.55  # fraction of a cycle in which a foot should be on the ground
     foot_lift: float = 0.07  # greatest height of a swing, m
     standing_height: float = 0.04  # height of the feet's sites above the soles, m
-    growth_start: float = 0.0  # steps of each world until the costs begin to grow
-    growth_steps: float = 4000.0  # further steps until they reach their full weight
+    growth_steps: float = 4000.0  # steps of each world until the costs reach their full weight
 
 
 @wp.struct
@@ -113,8 +112,8 @@ def foot_lift_l2(active: float, s: World, p: Params) -> float:
 
 
 @wp.func
-def growth(env_steps: Row[float], growth_start: float, growth_steps: float) -> float:
-    return wp.clamp((env_steps[0] - growth_start) / growth_steps, 0.0, 1.0)
+def growth(env_steps: Row[float], growth_steps: float) -> float:
+    return wp.min(1.0, env_steps[0] / growth_steps)
 
 
 @wp.func
