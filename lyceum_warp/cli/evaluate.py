@@ -91,7 +91,7 @@ class Eval:
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         if self.episodes_to is not None:
             training.Run.check_free(self.episodes_to)
-        run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
+        run = open_run(self.folder, pretrained=self.pretrained)
         nworld = min(self.nworld, self.episodes)
         options = arguments.given(self.env) | arguments.given(self.physics)
         env = run_worlds(run, options, arguments.parameters(self.param), nworld=nworld, task=self.task)
@@ -167,6 +167,11 @@ class Eval:
                     for row in rows
                 ]
         return curricula, "as given"
+
+
+def open_run(folder: Path, *, pretrained: bool) -> training.Run:
+    """Open a run's folder, or with ``pretrained`` the package's policy of the task of this name."""
+    return training.Run.open(training.pretrained_run(str(folder)) if pretrained else folder)
 
 
 def better_policy(run: training.Run, which: str, *, task: str | None = None) -> str:
