@@ -214,7 +214,10 @@ def _load_checkpoint(run: Run, learner: Learner, iterations: int) -> None:
             read_replay(run.replay, learner.replay, content["state"]["stored"], learner.own_worlds)
     except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
-        raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
+        raise ValueError(
+            f"{run.checkpoint} does not fit the run's configuration: {text}; start a new run from its policy "
+            f"(--from {run.folder})"
+        ) from error
 
 
 def _changed_versions(run: Run) -> dict[str, Any]:
