@@ -84,6 +84,8 @@ class Eval:
         whole_number("episodes", self.episodes, low=1)
         if self.transfer and self.env.engine is not None:
             raise ValueError("--transfer plays episodes on both engines: omit --engine")
+        if self.clips is not None and (self.transfer or self.episodes_to):
+            raise ValueError("--clips plays each clip once: omit --transfer and --episodes-to")
         camera = arguments.video_camera(self.camera)
         if self.video:
             viz.check_video()
