@@ -125,6 +125,10 @@ class BoundTask:
             raise ValueError(f"fitted_draws=True draws {both[0]}, which differs between objects: name one object")
         self.parameters = Parameters(source, self.nominal, params or {}, nworld=nworld, timestep=self.timestep)
         self.layouts = layouts_of(source, self.params)
+        if taken := [camera for camera in self.cameras if camera.group in self.layouts.obs]:
+            raise ValueError(
+                f"the camera {taken[0].name!r} needs another group: the task's group {taken[0].group!r} has numbers"
+            )
         self.kernels = kernels_of(source, self.layouts)
 
     def _put_objects(self, spec: mujoco.MjSpec, names: Collection[str] | None) -> ObjectModels | None:

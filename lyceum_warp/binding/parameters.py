@@ -230,8 +230,8 @@ def _element_field(default: Any) -> str | None:
 def _loaded(text: str, path: str | Path) -> np.ndarray:
     try:
         # map the file instead of reading it: a broken header could make NumPy allocate any amount of memory
-        return np.array(np.load(path, allow_pickle=False, mmap_mode="r"))
+        return np.array(np.lib.format.open_memmap(path, mode="r"))
     except FileNotFoundError:
         raise FileNotFoundError(f"{text} cannot be read, because there is no such file") from None
     except Exception as error:  # NumPy raises many types of errors
-        raise ValueError(f"{text} cannot be read: {error}") from error
+        raise ValueError(f"{text} is not a file of np.save with numbers: {error}") from error

@@ -84,6 +84,8 @@ class Eval:
         whole_number("episodes", self.episodes, low=1)
         if self.transfer and self.env.engine is not None:
             raise ValueError("--transfer plays episodes on both engines: omit --engine")
+        if self.clips is not None and (self.transfer or self.episodes_to):
+            raise ValueError("--clips plays each clip once: omit --transfer and --episodes-to")
         camera = arguments.video_camera(self.camera)
         if self.video:
             viz.check_video()
@@ -91,7 +93,7 @@ class Eval:
             raise ValueError("--camera has no effect without --video: add --video, or omit --camera")
         if self.episodes_to is not None:
             training.Run.check_free(self.episodes_to)
-        run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
+        run = open_run(self.folder, pretrained=self.pretrained)
         nworld = min(self.nworld, self.episodes)
         options = arguments.given(self.env) | arguments.given(self.physics)
         env = run_worlds(run, options, arguments.parameters(self.param), nworld=nworld, task=self.task)
@@ -167,6 +169,11 @@ class Eval:
                     for row in rows
                 ]
         return curricula, "as given"
+
+
+def open_run(folder: Path, *, pretrained: bool) -> training.Run:
+    """Open a run's folder, or with ``pretrained`` the package's policy of the task of this name."""
+    return training.Run.open(training.pretrained_run(str(folder)) if pretrained else folder)
 
 
 def better_policy(run: training.Run, which: str, *, task: str | None = None) -> str:

@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp import algos, engines, training
 from lyceum_warp.cli.display import note, say, say_entries
-from lyceum_warp.cli.evaluate import better_policy, run_worlds
+from lyceum_warp.cli.evaluate import better_policy, open_run, run_worlds
 from lyceum_warp.env import Env, start_episodes
 
 
@@ -22,12 +22,16 @@ class Export:
 
     $ lyceum-warp export runs/hopper-20260101-120000
     $ lyceum-warp export runs/hopper --which best --to robot/policy.onnx
+    $ lyceum-warp export go1_velocity --pretrained
     """
 
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
-    """The run's folder."""
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
+    """The run's folder; with --pretrained, the name of a task."""
+    pretrained: bool = False
+    """Whether to export the package's pretrained policy of a task."""
     to: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """The file to write, .onnx or .pt2; by default policy.onnx in the run's folder. An existing file is replaced."""
+    """The file to write, .onnx or .pt2; by default policy.onnx in the run's folder, or TASK.onnx with --pretrained. An
+    existing file is replaced."""
     which: str = training.AUTO
     """The policy to export: auto (the better of the last and the best policy in new episodes), last, best, or the
     number of a saved iteration."""
@@ -35,9 +39,9 @@ class Export:
     """The file of the run's task, if it has moved, or a different task."""
 
     def run(self) -> None:
-        path = self.to or self.folder / "policy.onnx"
+        run = open_run(self.folder, pretrained=self.pretrained)
+        path = self.to or (Path(f"{run.folder.name}.onnx") if self.pretrained else run.folder / "policy.onnx")
         algos.check_export(path)
-        run = training.Run.open(self.folder)
         which = better_policy(run, self.which, task=self.task)
         policy = training.load(run, which=which)
         algos.export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)

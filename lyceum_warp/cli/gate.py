@@ -8,7 +8,7 @@ import tyro
 
 from lyceum_warp import algos, engines, training
 from lyceum_warp.cli.display import console, say, say_entries, table
-from lyceum_warp.cli.evaluate import run_worlds
+from lyceum_warp.cli.evaluate import open_run, run_worlds
 from lyceum_warp.support.long_work import LongWork
 
 
@@ -25,7 +25,7 @@ class Gate:
 
     USUAL = ("folder", "which", "pretrained", "seed", "task")
 
-    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN")]
+    folder: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="RUN|TASK")]
     """A run's folder; with --pretrained, the name of a task."""
     which: str = "last"
     """The policy: last, best, or the number of a saved iteration."""
@@ -39,7 +39,7 @@ class Gate:
     """Threads of the C engine; by default all cores."""
 
     def run(self) -> int:
-        run = training.Run.open(training.pretrained_run(str(self.folder)) if self.pretrained else self.folder)
+        run = open_run(self.folder, pretrained=self.pretrained)
         env = run_worlds(run, {**engines.options_on_cores(), "physics": "exact"}, {}, nworld=1, task=self.task)
         policy = training.load(run, which=self.which)
         curriculum = None if self.task else training.load_curriculum(run, which=self.which)
@@ -57,6 +57,6 @@ class Gate:
         say(f"{verdict.task}: the policy {'passes' if verdict.passed else 'does not pass'} on the C engine under exact "
             f"physics{start}")  # fmt: skip
         place = f"{self.folder} --pretrained" if self.pretrained else f"{self.folder} --which {self.which}"
-        export = f", or lyceum-warp export {place}" if verdict.passed and not self.pretrained else ""
+        export = f", or lyceum-warp export {place}" if verdict.passed else ""
         say_entries(next=f"lyceum-warp view {place}{export}")
         return 0 if verdict.passed else 1

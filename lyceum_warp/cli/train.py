@@ -179,7 +179,7 @@ class Train:
     engine.
     """
     param: arguments.ParamWords = ()
-    clips: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE ...")] = ()
+    clips: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")] = None
     """Motions for a task that tracks clips, such as g1_tracking: files and folders of the formats that lw.load_clips
     reads. The run's folder has a copy."""
     video: bool = False
@@ -352,7 +352,7 @@ class Train:
         if "solver" in flags:
             flags["solver"] = {**(base.options.physics.solver or {}), **flags["solver"]}
         options, params = base.options.changed(flags), arguments.parameters(self.param)
-        if self.clips:
+        if self.clips is not None:
             from lyceum_warp.cli.clips import clips_of_task
 
             params["clips"] = clips_of_task(self.clips, self.task or base.task or "", options)

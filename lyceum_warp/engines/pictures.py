@@ -114,6 +114,6 @@ def _sizes(model: mujoco.MjModel, cameras: Iterable[Camera]) -> dict[str, tuple[
                 f"lw.Camera({camera.name!r}, pos=(2, 0, 1), lookat=(0, 0, 0)), to add one"
             )
         size = camera.width, camera.height
-        if sizes.setdefault(camera.name, size) != size:
-            raise ValueError(f"the pictures of the camera {camera.name!r} must have one size, not also {size}")
+        if (first := sizes.setdefault(camera.name, size)) != size:
+            raise ValueError(f"the pictures of the camera {camera.name!r} must have one size, not {first} and {size}")
     return {name: sizes[name] for name in names if name in sizes}

@@ -82,8 +82,12 @@ def start_episodes(
         first: Index of the first world among ``total`` worlds, over which the rows of ``curriculum.lasting`` are
             spread.
         total: By default the environment's number of worlds.
+
+    Raises:
+        ValueError: The task has no memory of this name and size.
     """
     curriculum = curriculum or Curriculum()
+    curriculum.check(env)
     for name, memory in curriculum.shared.items():
         env.shared[name].copy_(memory)
     if seed is not None:

@@ -77,7 +77,9 @@ def _read_npz(path: Path) -> Motion:
         if "states" in file:
             info = json.loads(str(file["info"]))
             start, stop = info["state_parts"]["qpos"]
-            return Motion(np.asarray(file["states"], float)[:, start:stop], 1.0 / float(info["timestep"]))
+            qpos = np.asarray(file["states"], float)[:, start:stop]
+            qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)  # as MuJoCo reads rotations
+            return Motion(qpos, 1.0 / float(info["timestep"]))
         joints, bodies = ([str(name) for name in file[names]] if names in file else None
                           for names in ("joint_names", "body_names"))  # fmt: skip
         positions, qpos = np.asarray(file["body_pos_w"], float), np.asarray(file["joint_pos"], float)

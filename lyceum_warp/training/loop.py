@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lyceum_warp.algos import EXACT, Learner, task_physics
 from lyceum_warp.binding import class_sources
 from lyceum_warp.engines import engine_name
@@ -214,7 +216,10 @@ def _load_checkpoint(run: Run, learner: Learner, iterations: int) -> None:
             read_replay(run.replay, learner.replay, content["state"]["stored"], learner.own_worlds)
     except Exception as error:  # a damaged state may raise any error
         text = " ".join(str(error).split())
-        raise ValueError(f"{run.checkpoint} does not fit the run's configuration: {text}") from error
+        raise ValueError(
+            f"{run.checkpoint} does not fit the run's configuration: {text}; start a new run from its policy "
+            f"(--from {run.folder})"
+        ) from error
 
 
 def _changed_versions(run: Run) -> dict[str, Any]:
@@ -236,6 +241,13 @@ def _check_equal(run: Run, learner: Learner, done: int) -> None:
     for name, copy in table_copies(run).items():  # ``note_changes`` reports a changed table
         if after.get(f"params.{name}") == str(copy):
             after[f"params.{name}"] = run.config["params"][name]
+        elif after.get(f"params.{name}") == f"{name}.npy" and not np.array_equal(
+            table := learner.env.task.params[name], np.load(copy).astype(table.dtype)
+        ):
+            raise ValueError(
+                f"{copy} is another table than the given {name}, and a run keeps its settings: omit {name}, or start a "
+                "new run in another folder"
+            )
     if task_physics(learner.env)[1] == EXACT and (run.config.get("exact_from") or math.inf) <= done:
         before = {name: value for name, value in before.items() if not name.startswith("physics.")}
     for name in before | after:

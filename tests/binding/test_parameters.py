@@ -172,7 +172,7 @@ def test_file_without_an_array_raises_an_error(model: mujoco.MjModel, tmp_path: 
     (tmp_path / "text.npy").write_text("1 2 3")
     np.savez(tmp_path / "several.npz", a=1)
     for name in ("text.npy", "several.npz"):
-        with pytest.raises(ValueError, match=f"motion from '.*{name}'"):
+        with pytest.raises(ValueError, match=f"motion from '.*{name}' is not a file of np.save with numbers"):
             parameters(model, Tables, motion=tmp_path / name)
 
 

@@ -27,6 +27,13 @@ def test_clips_of_a_run_are_kept_and_evaluated(
     for file in ("walk.npz", "side.csv"):
         (tmp_path / file).rename(tmp_path / f"moved-{file}")
     assert cli.main(["train", "--resume", "run", "--iterations", "2", "--no-plot"]) == 0
+    capsys.readouterr()
+    assert cli.main(["train", "--resume", "run", "--iterations", "3", "--clips", "moved-walk.npz"]) == 2
+    assert "is another table than the given clips, and a run keeps its settings" in capsys.readouterr().err
+    assert cli.main(["train", "go1_tracking", "--clips", "--out", "no"]) == 2
+    refused(capsys, "name at least one file")
+    assert cli.main(["eval", "run", "--clips", "--transfer"]) == 2
+    refused(capsys, "omit --transfer")
     np.save("clips.npy", np.zeros(3))  # another table of this name is not the run's
     picture = True
     try:

@@ -128,6 +128,12 @@ def test_episodes_begin_at_a_given_curriculum_and_report_it() -> None:
     torch.testing.assert_close(episodes.select(slice(4, 6)).step_metrics["height"], torch.full((2,), 7.55))
 
 
+def test_curriculum_of_another_version_of_the_task_is_refused() -> None:
+    curriculum = lw.Curriculum(shared={"bonus": torch.zeros(3)})
+    with pytest.raises(ValueError, match=r"no memory 'bonus' of size 3; it has: bonus \(1\)"):
+        list(policy_episodes(make(2, autoreset=False), still, 2, curriculum=curriculum))
+
+
 def test_saved_episodes_equal_the_evaluated_ones() -> None:
     curriculum = lw.Curriculum(lasting={"level": torch.tensor([[2.0], [4.0]])})
     episodes = lw.evaluate(make(2), still, 4, seed=3, curriculum=curriculum)

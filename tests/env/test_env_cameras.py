@@ -172,6 +172,7 @@ def test_a_task_declares_cameras_and_options_replace_them() -> None:
     ([lw.Camera("side"), lw.Camera("side", 32, group="other")], "one size"), ([3], "Camera"),
     ([lw.Camera("new", pos=(0, 0, 1), lookat=(0, 0, 0), body="wheel")], "no body 'wheel'"),
     ([lw.Camera("new", pos=(0, 0, 1), lookat=(0, 0, 1))], "must differ"),
+    ([lw.Camera("side", group="policy")], "another group: the task's group 'policy' has numbers"),
 ])  # fmt: skip
 def test_wrong_cameras_are_refused(cameras: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):

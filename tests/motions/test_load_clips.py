@@ -35,6 +35,9 @@ def test_saved_episode_becomes_a_clip(tmp_path: Path) -> None:
     episode = lw.control(env, lambda state, obs: 0.1 * obs[:12], seed=0)
     clips = lw.load_clips(episode.save(tmp_path / "episode.npz"), env.model, rate=1.0 / env.timestep)
     np.testing.assert_allclose(clips.qpos[0], episode.part("qpos").numpy(), atol=1e-6)
+    episode.part("qpos")[:, 3:7] *= 1.1  # MuJoCo reads rotations of any length, such as those of Gymnasium's ant
+    again = lw.load_clips(episode.save(tmp_path / "longer.npz"), env.model, rate=1.0 / env.timestep)
+    np.testing.assert_allclose(again.qpos[0], clips.qpos[0], atol=1e-6)
 
 
 def test_names_of_joints_put_them_into_order(model: mujoco.MjModel, tmp_path: Path) -> None:

@@ -303,6 +303,8 @@ def test_evaluation_plays_each_clip_once(shared_env: SharedEnv) -> None:
     assert row == worst and results.errors["r_mpkpe"][0] > 0.02
     with pytest.raises(ValueError, match="tracks no clips"):
         lw.evaluate_clips(shared_env("point_mass"), lambda obs: obs)
+    with pytest.raises(ValueError, match="policy must return"):
+        lw.evaluate_clips(env, lambda obs: obs)
 
 
 def test_saved_episodes_hold_no_table_of_the_package(tmp_path: Path) -> None:

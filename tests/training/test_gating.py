@@ -52,6 +52,8 @@ def test_policies_that_fail_the_gate_are_counted_and_not_kept(cores: int, tmp_pa
     assert cli.main(["gate", str(run.folder)]) == 1
     verdict = lw.gate(env, lambda obs: torch.zeros(len(obs), 2))
     assert not verdict.passed and verdict.numbers["largest"] > 0.0
+    with pytest.raises(ValueError, match="policy must return"):
+        lw.gate(env, lambda obs: torch.zeros(len(obs), 5))
 
 
 def test_task_without_a_gate_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

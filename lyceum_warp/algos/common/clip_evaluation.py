@@ -65,11 +65,12 @@ def evaluate_clips(
         **changes: Options and parameters that differ from the environment's, such as ``physics="exact"``.
 
     Raises:
-        ValueError: The task tracks no clips.
+        ValueError: The task tracks no clips, or the policy does not fit the task.
     """
     check_kind("env of evaluate_clips", env, Env, "as lw.make('g1_tracking') makes it")
     worlds = clip_worlds(env, **changes)
     act = Player(policy, worlds)
+    act.first(worlds.obs)  # checks the policy
     definition, params = worlds.task.definition, worlds.task.params
     steps = torch.as_tensor(params["ranges"][:, 1].copy()).to(worlds.obs.device) - 1
     terms = [name for name in definition.rewards if params[name] > 0.0]

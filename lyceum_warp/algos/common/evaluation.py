@@ -113,9 +113,7 @@ def evaluate(
     seed = None if seed is None else evaluation_seed(seed)
     several = len(env.task.objects) > 1 and not env.task.redraws
     rounds = each if env.task.curriculum or several else 1
-    if curriculum is not None:
-        curriculum.check(env)
-    elif seed is None and rounds > 1:
+    if curriculum is None and seed is None and rounds > 1:
         curriculum = Curriculum.of(env)
     results = torch.zeros(7 + len(env.metrics), each, env.nworld, device=env.obs.device)
     starts = []

@@ -50,6 +50,7 @@ def gate(
         start_episodes(replica, None, curriculum)
         nonlocal player
         player = Player(policy, replica)
+        player.first(replica.obs)  # checks the policy
         return replica
 
     numbers: dict[str, float] = {}

@@ -232,11 +232,22 @@ class Learner(abc.ABC):
         """Resume from a result of ``state_dict``. Later iterations equal those of an uninterrupted run bit for bit.
 
         Raises:
-            ValueError: The state has a different number of worlds, or a counter is not a whole number.
+            ValueError: The state has a different number of worlds, or other sizes than the task's memory, or a counter
+                is not a whole number.
         """
         nworld = self.env.nworld * self.team.size
         if len(state["env"]) != nworld:
             raise ValueError(f"the state has {len(state['env'])} worlds, but the environment has {nworld}")
+        sizes = {
+            "a world": (state["env"].shape[1], self.env.state_space.size),
+            "shared memory": (len(state["shared"]), len(self.env.get_shared())),
+        }
+        for part, (size, expected) in sizes.items():
+            if size != expected:
+                raise ValueError(
+                    f"the state of {part} has {size} numbers, and the task needs {expected}: another version of the "
+                    "task has saved it"
+                )
         self.policy.load_state_dict(state["policy"])
         if self.value is not None:
             self.value.load_state_dict(state["value"])

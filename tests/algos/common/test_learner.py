@@ -66,6 +66,10 @@ def test_a_minimal_learner_resumes_bit_for_bit(env: lw.Env) -> None:
     assert torch.equal(env.get_state(), state) and rest[-1].keys() == {"iteration", "samples", "distance"}
     with pytest.raises(ValueError, match="the state has 3 worlds, but the environment has 2"):
         other.load_state_dict(saved | {"env": torch.zeros(3, 1)})
+    with pytest.raises(ValueError, match="the state of a world has 1 numbers, and the task needs .* another version"):
+        other.load_state_dict(saved | {"env": torch.zeros(2, 1)})
+    with pytest.raises(ValueError, match="the state of shared memory has 9 numbers, and the task needs 0"):
+        other.load_state_dict(saved | {"shared": torch.zeros(9)})
 
 
 NETWORKS: dict[str, Any] = dict(hidden=(8,), value_hidden=(8, 8), mean_every=2, mean_episodes=2)

@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+import onnxruntime
 import pytest
 import torch
 from training_runs import refused
@@ -64,7 +65,17 @@ def test_eval_runs_a_pretrained_policy(capsys: pytest.CaptureFixture[str]) -> No
     assert "2 episodes of the mean policy pretrained by" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("command", ["eval", "view"])
+def test_pretrained_policy_is_exported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["export", "hopper", "--pretrained"]) == 0
+    assert capsys.readouterr().out.startswith("hopper.onnx: 11 observations, 3 actions")
+    session = onnxruntime.InferenceSession(tmp_path / "hopper.onnx")
+    assert session.get_modelmeta().custom_metadata_map["task"] == '"hopper"'
+
+
+@pytest.mark.parametrize("command", ["eval", "export", "view"])
 def test_task_without_a_pretrained_policy_prints_an_error(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main([command, "soft_ball", "--pretrained"]) == 2
     refused(capsys, "there is no pretrained policy of 'soft_ball': the tasks with a policy are ", ", hopper")
