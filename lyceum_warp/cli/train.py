@@ -174,9 +174,9 @@ class Train:
     samples / nworld steps per iteration. If an episode is longer, an iteration contains only a segment of it.
     """
     threads: Annotated[int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: 1)")] = None
-    """Number of torch threads on the CPU. Small networks gain little from more threads, and busy cores gain nothing.
-    Runs are identical bit for bit only with the same number of threads. --nthread sets the threads of the mujoco
-    engine.
+    """Number of torch threads on the CPU. PPO divides mini-batches of 512 or more samples among them. Otherwise, small
+    networks gain little from more threads, and busy cores gain nothing. Runs are identical bit for bit only with the
+    same number of threads. --nthread sets the threads of the mujoco engine.
     """
     param: arguments.ParamWords = ()
     clips: Annotated[tuple[Path, ...] | None, tyro.conf.arg(metavar="FILE ...", help_behavior_hint="")] = None

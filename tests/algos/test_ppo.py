@@ -11,6 +11,7 @@ from metered_task import Metered
 
 import lyceum_warp as lw
 from lyceum_warp.algos.common.networks import Normalizer
+from lyceum_warp.support.settings import temporarily
 
 SMALL = lw.PPOConfig(hidden=(8,), value_hidden=(8, 8), num_steps=12, mean_every=2, mean_episodes=2)
 
@@ -106,6 +107,20 @@ def test_networks_do_not_see_how_absurd_an_observation_is(env: lw.Env) -> None:
     assert ppo.policy(obs)[0].equal(ppo.policy(obs)[1])
     both = ppo.value.normalizer(obs.repeat(1, 2))
     assert both[0].equal(both[1])
+
+
+@pytest.mark.parametrize("changes", [{}, {"recurrent": 4, "whiten_minibatches": True}])
+def test_threads_change_only_the_rounding_of_updates(changes: dict[str, Any], env: lw.Env) -> None:
+    numbers, threads = [], torch.get_num_threads()
+    for count in (1, 2):
+        env.rand_reset(0)
+        with temporarily(torch.set_num_threads, count, threads):
+            ppo = made(env, num_steps=128, minibatches=1, mean_every=0, **changes)
+            its = [next(ppo) for _ in range(2)]
+            assert torch.get_num_threads() == count
+        numbers.append([(it.kl, it.value_loss, it.surrogate_loss, it.entropy, it.std_mean) for it in its])
+    for one, two in zip(*numbers, strict=True):
+        assert two == pytest.approx(one, rel=1e-3, abs=1e-6)
 
 
 @pytest.mark.parametrize("changes, rate", [
