@@ -13,6 +13,7 @@ from mujoco.batch import Batch
 from lyceum_warp.engines import call_batch
 from lyceum_warp.fitting.log import Column, Log
 from lyceum_warp.fitting.parameters import Parameters
+from lyceum_warp.support.machine import cpu_cores
 
 Signals: TypeAlias = dict[str, np.ndarray]
 """Delay, gain and bias of each control, and then of each column of the log."""
@@ -85,7 +86,7 @@ class Predictor:
         """Places of each field's columns in the log, and their indices in the field."""
         self.quats = _quaternions(log.columns, self.model)
         self._data = mujoco.MjData(self.model)
-        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread))
+        self._batch = functools.lru_cache(4)(lambda worlds: Batch(self.model, worlds, nthread or cpu_cores()))
 
     def track(self, windows: Windows, x: np.ndarray, memories: Sequence[float]) -> list[np.ndarray]:
         """Guess the initial states of windows: simulate each take, and pull the state towards the measurements.

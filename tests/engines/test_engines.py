@@ -1,4 +1,5 @@
 import gc
+import os
 from pathlib import Path
 
 import mujoco
@@ -197,3 +198,14 @@ def test_an_overflow_in_the_first_state_of_an_episode_is_reported(
     assert not env.done.any()
     env.step()
     assert env.done_reason[0] & int(lw.Done.CONTACT_OVERFLOW)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs Linux")
+def test_threads_of_the_c_engine_fit_the_cores_that_the_process_may_use() -> None:
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        engine = lw.make("hopper", nworld=4).engine
+    finally:
+        os.sched_setaffinity(0, cores)
+    assert isinstance(engine, MujocoEngine) and engine.batch.nthread == 1

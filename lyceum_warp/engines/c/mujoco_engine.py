@@ -42,7 +42,7 @@ class MujocoEngine(Engine):
     """Steps worlds in float64 in ``mujoco.batch.Batch``, and copies the batch's fields to float32 arrays.
 
     The device must be the CPU, and the initial state is rounded to float32. The number of threads is ``nthread``; 0
-    means all cores.
+    means all cores that the process may use.
 
     Raises:
         ValueError: The device is not the CPU, or ``nthread`` is negative.
@@ -68,8 +68,8 @@ class MujocoEngine(Engine):
             )
         super().__init__(model, nworld, device, fields, dynamics, initial)
         quiet()
-        self.nthread = whole_number("nthread", nthread, low=0)
-        self.launch_threads = self.nthread or cpu_cores()
+        # MuJoCo's own default ignores the process's affinity: under taskset, many threads would share a few cores
+        self.launch_threads = self.nthread = whole_number("nthread", nthread, low=0) or cpu_cores()
         self.native_model = copy.copy(model)
         # autoreset would hide a fault: MuJoCo would silently reset the world within a step
         self.native_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
