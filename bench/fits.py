@@ -321,7 +321,8 @@ def policy(case: Case, options: Options, settings: dict[str, Any]) -> dict[str, 
     if case.contestant == "fit":
         plant = Plant("go1", case.seed, ground=True, kind=case.plant)
         folder = options.fits / f"go1-{case.seed}"
-        lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, resume=True, **settings)
+        if not (folder / "fit.json").exists():
+            lw.fit("go1_velocity", plant.log(case.seconds, case.seed), plant.wanted, out=folder, **settings)
         params_of["fit"] = trunk | {"fitted": folder, "fitted_draws": True}
     fitted = time.perf_counter()
     env = lw.make("go1_velocity", nworld=nworld, device=options.device, seed=case.seed, **params_of[case.contestant])

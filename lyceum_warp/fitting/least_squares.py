@@ -29,6 +29,9 @@ _STEADY = 0.03
 _NEAR, _SLACK = 2.0, 1.01
 """Steps below the first multiple of a standard deviation are averaged, because contacts make each of them uncertain. A
 step may increase the cost to the second multiple, because contacts change that, too."""
+_SHIFTS = np.array([0.0, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3])
+"""Changes of a delay that are tried, in substeps. At whole substeps, the cost of stiff joints has ridges: the samples
+after a step of the controls, which show the delay best, have other derivatives on the other side."""
 _DRAWS = np.array([0.0] + 5 * [0.1, 0.3, 1.0])
 """Draws of initial states, in multiples of their posterior's deviation."""
 _DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 1.0, 100.0)
@@ -115,8 +118,12 @@ class LeastSquares:
         parts = [self._equations(rows, at, np.concatenate([eps, self.steps])) for rows in self._rows(at, xs, changes)]
         residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
+        return Linear(residuals, cost, self._weights(cost), *blocks)
+
+    def _weights(self, cost: np.ndarray) -> np.ndarray:
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+        weights: np.ndarray = np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER
+        return weights
 
     def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
         p, count, scale = self.parameters.size, len(rows), np.outer(steps, steps)
@@ -134,7 +141,8 @@ class LeastSquares:
         return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
     def iterate(self, at: Estimate) -> Estimate:
-        """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
+        """Shift the delays, take a damped Gauss-Newton step, and estimate the noise for the next one."""
+        at = self._shifted(at)
         linear = self.linearize(at)
         cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
         steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
@@ -152,6 +160,18 @@ class LeastSquares:
                 break
         move, iteration = move if steady else np.inf, at.iteration + 1
         return dataclasses.replace(result, noise=noise, move=move, iteration=iteration, averaged=averaged)
+
+    def _shifted(self, at: Estimate) -> Estimate:
+        """Move each delay to another side of a ridge if the cost is clearly lower there."""
+        for i in [i for i, c in enumerate(self.parameters.coordinates) if c.kind == "delay"]:
+            xs = np.tile(at.x, (len(_SHIFTS), 1))
+            xs[:, i] += _SHIFTS * self.predictor.model.opt.timestep
+            xs = np.clip(xs, self.parameters.low, self.parameters.high)
+            costs = self.costs(at, xs, np.zeros((1, len(xs), self.predictor.nx)))
+            total = self._weights(costs[:, 0]) @ costs + self.prior(xs)
+            if _SLACK * total.min() < total[0]:
+                at = dataclasses.replace(at, x=xs[total.argmin()], averaged=0)
+        return at
 
     def _guessed(self, at: Estimate, states: Sequence[np.ndarray]) -> tuple[Estimate, np.ndarray]:
         """Choose each window's best initial state among the given ones and guesses; return the windows' costs, too."""
