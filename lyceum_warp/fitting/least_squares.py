@@ -16,10 +16,10 @@ _STEPS, _PARAMETER_STEP = (1e-6, 2e-5, 1e-5), 1e-4
 """Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
 _MEMORIES = (0.015, 0.1, 0.5)
 """Seconds of memory of the simulations that guess the initial states."""
-_JUMP, _USUAL_CHANGES = 0.003, 30.0
-"""A prediction that a finite difference changes by the first multiple of the noise, and by the second multiple of the
-median change, has jumped. A few jumps would outweigh all smooth changes, make steps much too short, and intervals too
-narrow."""
+_JUMP, _CURVED = 0.003, 0.01
+"""A prediction has jumped in a finite difference if the change by all differences together is not the sum of the single
+changes, up to the first multiple of the noise and the second multiple of the sum of sizes. A few jumps would outweigh
+all smooth changes, make steps much too short, and intervals too narrow."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
 _SETTLE = 4
@@ -111,11 +111,10 @@ class LeastSquares:
         """Make the normal equations from finite differences, with one world for each number and window."""
         p, nx = self.parameters.size, self.predictor.nx
         eps = np.where(at.x >= self.parameters.high, -_PARAMETER_STEP, _PARAMETER_STEP) * self.parameters.std
-        xs = np.tile(at.x, (1 + p + nx, 1))
-        xs[1 : 1 + p] += np.diag(eps)
-        changes = np.zeros((1, 1 + p + nx, nx))
-        changes[0, 1 + p :] = np.diag(self.steps)
-        parts = [self._equations(rows, at, np.concatenate([eps, self.steps])) for rows in self._rows(at, xs, changes)]
+        steps, both = np.concatenate([eps, self.steps]), np.array([[1.0], [-1.0]])
+        moves = np.concatenate([np.zeros((1, p + nx)), np.diag(steps), both * steps])
+        rows = self._rows(at, at.x + moves[:, :p], moves[None, :, p:])
+        parts = [self._equations(part, at, steps) for part in rows]
         residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
         return Linear(residuals, cost, self._weights(cost), *blocks)
@@ -129,11 +128,11 @@ class LeastSquares:
         p, count, scale = self.parameters.size, len(rows), np.outer(steps, steps)
         base = np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
         with np.errstate(invalid="ignore"):
-            change = (rows[:, 1:] - rows[:, :1]) / at.noise
+            change, together = np.split((rows[:, 1:] - rows[:, :1]) / at.noise, [len(steps)], axis=1)
+            total, most = change.sum(axis=1), np.maximum(_JUMP, _CURVED * np.abs(change).sum(axis=1))
+            smooth = (np.abs(together[:, 0] - total) < most) & (np.abs(together[:, 1] + total) < most)
         # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
-        size = np.nan_to_num(np.abs(change), nan=np.inf)
-        usual = _USUAL_CHANGES * np.median(size, axis=(0, 2), keepdims=True)
-        jumps = (size > np.maximum(_JUMP, usual)).any(axis=1, keepdims=True)
+        jumps = ~smooth[:, None]
         jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
