@@ -125,6 +125,10 @@ class Engine(abc.ABC):
         floats = sum(field.size for field in fields) + sum(field.size for field in dynamics)
         return 8 * _integration_size(model) + 4 * floats + 8
 
+    def start_at(self, initial: np.ndarray) -> None:
+        """Change the initial state of all later resets, (integration_size,)."""
+        self.initial = initial
+
     def prepare_capture(self) -> None:  # noqa: B027
         """Allocate memory for graphs, after all kernels have been compiled and before the first capture.
 

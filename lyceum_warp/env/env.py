@@ -226,6 +226,8 @@ class Env:
                 compile_ahead(worlds.rehearsal, self.device, self.task.name)
                 if self.engine.capturable and options.graphs:
                     self.engine.prepare_capture()
+                if self.task.fit is not None:
+                    worlds.hold_first_controls()
                 self.engine.reset(worlds.everyone)
                 Probe(worlds).check_bounds()  # a write out of range would damage the environment's own arrays
                 self.rand_reset(options.seed)

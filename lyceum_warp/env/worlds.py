@@ -5,11 +5,13 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+import mujoco
+import numpy as np
 import torch
 import warp as wp
 
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.core.fields import Stage
+from lyceum_warp.core.fields import Stage, elements
 from lyceum_warp.core.options import EnvOptions
 from lyceum_warp.core.task import MEMORIES, Task
 from lyceum_warp.engines.base import Engine
@@ -207,6 +209,27 @@ class Worlds(Resets):
         for phase in phases:
             if self.engine.capturable or not phase.engine:
                 phase.run()
+
+    def hold_first_controls(self) -> None:
+        """Let delayed actuators begin each episode as if the action had been 0 before it.
+
+        Otherwise, their controls would be 0 until the first action arrives, which throws a walking robot upwards.
+        """
+        assert self.task.fit is not None
+        self.set_mask(None)
+        self.seed_streams(0)
+        self.lasting_memory.zero_()
+        self._restart(self.everyone, randomly=False)
+        self.act()
+        model, state, controls = self.task.model, self.engine.initial.copy(), self.engine.ctrl.numpy()[0]
+        data, kind = mujoco.MjData(model), mujoco.mjtState.mjSTATE_INTEGRATION.value
+        mujoco.mj_setState(model, data, state, kind)
+        for name in self.task.fit.delays:
+            number, held = model.actuator(name).id, controls[elements(model, "ctrl", name)]
+            rows = np.tile(held.astype(float), (model.actuator_history[number, 0], 1))
+            mujoco.mj_initCtrlHistory(model, data, number, None, rows)
+        mujoco.mj_getState(model, data, state, kind)
+        self.engine.start_at(state)
 
     def keep_before(self) -> None:
         """Copy the current state into ``before``."""

@@ -194,6 +194,8 @@ def _controls(task: type[Task], options: EnvOptions, params: Mapping[str, Any], 
     env = Env(task, options.changed({"nworld": len(actions), "engine": "mujoco", "device": "cpu"}), params)
     if actions.shape[1] != env.action.shape[1]:
         raise ValueError(f"'action' has {actions.shape[1]} numbers per time, and the task's has {env.action.shape[1]}")
+    for memory in env.lasting.values():
+        memory.zero_()  # a startup's draws, such as errors of encoders, are not those of this robot
     env.reset()
     env.action.copy_(torch.as_tensor(actions))
     env.worlds.act()

@@ -16,10 +16,10 @@ _STEPS, _PARAMETER_STEP = (1e-6, 2e-5, 1e-5), 1e-4
 """Finite differences of positions, velocities and activations, and of parameters in multiples of the prior."""
 _MEMORIES = (0.015, 0.1, 0.5)
 """Seconds of memory of the simulations that guess the initial states."""
-_JUMP, _USUAL_CHANGES = 0.003, 30.0
-"""A prediction that a finite difference changes by the first multiple of the noise, and by the second multiple of the
-median change, has jumped. A few jumps would outweigh all smooth changes, make steps much too short, and intervals too
-narrow."""
+_JUMP, _CURVED = 0.003, 0.01
+"""A prediction has jumped in a finite difference if the change by all differences together is not the sum of the single
+changes, up to the first multiple of the noise and the second multiple of the sum of sizes. A few jumps would outweigh
+all smooth changes, make steps much too short, and intervals too narrow."""
 _START = (0.1, 1.0, 1.0)
 """Standard deviations of a step of the initial states, which keep unmeasured numbers where they are."""
 _SETTLE = 4
@@ -29,6 +29,9 @@ _STEADY = 0.03
 _NEAR, _SLACK = 2.0, 1.01
 """Steps below the first multiple of a standard deviation are averaged, because contacts make each of them uncertain. A
 step may increase the cost to the second multiple, because contacts change that, too."""
+_SHIFTS = np.array([0.0, -0.3, -0.1, -0.03, 0.03, 0.1, 0.3])
+"""Changes of a delay that are tried, in substeps. At whole substeps, the cost of stiff joints has ridges: the samples
+after a step of the controls, which show the delay best, have other derivatives on the other side."""
 _DRAWS = np.array([0.0] + 5 * [0.1, 0.3, 1.0])
 """Draws of initial states, in multiples of their posterior's deviation."""
 _DAMPINGS, _STATE_DAMPINGS = (0.0, 0.1, 3.0, 100.0), (0.0, 1.0, 100.0)
@@ -108,25 +111,28 @@ class LeastSquares:
         """Make the normal equations from finite differences, with one world for each number and window."""
         p, nx = self.parameters.size, self.predictor.nx
         eps = np.where(at.x >= self.parameters.high, -_PARAMETER_STEP, _PARAMETER_STEP) * self.parameters.std
-        xs = np.tile(at.x, (1 + p + nx, 1))
-        xs[1 : 1 + p] += np.diag(eps)
-        changes = np.zeros((1, 1 + p + nx, nx))
-        changes[0, 1 + p :] = np.diag(self.steps)
-        parts = [self._equations(rows, at, np.concatenate([eps, self.steps])) for rows in self._rows(at, xs, changes)]
+        steps, both = np.concatenate([eps, self.steps]), np.array([[1.0], [-1.0]])
+        moves = np.concatenate([np.zeros((1, p + nx)), np.diag(steps), both * steps])
+        rows = self._rows(at, at.x + moves[:, :p], moves[None, :, p:])
+        parts = [self._equations(part, at, steps) for part in rows]
         residuals, *blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
         cost = self._costs(residuals[:, None], np.ones(len(at.noise)))[:, 0]
+        return Linear(residuals, cost, self._weights(cost), *blocks)
+
+    def _weights(self, cost: np.ndarray) -> np.ndarray:
         share = np.maximum(cost, 1e-9) / np.maximum(1, self.seen.sum(axis=(1, 2)))
-        return Linear(residuals, cost, np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER, *blocks)
+        weights: np.ndarray = np.minimum(1.0, _BAD * np.median(share) / share) ** _POWER
+        return weights
 
     def _equations(self, rows: np.ndarray, at: Estimate, steps: np.ndarray) -> tuple[np.ndarray, ...]:
         p, count, scale = self.parameters.size, len(rows), np.outer(steps, steps)
         base = np.clip(rows[:, 0] / at.noise, -_CUT, _CUT)
         with np.errstate(invalid="ignore"):
-            change = (rows[:, 1:] - rows[:, :1]) / at.noise
+            change, together = np.split((rows[:, 1:] - rows[:, :1]) / at.noise, [len(steps)], axis=1)
+            total, most = change.sum(axis=1), np.maximum(_JUMP, _CURVED * np.abs(change).sum(axis=1))
+            smooth = (np.abs(together[:, 0] - total) < most) & (np.abs(together[:, 1] + total) < most)
         # a jump, such as a contact one substep later, has no derivative: the sample says nothing in this step
-        size = np.nan_to_num(np.abs(change), nan=np.inf)
-        usual = _USUAL_CHANGES * np.median(size, axis=(0, 2), keepdims=True)
-        jumps = (size > np.maximum(_JUMP, usual)).any(axis=1, keepdims=True)
+        jumps = ~smooth[:, None]
         jacobian, flat = np.where(jumps, 0.0, change).reshape(count, len(steps), -1), base.reshape(count, -1)
         weighted = jacobian * np.minimum(1.0, _HUBER / np.maximum(np.abs(flat), _HUBER))[:, None]
         square, gradient = weighted @ jacobian.swapaxes(1, 2) / scale, (weighted @ flat[..., None])[..., 0] / steps
@@ -134,7 +140,8 @@ class LeastSquares:
         return base, square[:, :p, :p], square[:, :p, p:], c, gradient[:, :p], gradient[:, p:]
 
     def iterate(self, at: Estimate) -> Estimate:
-        """Take a damped Gauss-Newton step, and estimate the noise for the next one."""
+        """Shift the delays, take a damped Gauss-Newton step, and estimate the noise for the next one."""
+        at = self._shifted(at)
         linear = self.linearize(at)
         cost, noise = linear.weight @ linear.cost + self.prior(at.x[None])[0], self._noise(at, linear)
         steady = np.abs(np.log(noise / at.noise)).max() < _STEADY
@@ -152,6 +159,18 @@ class LeastSquares:
                 break
         move, iteration = move if steady else np.inf, at.iteration + 1
         return dataclasses.replace(result, noise=noise, move=move, iteration=iteration, averaged=averaged)
+
+    def _shifted(self, at: Estimate) -> Estimate:
+        """Move each delay to another side of a ridge if the cost is clearly lower there."""
+        for i in [i for i, c in enumerate(self.parameters.coordinates) if c.kind == "delay"]:
+            xs = np.tile(at.x, (len(_SHIFTS), 1))
+            xs[:, i] += _SHIFTS * self.predictor.model.opt.timestep
+            xs = np.clip(xs, self.parameters.low, self.parameters.high)
+            costs = self.costs(at, xs, np.zeros((1, len(xs), self.predictor.nx)))
+            total = self._weights(costs[:, 0]) @ costs + self.prior(xs)
+            if _SLACK * total.min() < total[0]:
+                at = dataclasses.replace(at, x=xs[total.argmin()], averaged=0)
+        return at
 
     def _guessed(self, at: Estimate, states: Sequence[np.ndarray]) -> tuple[Estimate, np.ndarray]:
         """Choose each window's best initial state among the given ones and guesses; return the windows' costs, too."""

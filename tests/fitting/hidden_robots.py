@@ -23,6 +23,11 @@ HOPPING = """<mujoco model="hopping"><option timestep="0.005" integrator="implic
 <geom name="sole" type="box" size=".08 .08 .02" mass=".3" friction=".8"/></body></body></worldbody>
 <actuator><position name="leg" joint="leg" kp="800" kv="10"/></actuator></mujoco>"""
 
+STIFF = """<mujoco model="stiff"><compiler angle="radian"/><option timestep="0.005" integrator="implicitfast"/>
+<worldbody><body name="hand"><joint name="wrist" axis="0 1 0" damping=".02" armature=".005" range="-3 3"/>
+<geom type="capsule" size=".02" fromto="0 0 0 0 0 -.05"/></body></worldbody>
+<actuator><position name="wrist" joint="wrist" kp="60" kv="1"/></actuator></mujoco>"""
+
 NOISE = {"qpos": 0.002, "qvel": 0.05}
 
 

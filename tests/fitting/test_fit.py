@@ -5,7 +5,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-from hidden_robots import ARM, HOPPING, NOISE, log_of
+from hidden_robots import ARM, HOPPING, NOISE, STIFF, log_of
 
 import lyceum_warp as lw
 from lyceum_warp.fitting import Fit
@@ -100,6 +100,18 @@ def test_held_out_error_tells_a_delayed_servo_from_an_ideal_one() -> None:
     assert with_delay.delays["elbow"] == pytest.approx(0.013, abs=5e-4)
     ideal = lw.fit(spec, log_of(ARM, ["kp.*"], {}, controls(3.0)), ["kp.*", "delay.ctrl.*"], samples=0, nthread=1)
     assert ideal.low[1] == 0.0 and ideal.high[1] < 1e-3
+
+
+@pytest.mark.parametrize("delay", [0.0093, 0.0097])
+def test_delay_of_a_stiff_joint_is_found_beside_a_whole_number_of_substeps(delay: float) -> None:
+    # nearly all information is in the samples right after a step of the controls
+    truth = {"kp.*": 0.1, "kd.*": -0.1, "delay.ctrl.*": delay}
+    control = np.repeat(lw.excitation([-0.4], [0.4], "steps", seconds=6.0, rate=50, frequencies=(0.3, 4)), 4, axis=0)
+    log = log_of(STIFF, list(truth), truth, control, dt=0.005, substeps=1)
+    fit = lw.fit(mujoco.MjSpec.from_string(STIFF), log, list(truth), samples=0, nthread=1)
+    for name, x in coordinates(fit, fit.value).items():
+        assert abs(x - truth[name]) < (1e-4 if name.startswith("delay") else 0.02), name
+    assert fit.high[2] - fit.low[2] < 2e-4
 
 
 def test_windows_with_contacts_determine_mass_and_gain() -> None:

@@ -26,12 +26,19 @@ class World:
     qpos: Row[float]
     qvel: Row[float]
     dof_damping: Row[float]
+    offset: Row[float] = lw.lasting_memory(2)
 
 
 @wp.struct
 class Params:
     dt: float
     stiffness: float = lw.from_model(lambda model, p: model.actuator_gainprm[0, 0])
+
+
+@wp.func
+def control(s: World, action: Row[float], p: Params, ctrl: Row[float]):
+    for i in range(2):
+        ctrl[i] = action[i] - 0.5 - s.offset[i]
 
 
 @wp.func
@@ -42,6 +49,7 @@ def observe(s: World, p: Params, obs: Row[float]):
 @wp.func
 def startup(s: World, p: Params, rng: Row[wp.uint32]):
     s.dof_damping[0] = 2.0 * s.dof_damping[0]
+    s.offset[0] = 0.1
 
 
 class FittedArm(lw.Task):
@@ -108,6 +116,29 @@ def test_both_engines_step_fitted_worlds_alike(fit: lw.Fit, task: str) -> None:
         for k in range(10):
             env.step(torch.full((4, 2), 0.3 * (-1) ** k))
     assert torch.allclose(envs[0].obs, envs[1].obs, atol=1e-5)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_delayed_controls_begin_as_after_the_action_0(fit: lw.Fit, task: str, tmp_path: Path, engine: str) -> None:
+    envs = [
+        lw.make(task, fitted=folder, engine=engine)
+        for folder in (fit.folder, changed(fit, tmp_path / "fit", delays={}))
+    ]
+    for env in envs:
+        env.lasting["offset"].zero_()
+        env.reset()
+        env.step()
+    assert envs[0].obs.abs().min() > 1e-3
+    assert torch.allclose(envs[0].obs, envs[1].obs, atol=1e-6)
+
+
+def test_log_of_actions_is_a_log_of_their_controls(task: str) -> None:
+    actions = lw.excitation([-0.3] * 2, [1.3] * 2, seconds=3.0, rate=100)
+    log = log_of(ARM, ["kp.*"], {"kp.*": 0.2}, actions - 0.5)
+    others = {name: column for name, column in log.items() if name != "ctrl"}
+    fits = [lw.fit(task, logged, ["kp.*"], samples=0, iterations=1, nthread=1)
+            for logged in (log, others | {"action": actions})]  # fmt: skip
+    assert fits[1].value == pytest.approx(fits[0].value, rel=1e-6)
 
 
 def test_run_keeps_a_copy_of_its_fit(fit: lw.Fit, task: str, tmp_path: Path) -> None:

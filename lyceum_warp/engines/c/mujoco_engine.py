@@ -132,6 +132,10 @@ class MujocoEngine(Engine):
     def _alias(self, rows: np.ndarray) -> wp.array:
         return wp.array(rows, dtype=wp.float64, device=self.device, copy=False)
 
+    def start_at(self, initial: np.ndarray) -> None:
+        super().start_at(initial)
+        wp.copy(self._initial, self._rounded_initial())
+
     def _rounded_initial(self) -> wp.array:
         initial = self.initial.copy()
         for name in STATE_FIELDS:

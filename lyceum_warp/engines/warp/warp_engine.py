@@ -87,7 +87,7 @@ class WarpEngine(Engine):
         self._constants = self._model_constants()
         # from these model fields, MuJoCo Warp would derive a different initial state for each world
         self._start: wp.array | None = None
-        if initial is not None or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
+        if initial is not None or model.nhistory or self.dynamics.keys() & {"qpos0", "body_pos", "body_quat"}:
             self._start = wp.array(self.initial, dtype=float, device=device)
         self._reset = [field.name for field in self.fields.values() if field.reset > Stage.NONE]
         current = [field.name for field in self.fields.values() if field.refresh > Stage.NONE]
@@ -254,6 +254,11 @@ class WarpEngine(Engine):
         bits = [sizes.CONTACT_BITS, sizes.CONSTRAINT_BITS, sizes.IGNORED_BITS]
         args = [mask, d.qpos, d.qvel, d.act, d.overflow, *bits, d.efc.J, self.fault]
         wp.launch(faults.faults_of_fields, self.nworld, args, device=self.device)
+
+    def start_at(self, initial: np.ndarray) -> None:
+        super().start_at(initial)
+        if self._start is not None:
+            self._start.assign(initial.astype(np.float32))
 
     def reset(self, mask: wp.array) -> None:
         with self._on_device():
