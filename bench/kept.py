@@ -91,6 +91,7 @@ def synchronize(env: lw.Env) -> None:
 
 
 def seconds(env: lw.Env, function: Callable[[], object]) -> float:
+    synchronize(env)
     start = time.perf_counter()
     function()
     synchronize(env)
