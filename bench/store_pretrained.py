@@ -1,7 +1,7 @@
 """Store the policies of runs in the package: lyceum-warp bench store_pretrained RUN...
 
 The folder lyceum_warp/pretrained/TASK then contains the run's settings, the policy with its network weights in float16,
-and the policy's return.
+and the policy's return in exact physics on the C engine.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from lyceum_warp.training import Run, read_checkpoint
 from lyceum_warp.training.runs.checkpoints import write_content
 
 FOLDER = Path(lw.__file__).parent / "pretrained"
-KEPT = ("format", "algorithm", "task", "params", "physics", "options", "nworld", "threads", "seed")
+KEPT = ("format", "algorithm", "task", "params", "physics", "exact_from", "options", "nworld", "threads", "seed")
 EPISODES, SEED = 32, 1
 FEW, FIRST = 4, 60  # a stored policy is tested in this many worlds and steps
 
@@ -31,7 +31,7 @@ def store(folder: Path, which: str) -> Path:
     saved = content["policy"]
     state = {name: part.half() if name.startswith("network.") else part for name, part in saved["state"].items()}
     saved_task = {name: value for name, value in run.config["kept"].items() if name in ("name", "model_hash")}
-    config = {name: run.config[name] for name in KEPT} | {
+    config = {name: run.config.get(name) for name in KEPT} | {
         algorithm: run.config[algorithm], "engine": "auto", "device": "cpu", "kept": saved_task,
         "versions": {"mujoco": run.config["versions"]["mujoco"]},
     }  # fmt: skip
@@ -42,12 +42,12 @@ def store(folder: Path, which: str) -> Path:
     )
     (out / "config.json").write_text(json.dumps(config, indent=1))
     stored = Run.open(out)
-    env = run_worlds(stored, {}, {}, nworld=EPISODES)
+    env = run_worlds(stored, {"physics": "exact"}, {}, nworld=EPISODES)
     if env.horizon == 0:
         env = env.replicate(horizon=ENDLESS_STEPS)
     policy = lw.load(stored)
     returns = evaluate(env, policy, EPISODES, seed=SEED).returns
-    few = run_worlds(stored, {}, {}, nworld=FEW)
+    few = run_worlds(stored, {"physics": "exact"}, {}, nworld=FEW)
     few.rand_reset(SEED)
     total = torch.zeros(FEW)
     for _ in range(FIRST):

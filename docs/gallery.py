@@ -25,7 +25,7 @@ from PIL import Image
 import lyceum_warp as lw
 from lyceum_warp.binding import file_name, find_task
 from lyceum_warp.binding.bound_task import BoundTask
-from lyceum_warp.training import ALGORITHMS, pretrained_tasks
+from lyceum_warp.training import ALGORITHMS, Run, learned_physics, pretrained_tasks
 from lyceum_warp.viz import CameraChoice, FreeCamera, write_page
 from lyceum_warp.viz.cameras import camera_values
 from lyceum_warp.viz.render import Painter
@@ -318,6 +318,8 @@ def card(name: str, stem: str, result: dict[str, str]) -> list[str]:
         head = "<details><summary>How this was made</summary>"
         lines += [head, "", "```", result["command"], "```", "", "</details>", ""]
     if name in pretrained_tasks():
+        physics = learned_physics(Run.open(lw.pretrained_run(name)), find_task(name))
+        lines += [f"Learned in {physics}, judged in exact physics on the C engine", ""]
         lines += [f"<!-- turnable: {name} -->", ""]
     return [*lines, "</div>", ""]
 

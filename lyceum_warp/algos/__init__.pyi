@@ -37,6 +37,7 @@ from lyceum_warp.algos.common.squashed_policy import SquashedPolicy as SquashedP
 from lyceum_warp.algos.common.transfer import (
     EXACT as EXACT,
     Transfer as Transfer,
+    physics_text as physics_text,
     simulation as simulation,
     task_physics as task_physics,
     transfer as transfer,

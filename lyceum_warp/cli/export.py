@@ -44,7 +44,9 @@ class Export:
         algos.check_export(path)
         which = better_policy(run, self.which, task=self.task)
         policy = training.load(run, which=which)
-        algos.export_policy(policy, path, env=self._env(run, which) if path.suffix == ".onnx" else None)
+        env = self._env(run, which) if path.suffix == ".onnx" else None
+        physics = None if env is None else training.learned_physics(run, env.task.definition, which)
+        algos.export_policy(policy, path, env=env, physics=physics)
         say(f"{path}: {policy.nobs} observations, {policy.nact} actions, {path.stat().st_size / 1e3:.1f} kB")
         say_entries(next="docs/deployment.md runs the policy on a robot")
 

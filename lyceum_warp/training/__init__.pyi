@@ -31,6 +31,7 @@ from lyceum_warp.training.runs.choice import (
 from lyceum_warp.training.runs.configuration import (
     ALGORITHMS as ALGORITHMS,
     Configuration as Configuration,
+    learned_physics as learned_physics,
     learner_classes as learner_classes,
     saved_networks as saved_networks,
 )

@@ -73,6 +73,11 @@ def test_command_follows_the_task_and_names_the_physics(tmp_path: Path, capsys: 
     assert cli.main(["train", TASK, "--out", str(tmp_path / "exact"), "--physics", "exact", *words]) == 0
     assert "coarse physics" not in capsys.readouterr().out
     assert cli.main(["train", TASK, "--out", str(tmp_path / "short"), *words, "--iterations", "1"]) == 0
+    runtime, coarse = pytest.importorskip("onnxruntime"), "coarse physics (cone elliptic, integrator discrete)"
+    for name, text in (("run", f"{coarse} for 2 iterations, then exact physics for 1"), ("short", coarse)):
+        assert cli.main(["export", str(tmp_path / name), "--which", "last"]) == 0
+        session = runtime.InferenceSession(str(tmp_path / name / "policy.onnx"))
+        assert json.loads(session.get_modelmeta().custom_metadata_map["physics"]) == text
     for name, physics in (("run", "exact"), ("short", "coarse")):
         capsys.readouterr()
         assert cli.main(["eval", str(tmp_path / name), "--episodes", "1"]) == 0

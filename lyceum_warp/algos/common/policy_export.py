@@ -24,7 +24,9 @@ from lyceum_warp.support.validate import described, first_sentence
 _SUFFIXES = (".onnx", ".pt2")
 
 
-def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None = None) -> Path:
+def export_policy(
+    policy: torch.nn.Module, path: str | Path, *, env: Env | None = None, physics: str | None = None
+) -> Path:
     """Export a policy's ``act`` to a file that runs without this package.
 
     The exported file includes the normaliser. It maps float32 observations (n, nobs), with any n, to actions without
@@ -49,6 +51,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
         path: Path of the file; an existing file is replaced.
         env: An environment of the policy's task. With an environment, an ONNX file also contains the
             ``deployment_metadata``. Its memory tells how far the training's curricula had come.
+        physics: Text of the metadata on the physics in which the policy has learned, if it is not that of ``env``.
 
     Returns:
         The file's path.
@@ -84,7 +87,7 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
                     program, input_names=inputs, output_names=outputs, dynamo=True, verbose=False
                 )
                 if env is not None:
-                    metadata = deployment_metadata(policy, env)
+                    metadata = deployment_metadata(policy, env, physics)
                     program.model.metadata_props.update({name: json.dumps(value) for name, value in metadata.items()})
     except Exception as error:  # torch raises many types of errors
         reason = first_sentence(error)
@@ -99,14 +102,14 @@ def export_policy(policy: torch.nn.Module, path: str | Path, *, env: Env | None 
     return path
 
 
-def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
+def deployment_metadata(policy: torch.nn.Module, env: Env, physics: str | None = None) -> dict[str, Any]:
     """Describe a policy's inputs, outputs and timing, as needed on a robot or in another simulator.
 
     ================  ===================================================================================
     ``task``          name of the task
     ``timestep``      seconds between two actions
     ``substep``       seconds between two steps of the exact physics
-    ``physics``       the physics of ``env``, in which the policy has learned
+    ``physics``       the physics in which the policy has learned, by default that of ``env``
     ``observations``  the parts of an observation in order: name, size, and the normaliser's offset and
                       scale of each column; the file applies them: (obs - offset) * scale
     ``cameras``       the cameras whose pictures the policy sees, if any; see ``lw.Camera``
@@ -131,7 +134,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env) -> dict[str, Any]:
         "task": task.name,
         "timestep": env.timestep,
         "substep": model.opt.timestep,
-        "physics": simulation(env).partition(", ")[2],
+        "physics": physics or simulation(env).partition(", ")[2],
         "observations": parts if "policy" in groups else [],
         **({"cameras": cameras} if cameras else {}),
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],

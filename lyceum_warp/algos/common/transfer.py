@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from lyceum_warp.algos.common.evaluation import Episodes, evaluate, evaluation_worlds
-from lyceum_warp.core.options import PhysicsOptions
+from lyceum_warp.core import PhysicsOptions, Task
 from lyceum_warp.engines.placement import options_on_cores
 from lyceum_warp.env import Curriculum, Env, Policy
 from lyceum_warp.support.intervals import clear_losses, mean_interval, share_interval
@@ -209,8 +209,12 @@ def task_physics(env: Env) -> tuple[dict[str, PhysicsOptions], str]:
 
     Options that only the Warp engine has are ignored.
     """
-    named = {EXACT: PhysicsOptions(), **env.task.definition.physics}
-    current = dataclasses.replace(env.options.physics, nconmax=None, njmax=None, deterministic=None)
+    return _named_physics(env.task.definition, env.options.physics)
+
+
+def _named_physics(task: type[Task], physics: PhysicsOptions) -> tuple[dict[str, PhysicsOptions], str]:
+    named = {EXACT: PhysicsOptions(), **task.physics}
+    current = dataclasses.replace(physics, nconmax=None, njmax=None, deterministic=None)
     name = next((name for name, options in named.items() if options == current), "own")
     return named | {name: current}, name
 
@@ -220,9 +224,14 @@ def simulation(env: Env) -> str:
     engine = (
         "C engine" if env.engine.name == "mujoco" else f"{env.engine.name.capitalize()} engine on {env.device.alias}"
     )
-    named, physics = task_physics(env)
-    options = ", ".join(f"{name} {value}" for name, value in named[physics].given().items())
-    return f"{engine}, {physics} physics{f' ({options})' if options else ''}"
+    return f"{engine}, {physics_text(env.task.definition, env.options.physics)}"
+
+
+def physics_text(task: type[Task], physics: PhysicsOptions) -> str:
+    """Name physics options of a task, such as "coarse physics (integrator discrete)"."""
+    named, name = _named_physics(task, physics)
+    options = ", ".join(f"{option} {value}" for option, value in named[name].given().items())
+    return f"{name} physics{f' ({options})' if options else ''}"
 
 
 def _compared(

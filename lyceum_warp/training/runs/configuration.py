@@ -13,7 +13,7 @@ from torch import nn
 from lyceum_warp import algos
 from lyceum_warp.algos import LIMIT, Distill, GaussianPolicy, Learner, Team
 from lyceum_warp.binding import class_in_file, class_sources, made, spelled_task
-from lyceum_warp.core import EnvOptions
+from lyceum_warp.core import EnvOptions, Task
 from lyceum_warp.engines import engine_name
 from lyceum_warp.env import Env
 from lyceum_warp.support.machine import cpu_cores
@@ -182,6 +182,16 @@ class Configuration:
         with torch.random.fork_rng(devices=()):
             torch.manual_seed(seed)
             return GaussianPolicy(*sizes, network=made(class_in_file(network, nn.Module), *sizes), **options)
+
+
+def learned_physics(run: Run, task: type[Task], which: str = "last") -> str:
+    """Name the physics in which a run's policy has learned, with a change to exact physics."""
+    first = algos.physics_text(task, Configuration.of(run).options.physics)
+    number = run.config.get("exact_from")
+    done = read_checkpoint(run.policy_file(which), parts=("iteration",))["iteration"]
+    if number is None or done <= number:
+        return first
+    return f"{first} for {number} iterations, then {algos.EXACT} physics for {done - number}"
 
 
 def saved_networks(run: Run, which: str | int | None = None) -> tuple[Any, Any, int]:
