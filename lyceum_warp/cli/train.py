@@ -19,6 +19,7 @@ from lyceum_warp.core import EnvOptions, PhysicsOptions
 from lyceum_warp.support.interrupts import Interrupted, obeyed
 from lyceum_warp.support.long_work import LongWork
 from lyceum_warp.support.outlines import outline
+from lyceum_warp.support.validate import whole_number
 
 _CONFIGS = {
     name.removesuffix("Config").lower(): outline("lyceum_warp.algos", name)
@@ -321,13 +322,13 @@ class Train:
         callbacks: list[training.Callback] = [display]
         if settings["target_return"] is not None:
             callbacks.insert(0, training.TargetReturn(settings["target_return"]))
-        if every := settings["video_every"]:
+        if every := whole_number("--video-every", settings["video_every"], low=0):
             callbacks.append(training.Videos(every, camera=arguments.video_camera(self.camera), progress=display.work))
         if settings["tensorboard"]:
             callbacks.append(training.TensorBoard())
         if settings["wandb"] is not None:
             callbacks.append(training.WandB(settings["wandb"]))
-        if every := settings["gate_every"]:
+        if every := whole_number("--gate-every", settings["gate_every"], low=0):
             callbacks.append(training.PassGate(every))
         if self.transfer:
             callbacks.append(training.TransferTest(progress=display.work))

@@ -185,7 +185,8 @@ def test_damaged_best_policy_is_replaced_with_a_message(
         ("point_mass", ["--learning-rate", "3"], ["--learning-rate", "ppo or sac", "npg"]),
         ("point_mass", ["--video-every", "1", "--camera", "side"], ["'side'"]),
         ("point_mass", ["--camera", "0"], ["--camera", "--video"]),
-        ("point_mass", ["--video-every", "-1"], ["every", "-1"]),
+        ("point_mass", ["--video-every", "-1"], ["--video-every must be", "-1"]),
+        ("point_mass", ["--gate-every", "-1"], ["--gate-every must be", "-1"]),
         ("point_mass", ["--take-over"], ["--take-over has no effect without --resume"]),
     ],
 )
