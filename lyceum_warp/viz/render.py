@@ -18,7 +18,7 @@ import pickle
 import shutil
 import sys
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
@@ -41,6 +41,8 @@ class Shot(TypedDict):
     lines: list[tuple[np.ndarray, tuple[float, ...], float]]
     """Lines, each as points (points, 3), a colour and a width in pixels."""
     frames: int
+    view: NotRequired[dict[str, Any]]
+    """Attributes of the ``MjvCamera`` from this shot on, if they change."""
 
 
 class Painter:
@@ -56,8 +58,7 @@ class Painter:
         self.renderer = mujoco.Renderer(model, height, width)
         self.data, self.ghost = mujoco.MjData(model), mujoco.MjData(model)
         self.view, self.option, self.perturb = mujoco.MjvCamera(), mujoco.MjvOption(), mujoco.MjvPerturb()
-        for name, value in camera.items():
-            setattr(self.view, name, value)
+        self._look(camera)
         self._fields: dict[str, np.ndarray] = {}
 
     def render(self, shot: Shot) -> np.ndarray:
@@ -65,6 +66,7 @@ class Painter:
         if any(not np.array_equal(value, self._fields.get(name, ())) for name, value in shot["model_fields"].items()):
             self._fields = shot["model_fields"]
             change_model(self.mujoco, self.model, self._fields)
+        self._look(shot.get("view", {}))
         self._place(self.data, shot["state"])
         self.renderer.update_scene(self.data, self.view, self.option)
         scene = self.renderer.scene
@@ -81,6 +83,10 @@ class Painter:
             self._add_line(scene, points, paint, width)
         image: np.ndarray = self.renderer.render()
         return image
+
+    def _look(self, camera: dict[str, Any]) -> None:
+        for name, value in camera.items():
+            setattr(self.view, name, value)
 
     def _place(self, data: Any, state: np.ndarray) -> None:
         self.mujoco.mj_setState(self.model, data, state, self.mujoco.mjtState.mjSTATE_INTEGRATION)
