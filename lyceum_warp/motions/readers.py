@@ -149,6 +149,8 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if module.partition(".")[0] == "numpy" and name in _MAKERS:
             return _MAKERS[name]
+        if (module, name) == ("_codecs", "encode"):  # before protocol 3, pickles hold bytes as texts
+            return lambda text, encoding: str.encode(text, "latin1")
         raise pickle.UnpicklingError(f"it would run {module}.{name}, but only arrays are read")
 
 

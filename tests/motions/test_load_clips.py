@@ -21,11 +21,12 @@ def test_all_formats_give_the_same_clip(model: mujoco.MjModel, tmp_path: Path) -
     write_npz(tmp_path / "a.npz", model, qpos, 50.0)
     write_pickle(tmp_path / "b.pkl", qpos, 50.0)
     write_pickle(tmp_path / "c.pkl", qpos.astype(np.float32), 50.0, protocol=5)
+    write_pickle(tmp_path / "d.pkl", qpos, 50.0, protocol=2)
     clips = lw.load_clips(tmp_path, model)
-    assert clips.names == ("a", "b", "c") and clips.rate == 50.0 and clips.seconds == pytest.approx(12.0)
+    assert clips.names == ("a", "b", "c", "d") and clips.rate == 50.0 and clips.seconds == pytest.approx(16.0)
     for loaded in clips.qpos:
         np.testing.assert_allclose(loaded, qpos, atol=1e-6)
-    slow = lw.load_clips(write_csv(tmp_path / "d.csv", qpos), model)  # 30 frames per second
+    slow = lw.load_clips(write_csv(tmp_path / "e.csv", qpos), model)  # 30 frames per second
     assert len(slow.qpos[0]) == int((len(qpos) - 1) / 30.0 * 50.0 + 1e-6) + 1
     np.testing.assert_allclose(slow.qpos[0][::5], qpos[::3], atol=1e-6)
 
