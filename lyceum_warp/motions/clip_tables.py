@@ -28,7 +28,7 @@ def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
     """Get the first row and the number of rows of each clip, (clips, 2).
 
     Raises:
-        ValueError: The clips are those of a robot with other joints, or have another rate than the task.
+        ValueError: The clips are those of a robot with other joints, have another rate than the task, or are broken.
     """
     joints = p.clips.shape[1] - 9
     if model.nq != joints + 7:
@@ -38,6 +38,14 @@ def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
         raise ValueError(
             "each clip needs three frames, and its first frame has the time 0: make clips by lw.load_clips"
         )
+    unit = np.abs(np.linalg.norm(p.clips[:, 5:9], axis=1) - 1.0) < 1e-2
+    if not unit.all() or not (p.clips[:, 1] > 0.0).all():
+        raise ValueError(
+            "each row of clips needs a time, a positive weight, a position and a unit quaternion: make clips by "
+            "lw.load_clips"
+        )
+    if (clip := np.max(p.start_clip)) >= len(table):
+        raise ValueError(f"start_clip={clip} must be less than {len(table)}, the number of clips")
     last = p.clips[table.sum(1) - 1, 0]
     dt = float(last.sum() / (table[:, 1] - 1).sum())
     if abs(dt / p.dt - 1.0) > 1e-3:

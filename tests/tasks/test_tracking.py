@@ -198,6 +198,13 @@ def test_clips_of_any_length_share_one_policy(tmp_path: Path) -> None:
         lw.make("go1_tracking", clips=clips, frame_skip=2)
     with pytest.raises(ValueError, match="the clips have 12 joints and a base, but the model has 36 coordinates"):
         lw.make("g1_tracking", clips=clips)
+    with pytest.raises(ValueError, match="start_clip=9 must be less than 2, the number of clips"):
+        lw.make("go1_tracking", clips=clips, start_clip=9)
+    for column, value in ((1, -1.0), (5, 3.0)):
+        table = np.array(env.task.params["clips"])
+        table[:, column] = value
+        with pytest.raises(ValueError, match="a positive weight, a position and a unit quaternion"):
+            lw.make("go1_tracking", clips=table)
 
 
 def test_failures_move_starts_to_their_bins() -> None:
