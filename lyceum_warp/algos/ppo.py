@@ -243,8 +243,9 @@ class PPO(OnPolicyLearner):
         self._make_networks(policy, value, scale=1.0, limit=limit, as_torch=True)
         self._recurrent = self.policy.state_size + self.value.state_size > 0
         if self._recurrent and config.symmetry != "none":
+            what = "cameras" if self.policy.pictures else "memory"
             raise ValueError(
-                f"symmetry={config.symmetry!r} needs a policy without memory: use symmetry='none' (--symmetry none)"
+                f"symmetry={config.symmetry!r} needs a policy without {what}: use symmetry='none' (--symmetry none)"
             )
         self._length = steps if self._recurrent else 1  # steps of a sequence, which stays together in a mini-batch
         self._burn_in = getattr(self.policy.network, "burn_in", 0)

@@ -134,7 +134,9 @@ def test_an_exported_policy_takes_pictures(env: lw.Env, tmp_path: Path, suffix: 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"policy_groups": ("front",)}, "no group 'front'"), ({"value_group": "camera"}, "no group 'camera'"),
     ({"policy_groups": ("camera", "ids")}, "segmentation"), ({"num_steps": 2}, "frames"),
-    ({"symmetry": "exact"}, "without memory"), ({"policy_groups": "camera"}, "names"),
+    ({"symmetry": "exact"}, "without cameras"), ({"policy_groups": "camera"}, "names"),
+    ({"policy_groups": ("camera", "camera")}, "'camera' twice"), ({"random_shift": 40}, "less than the 16 pixels"),
+    ({"policy_groups": ("policy",), "random_shift": 2}, "0 for a policy without cameras"),
 ])  # fmt: skip
 def test_wrong_settings_are_refused(shared_env, changes: dict[str, Any], message: str) -> None:
     cameras = [*SIDE, lw.Camera("side", 16, 16, "segmentation", "ids")]

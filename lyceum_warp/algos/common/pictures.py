@@ -30,13 +30,19 @@ def policy_inputs(env: Env, config: PictureConfig) -> tuple[int, dict[str, Any]]
         ValueError: There is no group of a name, or a policy cannot read a group.
     """
     cameras = {camera.group: camera for camera in env.task.cameras}
-    for group in (groups := config.policy_groups or ("policy", *cameras)):
+    groups = config.policy_groups or ("policy", *cameras)
+    if twice := next((group for group in groups if groups.count(group) > 1), ""):
+        raise ValueError(f"policy_groups={groups} names {twice!r} twice: omit one of them")
+    for group in groups:
         check_group(group, env.obs_groups, env.task.name)
         if group != "policy" and group not in cameras:
             raise ValueError(f"policy_groups may hold 'policy' and the groups of cameras, not {group!r}")
         if group in cameras and cameras[group].kind == "segmentation":
             raise ValueError(f"the policy cannot read the ids of the segmentation {group!r}: use kind 'rgb' or 'depth'")
     pictures = {group: env.obs_spaces[group].shape for group in groups if group in cameras}
+    if config.random_shift >= (size := min((min(shape[:2]) for shape in pictures.values()), default=1)):
+        needed = f"less than the {size} pixels of a picture" if pictures else "0 for a policy without cameras"
+        raise ValueError(f"random_shift={config.random_shift} must be {needed}")
     arguments = {name: getattr(config, name) for name in ("channels", "spatial_softmax", "frames")}
     return env.obs_space.size if "policy" in groups else 0, {"pictures": pictures, **arguments}
 
