@@ -7,7 +7,7 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from lyceum_warp.support.suggestions import suggest_arguments
+from lyceum_warp.support.suggestions import did_you_mean, suggest_arguments
 from lyceum_warp.support.validate import Rule, check_fields, check_kind, finite_number
 
 Kind = Literal["rgb", "depth", "segmentation"]
@@ -68,7 +68,9 @@ class Camera:
             return
         body = spec.worldbody if self.body == "world" else spec.body(self.body)
         if body is None:
-            raise ValueError(f"the model has no body {self.body!r}, to which the camera {self.name!r} is to be added")
+            names = [body.name for body in spec.bodies]
+            hint = did_you_mean(self.body, names, f"its bodies are {', '.join(filter(None, names))}")
+            raise ValueError(f"the model has no body {self.body!r} for the camera {self.name!r}: {hint}")
         back = np.subtract(self.pos, self.lookat)
         if not (length := np.linalg.norm(back)):
             raise ValueError(f"pos and lookat of the camera {self.name!r} must differ, not both be {self.pos}")
