@@ -45,7 +45,7 @@ def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
             "lw.load_clips"
         )
     if (clip := np.max(p.start_clip)) >= len(table):
-        raise ValueError(f"start_clip={clip} must be less than {len(table)}, the number of clips")
+        raise ValueError(f"start_clip={clip:g} must be less than {len(table)}, the number of clips")
     last = p.clips[table.sum(1) - 1, 0]
     dt = float(last.sum() / (table[:, 1] - 1).sum())
     if abs(dt / p.dt - 1.0) > 1e-3:
