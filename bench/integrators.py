@@ -27,7 +27,9 @@ from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 EXACT = "exact"
 INTEGRATORS = ("euler", "implicitfast", "discrete")
-PLANNED = {"reach": 1.5, "panda_lift": 5.0, "g1_stand": 3.0, "humanoid_stand": 3.0}
+PLANNED = {
+    "reach": 1.5, "panda_lift": 5.0, "g1_stand": 3.0, "g1_walk": 3.0, "humanoid_stand": 3.0, "humanoid_walk": 3.0,
+}  # fmt: skip
 """Tasks with a planner, and the seconds of an episode."""
 PLANNED_EPISODES = 5
 
@@ -63,11 +65,11 @@ def cases(options: Options) -> list[Case]:
     episodes = min(options.episodes, 4) if options.short else options.episodes
     cases: list[Case] = []
     for part, task in ((part, task) for part in parts for task in chosen if task in tasks[part]):
-        frame_skip, planned = find_task(task).frame_skip, part == "planners"
-        counts = dict.fromkeys((*(() if planned else (frame_skip,)), -(-frame_skip // 2), 1))
+        frame_skip = find_task(task).frame_skip
+        counts = dict.fromkeys((frame_skip, -(-frame_skip // 2), 1))
         settings = [(EXACT, frame_skip), *((name, count) for count in counts for name in INTEGRATORS)]
         for seed, setting in itertools.product(options.seeds or (0,), settings):
-            if planned:
+            if part == "planners":
                 cases.append(PlannerCase(task, *setting, PLANNED_EPISODES, seed, PLANNED[task]))
             else:
                 cases.append(Case(task, *setting, episodes, seed))
@@ -152,7 +154,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         "Pretrained policies under each integrator and number of substeps, on equal initial states: the mean return, "
         "its difference from the exact physics of the task with a 95 % interval, terminated episodes and faults.":
         [row for row in rows if "seconds" not in row.case],
-        "MPPI with samples under each integrator and fewer substeps, on equal initial states and seeds: the same "
+        "MPPI with samples under each integrator and number of substeps, on equal initial states and seeds: the same "
         "columns. The controlled worlds have exact physics and wait for each plan. The planner has the samples and the "
         "horizon of the task, which two cores can bear, but the integrator and substeps of the row. Episodes are short "
         f"({', '.join(f'{task} {seconds:g} s' for task, seconds in PLANNED.items())}) and few, so intervals are wide.":
