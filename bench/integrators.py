@@ -59,9 +59,9 @@ class PlannerCase(Case):
 
 def cases(options: Options) -> list[Case]:
     tasks = {"policies": pretrained_tasks(), "planners": PLANNED}
-    parts = choose(options.parts, tasks, ("policies",) if options.short else (), what="part")
+    parts = choose(options.parts, tasks, what="part")
     known = dict.fromkeys(name for part in parts for name in tasks[part])
-    chosen = choose(options.tasks, known, ("cartpole_swingup",) if options.short else (), what="task")
+    chosen = choose(options.tasks, known, ("cartpole_swingup", "reach") if options.short else (), what="task")
     episodes = min(options.episodes, 4) if options.short else options.episodes
     cases: list[Case] = []
     for part, task in ((part, task) for part in parts for task in chosen if task in tasks[part]):
@@ -70,7 +70,8 @@ def cases(options: Options) -> list[Case]:
         settings = [(EXACT, frame_skip), *((name, count) for count in counts for name in INTEGRATORS)]
         for seed, setting in itertools.product(options.seeds or (0,), settings):
             if part == "planners":
-                cases.append(PlannerCase(task, *setting, PLANNED_EPISODES, seed, PLANNED[task]))
+                seconds = 0.2 if options.short else PLANNED[task]
+                cases.append(PlannerCase(task, *setting, PLANNED_EPISODES, seed, seconds))
             else:
                 cases.append(Case(task, *setting, episodes, seed))
     return cases

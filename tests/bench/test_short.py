@@ -45,6 +45,13 @@ def humanoid(*results: Result) -> None:
     assert all(not result["fell"] and result["up_share"] == 1.0 for result in results)
 
 
+def integrators(*results: Result) -> None:
+    policy, (exact, euler, _, discrete) = results[0], results[4:8]  # cartpole has one substep
+    assert len(results) == 11 and len(policy["returns"]) == 4
+    assert euler["returns"] == exact["returns"] != discrete["returns"]  # reach has Euler's method
+    np.testing.assert_allclose(discrete["returns"], exact["returns"], rtol=0.02)
+
+
 def latency(*results: Result) -> None:
     for result in results:
         assert result["plans"] > 1 and 0.0 < result["plan_ms"] <= result["max_ms"] and result["deadline_ms"] == 20.0
@@ -91,6 +98,7 @@ SHORT: dict[Callable[..., None], str] = {
     fidelity: "--tasks point_mass --nworld 3 --steps 4",
     fits: "--parts policies",
     humanoid: "--threads 1",
+    integrators: "--threads 1",
     latency: "--threads 1 --samples 8",
     mppi: "--threads 1 --contestants mppi python",
     objects: "--engines mujoco",
