@@ -195,7 +195,8 @@ def tables(rows: Sequence[Row]) -> list[Table]:
         explained = "Medians over the repeats; ratios of the same repeat: median (smallest to largest)."
         if lines:
             tables.append(Table(f"{title} {explained}", [*by, *(LABELS[name] for name in names)], lines))
-    if lines := [kept_line(row) for *_, row in grouped(rows, "kept", "task", "contestant", "worlds", "policy").values()]:
+    runs = grouped(rows, "kept", "task", "contestant", "worlds", "policy").values()
+    if lines := [kept_line(latest) for *_, latest in runs]:
         header = ["task", "engine", "worlds", "env steps/s", "of the bare engine's", "added to a step", "kB a world"]
         tables.append(
             Table("Environment and bare engine on the same states, alternating every ten steps.", header, lines)
