@@ -42,7 +42,7 @@ SAMPLING = {"adaptive": (), "uniform": ("--param", "failure_weight=0")}
 
 FLAGS = {
     "cpu": "--nworld 128 --num-steps 32 --hidden 256 128 --value-hidden 256 128 --discardvisual --symmetry exact "
-    "--desired-kl 0.1 --log-std -1.5 --entropy-coef 0.001 --param randomness=0.3",
+    "--desired-kl 0.1 --log-std -1.5 --entropy-coef 0.001 --param randomness=0.3 --threads 2",
     "cuda": "",
 }
 """Flags of `lyceum-warp train`, by device."""
