@@ -196,12 +196,6 @@ def cameras(text: str) -> tuple[Camera, ...]:
         group = "camera" if len(entries) == 1 else name if kind in (None, "rgb") else f"{name}_{kind}"
         values: dict[str, Any] = {"width": width and int(width), "height": height and int(height), "kind": kind}
         parsed.append(Camera(name, group=group, **{key: value for key, value in values.items() if value is not None}))
-    groups = [camera.group for camera in parsed]
-    if twice := next((group for group in groups if groups.count(group) > 1), ""):
-        raise ValueError(
-            f"two cameras of {text!r} have the group {twice!r}: the flag takes one size of each name and kind, and "
-            "cameras=[lw.Camera(...)] in Python takes several"
-        )
     return tuple(parsed)
 
 

@@ -95,6 +95,9 @@ def cameras_of(entries: Any) -> tuple[Camera, ...]:
         camera = Camera(entry) if isinstance(entry, str) else Camera(**entry) if isinstance(entry, dict) else entry
         check_kind("a camera", camera, Camera, "as lw.Camera('fixed', width=64)")
         if camera.group in cameras:
-            raise ValueError(f"two cameras have the group {camera.group!r}: give each one its own group=...")
+            raise ValueError(
+                f"two cameras have the group {camera.group!r}: name a camera once for each kind of picture, or give "
+                "each one its own group=..."
+            )
         cameras[camera.group] = camera
     return tuple(cameras.values())

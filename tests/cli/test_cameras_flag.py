@@ -28,7 +28,7 @@ def test_flag_gives_sizes_kinds_and_groups() -> None:
 
 @pytest.mark.parametrize(("text", "words"), [
     ("left", ["no camera 'left'", "it has 'side'"]), ("side:64", ["'side:64'", "NAME:64x64"]),
-    ("side:deep", ["kind", "'deep'", "depth"]), ("side:16x16,side:8x8", ["group 'side'", "one size of each name"]),
+    ("side:deep", ["kind", "'deep'", "depth"]), ("side:16x16,side:8x8", ["group 'side'", "once for each kind"]),
     ("side:30x30", ["30: use 32"]),
 ])  # fmt: skip
 def test_invalid_cameras_print_one_line(text: str, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:

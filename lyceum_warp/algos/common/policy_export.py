@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from lyceum_warp.algos.common.networks import Normalizer
-from lyceum_warp.algos.common.transfer import EXACT, simulation, task_physics
+from lyceum_warp.algos.common.transfer import EXACT, physics_text, task_physics
 from lyceum_warp.env.env import Env
 from lyceum_warp.support.extras import check_extra
 from lyceum_warp.support.files import replaced
@@ -134,7 +134,7 @@ def deployment_metadata(policy: torch.nn.Module, env: Env, physics: str | None =
         "task": task.name,
         "timestep": env.timestep,
         "substep": model.opt.timestep,
-        "physics": physics or simulation(env).partition(", ")[2],
+        "physics": physics or physics_text(task.definition, env.options.physics),
         "observations": parts if "policy" in groups else [],
         **({"cameras": cameras} if cameras else {}),
         "actions": [{"name": name, "size": part.stop - part.start} for name, part in env.action_space.parts.items()],
