@@ -91,7 +91,7 @@ class Probe:
         """Raise a ValueError if a function reads or writes out of range."""
         runs = (_Run(self._worlds, self._world, guard).all_functions() for guard in _GUARDS)
         for (function, first), (_, second) in zip(*runs, strict=True):
-            if not np.array_equal(first, second):
+            if not np.array_equal(first, second, equal_nan=True):
                 raise ValueError(
                     f"{function} reads out of range: its result depends on memory beside its arguments, or on elements "
                     "of obs that it has not written"

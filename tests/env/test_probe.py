@@ -1,5 +1,6 @@
 import pytest
 import warp as wp
+from rail_task import Picky
 
 import lyceum_warp as lw
 from lyceum_warp import Row
@@ -167,3 +168,9 @@ def test_positive_and_negative_indices_within_an_array_are_accepted(index: int) 
     env = lw.make(OutOfRange, function=10, index=index)
     env.reset()
     assert env.field("qpos")[0, index] == 1.0
+
+
+def test_function_may_return_not_a_number_from_the_start() -> None:
+    env = lw.make(Picky, limit=-1.0)
+    env.step()
+    assert env.fault_counts["reward"] == 1
