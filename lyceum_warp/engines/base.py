@@ -145,11 +145,12 @@ class Engine(abc.ABC):
         The step reads ``ctrl`` and the other fields whose ``written`` is True.
         """
 
-    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True, rendered: bool = False) -> list[Phase]:
         """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
 
         Consecutive parts of a step are ``first``, ``last``, or neither. Until the last part, the fields of the position
-        and velocity stages may be outdated.
+        and velocity stages may be outdated. ``rendered`` tells that the pictures show the states before the step, so
+        that the step need not repeat the renderer's computations.
         """
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 

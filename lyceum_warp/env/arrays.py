@@ -18,8 +18,8 @@ from lyceum_warp.support.arrays import flat, launch_rows, shared_rows, torch_vie
 from lyceum_warp.support.tensors import check_tensor
 
 
-def own_bytes_per_world(task: BoundTask) -> int:
-    """Estimate the bytes that each world needs outside the engine's arrays."""
+def own_bytes_per_world(task: BoundTask, engine: str) -> int:
+    """Estimate the bytes that each world needs outside the arrays of the engine with the given name."""
     parts, snapshots = own_parts(task), [field for field in task.fields if field.snapshot]
     state_size = spaces.state_space(task.model, snapshots, task.dynamics, parts).size
     copies = sum(field.size for field in task.fields)
@@ -28,7 +28,7 @@ def own_bytes_per_world(task: BoundTask) -> int:
     if task.cameras:
         from lyceum_warp.engines.pictures import picture_bytes  # loads MuJoCo Warp
 
-        total += picture_bytes(task.model, task.cameras)
+        total += picture_bytes(task.model, task.cameras, engine)
     return total
 
 

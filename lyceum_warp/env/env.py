@@ -677,7 +677,7 @@ class Env:
     @property
     def bytes_per_world(self) -> float:
         """Estimate the memory per world in bytes, without the model, which all worlds share."""
-        return self.engine.estimated_bytes + own_bytes_per_world(self.task)
+        return self.engine.estimated_bytes + own_bytes_per_world(self.task, self.engine.name)
 
     @property
     def fault_counts(self) -> dict[str, int]:

@@ -15,7 +15,7 @@ from lyceum_warp.core.fields import Stage, elements
 from lyceum_warp.core.options import EnvOptions
 from lyceum_warp.core.task import MEMORIES, Task
 from lyceum_warp.engines.base import Engine
-from lyceum_warp.engines.placement import find_device, open_engine
+from lyceum_warp.engines.placement import engine_name, find_device, open_engine
 from lyceum_warp.env.arrays import own_bytes_per_world
 from lyceum_warp.env.resets import Resets
 from lyceum_warp.graphs.capture import Calls, Graphs, Phase
@@ -50,9 +50,10 @@ def open_worlds(task: type[Task], options: EnvOptions, params: Mapping[str, Any]
         physics=options.physics, params=params, fitted=options.fitted, fitted_draws=options.fitted_draws,
         cameras=options.cameras, objects=options.objects,
     )  # fmt: skip
+    reserved = own_bytes_per_world(bound, engine_name(options.engine, options.device))
     engine = open_engine(
         options.engine, bound.model, options.nworld, find_device(options.device), bound.fields,
-        dynamics=bound.dynamics, initial=bound.initial, reserved=own_bytes_per_world(bound), **options.for_engine(),
+        dynamics=bound.dynamics, initial=bound.initial, reserved=reserved, **options.for_engine(),
     )  # fmt: skip
     return Worlds(bound, engine, options)
 
@@ -123,7 +124,7 @@ class Worlds(Resets):
         else:
             episodes = only(outdated, restart, self.refresh_phases(outdated), observe)
         final = [Phase("final pictures", self._keep_final_pictures)] if self._final_pictures else []
-        ends = [*self.transition_phases(substeps), *only(restarting, final)]
+        ends = [*self.transition_phases(substeps, rendered=self.pictures is not None), *only(restarting, final)]
         return [*ends, *events, *episodes, *self.picture_phases()]
 
     def picture_phases(self) -> list[Phase]:
@@ -146,25 +147,31 @@ class Worlds(Resets):
 
         return Phase(phases[0].name, partial(self.engine.run_for, mask, run), engine=True)
 
-    def transition_phases(self, substeps: int | None = None) -> list[Phase]:
-        """List the phases of a step that advance and evaluate the worlds, without resets and events."""
+    def transition_phases(self, substeps: int | None = None, *, rendered: bool = False) -> list[Phase]:
+        """List the phases of a step that advance and evaluate the worlds, without resets and events.
+
+        ``rendered`` tells that the pictures show the states before the step.
+        """
         phases = [
             Phase("act", self.act, by_world=True),
-            *self.physics_phases(substeps),
+            *self.physics_phases(substeps, rendered=rendered),
             Phase("judge", self._judge_step, by_world=True),
         ]
         if self.autoreset and (kernel := self.task.kernels.tally_worlds) is not None:
             phases.append(Phase("tally", partial(self._tally, kernel)))  # on a CPU, atomic additions need one thread
         return phases
 
-    def physics_phases(self, substeps: int | None = None) -> list[Phase]:
+    def physics_phases(self, substeps: int | None = None, *, rendered: bool = False) -> list[Phase]:
         """List the phases of a step's substeps."""
         engine, skip = self.engine, self.task.frame_skip if substeps is None else substeps
         if (kernel := self.task.kernels.substep_memory) is None:
-            return engine.step_phases(skip)
+            return engine.step_phases(skip, rendered=rendered)
         between = Phase("substep", partial(self._substep, kernel), by_world=True)
         whole = any(engine.fields[name].refresh for name in self.task.source.read_in_substeps & engine.fields.keys())
-        parts = [engine.step_phases(1, first=whole or i == 0, last=whole or i == skip - 1) for i in range(skip)]
+        parts = [
+            engine.step_phases(1, first=whole or i == 0, last=whole or i == skip - 1, rendered=rendered and i == 0)
+            for i in range(skip)
+        ]
         return [phase for part in parts for phase in (*part, between)]
 
     def reset_phases(self, *, randomly: bool) -> list[Phase]:

@@ -175,7 +175,7 @@ class MujocoEngine(Engine):
         for call in self._steps[nstep]:
             call()
 
-    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True, rendered: bool = False) -> list[Phase]:
         fields = self._after_step if last else self._after_part
         return [
             Phase("inputs", self._take_inputs, by_world=True),

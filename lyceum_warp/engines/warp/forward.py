@@ -22,7 +22,10 @@ from lyceum_warp.support.upstream import forward_functions
 
 Part = Callable[[mjw.Model, mjw.Data], None]
 
-SKIPPED: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex, mjw.tendon, mjw.com_vel)
+POSES: tuple[Part, ...] = (mjw.kinematics, mjw.com_pos, mjw.camlight, mjw.flex)
+"""The parts that compute the poses of geoms, cameras and lights, and the vertices of flexes."""
+
+SKIPPED: tuple[Part, ...] = (*POSES, mjw.tendon, mjw.com_vel)
 """The parts that a substep can skip. They depend only on positions and velocities."""
 
 

@@ -96,8 +96,8 @@ class WarpEngine(Engine):
         self._reset_parts = None if needs_all else forward_parts(model, self._reset)
         self._columns: wp.array = wp.array(early_sensor_columns(model), dtype=int, device=device)
         # the parts that the next step can skip, because the last step or restart has computed them
-        moves_mocap = any(self.fields[name].written for name in ("mocap_pos", "mocap_quat") if name in self.fields)
-        current_parts = () if moves_mocap else self._current_parts or ()
+        self._moves_mocap = any(field.written and "mocap" in name for name, field in self.fields.items())
+        current_parts = () if self._moves_mocap else self._current_parts or ()
         self._shared = tuple(part for part in current_parts if part in forward.SKIPPED)
         self._conditional = Conditional(device)
         # if a reset needs no collisions, its parts are cheaper in all worlds than in a group
@@ -175,16 +175,21 @@ class WarpEngine(Engine):
 
     # physics
 
-    def step(self, nstep: int, *, first: bool = True, last: bool = True) -> None:
+    def step(self, nstep: int, *, first: bool = True, last: bool = True, rendered: bool = False) -> None:
+        done = {*(self._shared if first else ()), *(forward.POSES if rendered and not self._moves_mocap else ())}
         with self._on_device():
             for i in range(nstep):
-                forward.step(self.m, self.d, self._shared if first and i == 0 else ())
+                forward.step(self.m, self.d, () if i else done)
         self._copy_snapshots(self._everyone, self.snapshots)
         if last:
             self.refresh_current(self._everyone)
 
-    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True) -> list[Phase]:
-        return [Phase("physics", partial(self.step, nstep, first=first, last=last), engine=True)]
+    def step_phases(self, nstep: int, *, first: bool = True, last: bool = True, rendered: bool = False) -> list[Phase]:
+        return [Phase("physics", partial(self.step, nstep, first=first, last=last, rendered=rendered), engine=True)]
+
+    def pose(self) -> None:
+        """Compute the poses that pictures show, in the current states of all worlds, by Warp launches only."""
+        self._forward([part for part in forward.POSES if part not in self._shared], Stage.POSITION)
 
     def _forward(
         self, parts: Collection[Part] | None, stage: Stage, data: mjw.Data | None = None, model: mjw.Model | None = None
