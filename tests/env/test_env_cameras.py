@@ -107,9 +107,10 @@ def test_pictures_belong_to_the_state_and_are_no_part_of_it(shared_env, engine: 
     assert torch.equal(pictures[1], seen[0][1]) and not torch.equal(pictures[0], now[0])
 
 
-def test_final_pictures_show_the_last_state_of_an_episode(shared_env) -> None:
-    env = shared_env("cartpole", nworld=2, cameras=SIDE, final_pictures=True, horizon=6)
-    endless = shared_env("cartpole", nworld=2, cameras=SIDE, horizon=6, autoreset=False)
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_final_pictures_show_the_last_state_of_an_episode(shared_env, engine: str) -> None:
+    env = shared_env("cartpole", engine=engine, nworld=2, cameras=SIDE, final_pictures=True, horizon=6)
+    endless = shared_env("cartpole", engine=engine, nworld=2, cameras=SIDE, horizon=6, autoreset=False)
     endless.set_state(env.get_state())
     for _ in range(6):
         env.step(torch.ones_like(env.action))
@@ -136,8 +137,9 @@ def test_worlds_may_differ_in_colours_and_fields_of_view(shared_env, engine: str
         env.reset()
 
 
-def test_a_camera_may_follow_a_centre_of_mass() -> None:
-    env = lw.make(Followed, nworld=2)
+@pytest.mark.parametrize("engine", ["mujoco", "warp"])
+def test_a_camera_may_follow_a_centre_of_mass(engine: str) -> None:
+    env = lw.make(Followed, nworld=2, engine=engine)
     env.reset()
     state = env.get_state()
     state[1, env.state_space.parts["qpos"].start] += 0.7
