@@ -6,7 +6,8 @@
 
 Part "speed": a frame is one step of one world with its picture. The environment and the bare engine take turns of ten
 steps, from the same states (kept.py). The bare engine is one graph of ``mujoco_warp.step``, ``refit_bvh`` and
-``render``. With final pictures, all worlds are rendered a second time in each step in which an episode ends.
+``render``: its pictures are a substep older than its states, and its colours stay packed. With final pictures, all
+worlds are rendered a second time in each step in which an episode ends.
 
 Part "gap": policies that see are judged with their own pictures and with those of MuJoCo's renderer (picture_gap.py).
 Without ``--runs``, a policy first learns to balance a pole, which takes minutes on a CPU core.

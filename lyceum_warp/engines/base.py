@@ -149,8 +149,8 @@ class Engine(abc.ABC):
         """Return ``step`` as a list of phases, which ``Graphs`` can capture separately.
 
         Consecutive parts of a step are ``first``, ``last``, or neither. Until the last part, the fields of the position
-        and velocity stages may be outdated. ``rendered`` tells that the pictures show the states before the step, so
-        that the step need not repeat the renderer's computations.
+        and velocity stages may be outdated. ``rendered`` tells that pictures of the states before the step have been
+        rendered, so the step may skip the kinematics.
         """
         return [Phase("physics", partial(self.step, nstep), engine=True)]
 

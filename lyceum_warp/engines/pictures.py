@@ -33,8 +33,8 @@ def picture_bytes(model: mujoco.MjModel, cameras: Iterable[Camera], engine: str)
 class Pictures:
     """Renders the current states of an engine's worlds.
 
-    The Warp engine computes the poses in its own Data, and its next step does not compute them again. For other
-    engines, a Data of the renderer has the poses.
+    The Warp engine computes the poses in its own Data, and its next step skips them. For other engines, the poses are
+    computed in another Data.
 
     Raises:
         ValueError: The model has no camera of a name, a camera has two sizes, or MuJoCo Warp does not support the

@@ -150,7 +150,7 @@ class Worlds(Resets):
     def transition_phases(self, substeps: int | None = None, *, rendered: bool = False) -> list[Phase]:
         """List the phases of a step that advance and evaluate the worlds, without resets and events.
 
-        ``rendered`` tells that the pictures show the states before the step.
+        ``rendered`` tells that pictures of the states before the step have been rendered.
         """
         phases = [
             Phase("act", self.act, by_world=True),

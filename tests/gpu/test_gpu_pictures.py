@@ -39,6 +39,15 @@ def test_steps_with_pictures_do_not_wait_for_the_device() -> None:
     assert env.obs_groups["camera"].float().std() > 0 and env.final_obs_groups["camera"].float().std() > 0
 
 
+def test_pictures_do_not_affect_deterministic_steps() -> None:
+    options: dict[str, Any] = {"nworld": 64, "horizon": 5, "deterministic": True, "device": CUDA}
+    envs = [lw.make("half_cheetah", cameras=cameras, **options) for cameras in ([lw.Camera("track", 32, 32)], [])]
+    for _ in range(12):
+        for env in envs:
+            env.step(torch.ones_like(env.action))
+        assert torch.equal(envs[0].get_state(), envs[1].get_state())
+
+
 @pytest.mark.parametrize("changes", [{}, {"recurrent": 8}, {"spatial_softmax": True, "policy_groups": ()}])
 def test_captured_epochs_with_pictures_equal_epochs_without_graphs(changes: dict[str, Any]) -> None:
     captured, direct = learner(tf32=False, **changes), learner(tf32=False, **changes)
