@@ -77,16 +77,20 @@ class Turns:
             wp.launch(kernels.rank_worlds, self.nworld, [mask, self._rank, self._count])
             wp.launch(kernels.next_group, 1, [self._count, 0, self._first, self._left])
 
+            def group() -> None:
+                wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
+                turn()
+                wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
+
+            if not self._loop:  # graphs can allocate, also the buffers of deterministic launches
+                group()
+                return
+
             def body() -> None:
                 with self._memory():
                     self._memory.open()
-                    wp.launch(kernels.choose_group, self.nworld, [mask, self._rank, self._first, self._world])
-                    turn()
-                    wp.launch(kernels.next_group, 1, [self._count, self.size, self._first, self._left])
+                    group()
 
-            if not self._loop:
-                body()
-                return
             # outside a graph, the host repeats the turns: from the second on, it replays one that it has captured
             calls = Graphs(self.device, enabled=not self.device.is_capturing).sequence([Phase("turn", body)])
             wp.capture_while(self._left, while_body=calls[0])
