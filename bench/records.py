@@ -46,12 +46,15 @@ FEWER_OBSERVATIONS = (
 )  # fmt: skip
 """Command-line flags for Gymnasium's humanoid with only positions and velocities as observations."""
 FEW_WORLDS = (
-    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32", "--gate-every", "30",
+    "--symmetry", "exact", "--nworld", "128", "--num-steps", "32", "--gate-every", "24",
     "--hidden", "128", "128", "--value-hidden", "128", "128", "--threads", "2",
 )  # fmt: skip
 PYRAMIDAL = ("--cone", "pyramidal")
 """Friction cones that halve the time of a Go1's step: with the elliptic cones of its model, the feet's contacts, which
 also resist torsion and rolling, take most of it."""
+EXACT_END = ("--gamma", "0.97", "--exact-from", "300")
+"""Ends under exact physics: a policy that has learned with few samples under coarse physics falls in a few of 100 episodes
+under exact physics, mostly when it walks sideways, and in none under coarse physics."""
 STRONG_TRACKING = (
     "--param", "track_linear_velocity=6", "--param", "action_rate_l2=-0.02", "--param", "foot_clearance=-0.5",
     "--param", "foot_swing_height=0",
@@ -88,7 +91,10 @@ SUITE = (
 )
 
 RECORDS: dict[str, dict[str, tuple[float | None, tuple[str, ...]]]] = {
-    "go1_velocity": {"cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *PYRAMIDAL)), "cuda": (None, WALKING)},
+    "go1_velocity": {
+        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *PYRAMIDAL, *EXACT_END)),
+        "cuda": (None, WALKING),
+    },
     "spot_velocity": {"cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING)), "cuda": (None, WALKING)},
     "h1_velocity": {"cpu": (None, (*WALKING, *FEW_WORLDS)), "cuda": (None, WALKING)},
     "g1_velocity": {
