@@ -96,7 +96,10 @@ RECORDS: dict[str, dict[str, tuple[float | None, tuple[str, ...]]]] = {
         "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *PYRAMIDAL, *EXACT_END)),
         "cuda": (None, WALKING),
     },
-    "spot_velocity": {"cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING)), "cuda": (None, WALKING)},
+    "spot_velocity": {
+        "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING, *PYRAMIDAL, *EXACT_END)),
+        "cuda": (None, WALKING),
+    },
     "h1_velocity": {"cpu": (None, (*WALKING, *FEW_WORLDS)), "cuda": (None, WALKING)},
     "g1_velocity": {
         "cpu": (None, (*WALKING, *FEW_WORLDS, *STRONG_TRACKING_GAIT)),
