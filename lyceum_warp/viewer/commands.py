@@ -89,6 +89,17 @@ def seek(stage: Stage, step: int) -> None:
         stage.live.forward(steps)
 
 
+def set_clip(stage: Stage, clip: int) -> None:
+    """Start an episode in a clip, in which new episodes begin from now on, or in any clip if it is -1."""
+    stage.set_clip(clip)
+
+
+def seek_clip(stage: Stage, clip: int, frame: int) -> None:
+    """Pause, and put the displayed world into a frame of a clip."""
+    stage.paused = True
+    stage.seek_clip(clip, frame)
+
+
 def set_backwards(stage: Stage, backwards: bool) -> None:
     """Set the direction of the playback."""
     stage.playback.backwards = backwards

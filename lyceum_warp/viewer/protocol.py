@@ -47,6 +47,8 @@ class Scene:
     """The velocities of the driving keys, or None if the robot cannot be driven. Sliders reach twice these values."""
     sees: bool = False
     """Whether cameras render pictures for a policy."""
+    clips: tuple[int, ...] = ()
+    """The number of frames of each clip of a tracking task."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,6 +123,8 @@ class Status:
     """Model fields of the displayed world, as multiples of the nominal model's."""
     seekable: tuple[int, int] = (0, 0)
     """The first and the last step on the slider."""
+    clip: tuple[int, int, int] | None = None
+    """The clip of new episodes (-1 if it is drawn), and the clip and the frame of the displayed world."""
     text: tuple[tuple[str, str], ...] = ()
     """Additional lines of the panel. Each is a name with a value."""
     pictures: bool = False

@@ -14,7 +14,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import MAX_MESSAGES, MAX_POINTS, Frame, Ghost, Ghosts, Status
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows
-from lyceum_warp.viewer.session.live_settings import nominal_fields
+from lyceum_warp.viewer.session.live_settings import clip_lengths, nominal_fields
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
 from lyceum_warp.viz import REFERENCE, reference_states
@@ -88,6 +88,7 @@ class FrameMaker:
             text=tuple(text), command=self._driving.command(state),
             seekable=(max(0, step - past.behind), step + past.ahead),
             physics=tuple((name, float(state[parts[name]].sum() / n.sum())) for name, n in self._nominal.items()),
+            clip=self._clip(state),
         )  # fmt: skip
         return self._frame(state, complete, ghosts, None if traces is None else traces.paths, predicted)
 
@@ -118,6 +119,13 @@ class FrameMaker:
         ghosts = [*(Ghost(pose, REFERENCE, what="reference of the clip") for pose in references), *ghosts]
         arrows = self._driving.arrows(state)
         return Frame(self._physics(state), fields, status, tuple(ghosts), paths, arrows, predicted=predicted)
+
+    def _clip(self, state: np.ndarray) -> tuple[int, int, int] | None:
+        if not clip_lengths(self._env):
+            return None
+        params, parts = self._env.task.params, self._env.state_space.parts
+        clip, row = int(state[parts["clip"]][0]), int(state[parts["frame"]][0])
+        return int(params["start_clip"]), clip, row - int(params["ranges"][clip, 0])
 
     def _report(self, rows: Rows, plant_of: int | None) -> None:
         """Report faults and the end of an episode. ``plant_of`` is the world that a plant copies."""

@@ -10,8 +10,6 @@ from lyceum_warp.env import Env
 from lyceum_warp.viz import owner_of
 
 _SETTINGS = ("noise", "temperature", "horizon", "samples")
-STARTS = ("start_clip", "start_frame")
-"""Parameters of tracking tasks. A change puts the displayed world there."""
 _OF_THE_PLANNER = ("nworld", "autoreset", "horizon", "seed", "first_world", "cameras")
 """Options that a planner sets itself."""
 
@@ -27,9 +25,15 @@ def planner_numbers(controller: Any) -> Numbers:
 
 
 def task_numbers(env: Env) -> Numbers:
-    """Return the task's float parameters, including the weights of reward terms, and the start of a clip."""
-    params = [(n, v) for n, v in env.task.params.items() if isinstance(v, float) or (n in STARTS and np.ndim(v) == 0)]
-    return tuple((n, float(v)) for n, v in params if n not in ("dt", "substep_dt"))
+    """Return the task's float parameters, including the weights of reward terms."""
+    params = [(name, value) for name, value in env.task.params.items() if isinstance(value, float)]
+    return tuple((name, value) for name, value in params if name not in ("dt", "substep_dt"))
+
+
+def clip_lengths(env: Env) -> tuple[int, ...]:
+    """Return the number of frames of each clip, if the task tracks clips and all worlds begin in the same one."""
+    params = env.task.params
+    return tuple(params["ranges"][:, 1].tolist()) if np.ndim(params.get("start_clip", ())) == 0 else ()
 
 
 def nominal_fields(env: Env) -> dict[str, np.ndarray]:

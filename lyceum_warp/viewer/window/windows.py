@@ -154,6 +154,7 @@ class Windows:
         self._modes()
         self._worlds()
         self._time()
+        self._clip()
         self._status()
         self._drive()
         self._push()
@@ -217,6 +218,22 @@ class Windows:
             changed, step = imgui.SliderInt("##scrub", step, first, last, "step %d")
             if changed:
                 self._actions.do(commands.seek, step)
+
+    def _clip(self) -> None:
+        assert self._frame is not None
+        if (now := self._frame.status.clip) is None:
+            return
+        start, clip, frame = now
+        imgui.SeparatorText("clip")
+        imgui.SetNextItemWidth(90)
+        chosen = combo("of new episodes", ["any", *map(str, range(len(self._scene.clips)))], start + 1)
+        if chosen is not None:
+            self._actions.do(commands.set_clip, chosen - 1)
+        imgui.SetNextItemWidth(-1)
+        # episodes do not begin in the last frame
+        changed, frame = imgui.SliderInt("##clip", frame, 0, self._scene.clips[clip] - 2, f"clip {clip}, frame %d")
+        if changed:
+            self._actions.do(commands.seek_clip, clip, frame)
 
     def _button(self, key: str, icon: str | None = None) -> None:
         """Build the button of an action."""
