@@ -24,9 +24,7 @@ def go1_clip(clip: int = 0) -> np.ndarray:
 
 def write_npz(path: Path, model: mujoco.MjModel, qpos: np.ndarray, rate: float, **more: np.ndarray) -> Path:
     """Write BeyondMimic's format."""
-    positions, rotations = kinematics.body_poses(model, qpos)
-    qvel = kinematics.joint_velocities(qpos, 1.0 / rate)
-    velocities, spins = kinematics.body_velocities(model, qpos, qvel)
+    qvel, positions, rotations, velocities, spins = kinematics.reference_of(model, qpos, 1.0 / rate)
     arrays = {
         "fps": np.array([rate]), "joint_pos": qpos[:, 7:], "joint_vel": qvel[:, 6:], "body_pos_w": positions[:, 1:],
         "body_quat_w": rotations[:, 1:], "body_lin_vel_w": velocities[:, 1:], "body_ang_vel_w": spins[:, 1:],

@@ -93,26 +93,22 @@ def velocity_text(legs: Legs, **names: str) -> str:
     is_biped = len(legs.feet) == 2
     fastest = round(0.4 * float(np.sqrt(9.81 * legs.height)), 1)
     swing = max(foot.height for foot in legs.feet) - legs.ground + float(np.clip(0.1 * legs.height, 0.03, 0.1))
-    feet, edits, params = _robot(legs, "walkers.prepare_walker(spec, FEET)")
+    params = []
     if is_biped:
-        params.insert(0, f"least_height: float = {0.45 * legs.height:.2f}  # of the base; an episode ends below it")
+        params.append(f"least_height: float = {0.45 * legs.height:.2f}  # of the base; an episode ends below it")
     if not legs.has_home:
-        params.insert(1, f"start_height: float = {legs.height:.3f}")
+        params.append(f"start_height: float = {legs.height:.3f}")
     return _filled(
         "velocity",
         legs.model,
         training=TRAINING,
-        feet=feet,
-        joints=_list("JOINTS", list(map(literal, legs.joints))),
         family="Biped" if is_biped else "Velocity",
         params_family="BipedParams" if is_biped else "Params",
-        njoint=len(legs.joints),
         swing_target=f"{swing:.3g}",
         fastest=f"{fastest:g}",
         lateral=f"{fastest / 2:g}",
-        params=_added(params),
         keyframe='"home"' if legs.has_home else None,
-        edits=_indented(edits, 8),
+        **_robot(legs, "walkers.prepare_walker(spec, FEET)", *params),
         **names,
     )
 
@@ -130,19 +126,9 @@ def tracking_text(legs: Legs, **names: str) -> str:
             inner.add(body)
     ends = [body for body in bodies if body not in inner]
     ordered = [legs.base, *ends, *(body for body in bodies if body not in ends)]
-    feet, edits, params = _robot(legs, "tracking.prepare(spec, FEET)")
-    return _filled(
-        "tracking",
-        model,
-        feet=feet,
-        joints=_list("JOINTS", list(map(literal, legs.joints))),
-        bodies=_list("BODIES", [literal(model.body(body).name) for body in ordered]),
-        ends=len(ends),
-        njoint=len(legs.joints),
-        params=_added(params),
-        edits=_indented(edits, 8),
-        **names,
-    )
+    tracked = _list("BODIES", [literal(model.body(body).name) for body in ordered])
+    robot = _robot(legs, "tracking.prepare(spec, FEET)")
+    return _filled("tracking", model, bodies=tracked, ends=len(ends), **robot, **names)
 
 
 def actuated_joints(model: mujoco.MjModel) -> list[str]:
@@ -151,8 +137,8 @@ def actuated_joints(model: mujoco.MjModel) -> list[str]:
     return [model.joint(joint).name for joint in sorted(set(moved.tolist()))]
 
 
-def _robot(legs: Legs, prepare: str) -> tuple[str, list[str], list[str]]:
-    """Write what families of tasks share: the feet, the lines of ``edit_model``, and lines of ``Params``."""
+def _robot(legs: Legs, prepare: str, *params: str) -> dict[str, object]:
+    """Write what families of tasks share: feet, joints, the lines of ``edit_model``, and lines of ``Params``."""
     feet, edits = [f"FEET = [{', '.join(literal(foot.site) for foot in legs.feet)}]"], [prepare]
     if legs.has_motors:
         edits.insert(0, "walkers.use_servos(spec, JOINTS)")
@@ -161,8 +147,10 @@ def _robot(legs: Legs, prepare: str) -> tuple[str, list[str], list[str]]:
         feet += [f"    {literal(foot.site)}: ({literal(foot.element)}, {foot.position})," for foot in new]
         feet += ["}"]
         edits.insert(0, "walkers.add_feet(spec, NEW_SITES)")
-    pose = [f"{angle:.4g}" for angle in legs.pose]
-    return "\n".join(feet), edits, [] if legs.has_home else [_list("default_pose: wp.array[float]", pose, 4)]
+    pose = [] if legs.has_home else [_list("default_pose: wp.array[float]", [f"{a:.4g}" for a in legs.pose], 4)]
+    joints, njoint = _list("JOINTS", list(map(literal, legs.joints))), len(legs.joints)
+    return dict(feet="\n".join(feet), joints=joints, njoint=njoint, params=_added([*params, *pose]),
+                edits=_indented(edits, 8))  # fmt: skip
 
 
 def _filled(template: str, model: mujoco.MjModel, **values: object) -> str:

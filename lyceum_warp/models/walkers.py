@@ -175,13 +175,8 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
         values = np.asarray(getattr(p, table))
         if (np.abs(values - signs * values[joints[0]]) > 1e-3).any():
             raise ValueError(f"{table} is not symmetric: {values.tolist()}")
-    places = data.site_xpos[np.asarray(p.feet)]
-    distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
-    if distances.min(1).max() > 0.005:
-        raise ValueError("the feet's sites are not symmetric: place left and right sites as mirror images")
-    order = distances.argmin(1)
-    feet = order, np.ones(len(order))
-    vectors = (3 * order[:, None] + np.arange(3)).ravel(), np.tile(flip, len(order))
+    order = mirror_order(data.site_xpos[p.feet], [f"the foot's site {model.site(foot).name!r}" for foot in p.feet])
+    feet, vectors = mirror_rows(order, [1.0]), mirror_rows(order, flip)
     maps: dict[str, Any] = {
         "linear_velocity": flip, "angular_velocity": spin, "gravity": flip, "command": (1.0, -1.0, -1.0),
         **dict.fromkeys(("joint_position", "joint_velocity", "last_action"), joints),
@@ -196,6 +191,24 @@ def mirror(model: mujoco.MjModel, p: Any) -> Mirror:
         rows = np.linalg.norm(scan[None] - scan[:, None] * flip[:2], axis=2).argmin(1)
         maps["height_scan"] = rows, np.ones(len(rows))
     return Mirror(maps)
+
+
+def mirror_order(places: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """Find the index of each place's mirror image in the plane y = 0 among places (n, 3).
+
+    Raises:
+        ValueError: A place has no mirror image.
+    """
+    distances = np.linalg.norm(places[None] - (places * [1.0, -1.0, 1.0])[:, None], axis=2)
+    if distances.min(1).max() > 0.005:
+        alone = names[distances.min(1).argmax()]
+        raise ValueError(f"{alone} has no mirror image among the others: place or name one on each side of the robot")
+    return distances.argmin(1)
+
+
+def mirror_rows(order: np.ndarray, signs: Sequence[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Make the map of a table with the row ``order[i]`` in place of row i, and with a sign for each column."""
+    return (len(signs) * order[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(order))
 
 
 # legs

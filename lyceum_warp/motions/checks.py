@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from lyceum_warp.motions.kinematics import contact_spheres
+from lyceum_warp.motions.kinematics import Reference, contact_spheres
 from lyceum_warp.motions.rotations import rotate
 
 _SAME = 0.02
@@ -50,18 +50,18 @@ def check_bodies(model: mujoco.MjModel, stored: np.ndarray, positions: np.ndarra
     )
 
 
-def findings(model: mujoco.MjModel, qpos: np.ndarray, poses: tuple[np.ndarray, np.ndarray], rate: float) -> list[str]:
+def findings(model: mujoco.MjModel, qpos: np.ndarray, reference: Reference, rate: float) -> list[str]:
     """Describe in short texts what the robot cannot do in a motion.
 
     Args:
         model: The robot on a ground at height 0.
         qpos: The coordinates, (frames, nq).
-        poses: Positions and rotations of all bodies, from ``body_poses``.
+        reference: The poses of all bodies, from ``reference_of``.
         rate: Frames per second.
     """
     texts = []
     bodies, spheres = contact_spheres(model)
-    points = poses[0][:, bodies] + rotate(poses[1][:, bodies], spheres[:, :3])
+    points = reference.positions[:, bodies] + rotate(reference.rotations[:, bodies], spheres[:, :3])
     heights = points[..., 2] - spheres[:, 3]
     if heights.size and (depth := -heights.min()) > _SINK:
         frame, sphere = np.unravel_index(heights.argmin(), heights.shape)

@@ -4,6 +4,7 @@ The parameter ``p.clips`` is the table of a ``Clips``. The parameter ``p.bodies`
 """
 
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -34,15 +35,11 @@ def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
     if model.nq != joints + 7:
         raise ValueError(f"the clips have {joints} joints and a base, but the model has {model.nq} coordinates")
     table = kinematics.ranges(p.clips)
-    if not len(table) or table[0, 0] != 0 or table[:, 1].min() < 3:
+    is_unit = np.abs(np.linalg.norm(p.clips[:, 5:9], axis=1) - 1.0) < 1e-2
+    if p.clips[0, 0] or table[:, 1].min() < 3 or not is_unit.all() or not (p.clips[:, 1] > 0.0).all():
         raise ValueError(
-            "each clip needs three frames, and its first frame has the time 0: make clips by lw.load_clips"
-        )
-    unit = np.abs(np.linalg.norm(p.clips[:, 5:9], axis=1) - 1.0) < 1e-2
-    if not unit.all() or not (p.clips[:, 1] > 0.0).all():
-        raise ValueError(
-            "each row of clips needs a time, a positive weight, a position and a unit quaternion: make clips by "
-            "lw.load_clips"
+            "each clip needs three rows, and each row a time from 0 on, a positive weight, a position and a unit "
+            "quaternion: make clips by lw.load_clips"
         )
     if (clip := np.max(p.start_clip)) >= len(table):
         raise ValueError(f"start_clip={clip:g} must be less than {len(table)}, the number of clips")
@@ -56,29 +53,9 @@ def ranges(model: mujoco.MjModel, p: Any) -> np.ndarray:
     return table
 
 
-def qvel(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the velocities of each frame, in the order of ``qvel``, (frames, nv)."""
-    return kinematics.references(model, p.clips, p.bodies, p.dt).qvel
-
-
-def positions(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the positions of the tracked bodies, (frames, bodies, 3) in m."""
-    return kinematics.references(model, p.clips, p.bodies, p.dt).positions
-
-
-def rotations(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the rotations of the tracked bodies, (frames, bodies, 4)."""
-    return kinematics.references(model, p.clips, p.bodies, p.dt).rotations
-
-
-def velocities(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the velocities of the tracked bodies in the world's axes, (frames, bodies, 3) in m/s."""
-    return kinematics.references(model, p.clips, p.bodies, p.dt).velocities
-
-
-def spins(model: mujoco.MjModel, p: Any) -> np.ndarray:
-    """Get the angular velocities of the tracked bodies in the world's axes, (frames, bodies, 3) in rad/s."""
-    return kinematics.references(model, p.clips, p.bodies, p.dt).spins
+def reference(part: str) -> Callable[[mujoco.MjModel, Any], np.ndarray]:
+    """Get a part of ``kinematics.Reference`` of all clips for the tracked bodies, (frames, ...)."""
+    return lambda model, p: getattr(kinematics.references(model, p.clips, p.bodies, p.dt), part)
 
 
 def bins(model: mujoco.MjModel, p: Any) -> np.ndarray:
@@ -97,6 +74,11 @@ def bins(model: mujoco.MjModel, p: Any) -> np.ndarray:
     if not number:
         raise ValueError(f"there are {len(p.ranges)} clips, but at most {BINS[-1]} are possible")
     return np.array(rows + (number - len(rows)) * [(0, len(p.clips), 0)])
+
+
+def bin_ends(model: mujoco.MjModel, p: Any) -> np.ndarray:
+    """Get the last row that belongs to each bin, (bins,). The last row of a clip belongs to the clip's last bin."""
+    return np.append(p.bins[1:, 1], len(p.clips)) - 1
 
 
 def bin_starts(model: mujoco.MjModel, p: Any) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -95,20 +95,13 @@ class Clips:
         Each clip is moved and turned about the vertical, so that it begins where the one before it ends. ``blend`` is
         the number of seconds in between, in which the pose changes steadily and the base keeps its speed.
         """
-        qpos = self.qpos[0]
-        for other in self.qpos[1:]:
-            qpos = _joined(qpos, other, self.rate, positive_number("blend", blend, "seconds"))
-        return dataclasses.replace(self, names=(self.names[0],), qpos=(qpos,), weights=self.weights[:1])
+        qpos = _joined(self.qpos, self.rate, blend)
+        return dataclasses.replace(self, names=self.names[:1], qpos=(qpos,), weights=self.weights[:1])
 
     def loop(self, times: int, *, blend: float = 0.2) -> "Clips":
         """Repeat each clip, joined as by ``join``."""
-        times, looped = whole_number("times", times, low=1), list[Clips]()
-        for clip in self:
-            copies = dataclasses.replace(
-                clip, names=clip.names * times, qpos=clip.qpos * times, weights=clip.weights * times
-            )
-            looped.append(copies.join(blend=blend))
-        return dataclasses.replace(self, qpos=tuple(clip.qpos[0] for clip in looped))
+        times = whole_number("times", times, low=1)
+        return dataclasses.replace(self, qpos=tuple(_joined(times * [qpos], self.rate, blend) for qpos in self.qpos))
 
     def save(self, path: str | Path, model: mujoco.MjModel) -> Path:
         """Write one clip in BeyondMimic's format, with the names of joints and bodies, and return the path.
@@ -122,8 +115,7 @@ class Clips:
         if len(self) != 1:
             raise ValueError(f"a file has one clip, not {len(self)}: select one, as clips[0].save(...)")
         qpos, names = self.qpos[0], ("joint_names", "body_names")
-        qvel = kinematics.joint_velocities(qpos, 1.0 / self.rate)
-        poses = *kinematics.body_poses(model, qpos), *kinematics.body_velocities(model, qpos, qvel)
+        qvel, *poses = kinematics.reference_of(model, qpos, 1.0 / self.rate)
         parts = ("body_pos_w", "body_quat_w", "body_lin_vel_w", "body_ang_vel_w")
         elements = (
             (model.joint(i).name for i in range(1, model.njnt)),
@@ -222,42 +214,39 @@ def _fitted(motion: Motion, model: mujoco.MjModel, rate: float, name: str) -> np
     if motion.body_positions is not None:
         # a wrong order shows in every frame
         frames = np.unique(np.linspace(0, len(qpos) - 1, 20).astype(int))
-        positions, _ = kinematics.body_poses(model, qpos[frames])
+        positions = kinematics.reference_of(model, qpos[frames], 1.0).positions
         checks.check_bodies(model, motion.body_positions[frames], positions, motion.bodies)
+    if (seconds := (len(qpos) - 1) / motion.rate) * rate < 2.0:
+        raise ValueError(f"it lasts only {seconds:.2g} s")
     qpos = _resampled(qpos, motion.rate, rate)
-    for text in checks.findings(model, qpos, kinematics.body_poses(model, qpos), rate):
+    for text in checks.findings(model, qpos, kinematics.reference_of(model, qpos, 1.0 / rate), rate):
         log.warning("%s: %s", name, text)
     return qpos
 
 
 def _resampled(qpos: np.ndarray, source: float, rate: float) -> np.ndarray:
-    if (len(qpos) - 1) / source * rate < 2.0:
-        raise ValueError(f"it lasts only {(len(qpos) - 1) / source:.2g} s")
-    count = int((len(qpos) - 1) / source * rate + 1e-6) + 1
-    places = np.minimum(np.arange(count) / rate * source, len(qpos) - 1.0)
-    places = np.where(np.abs(places - places.round()) < 1e-6, places.round(), places)  # keep frames that exist
-    low = np.minimum(places.astype(int), len(qpos) - 2)
-    return _between(qpos[low], qpos[low + 1], places - low)
-
-
-def _between(a: np.ndarray, b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """Interpolate coordinates linearly, and the base's rotation by slerp."""
-    qpos = a + share[:, None] * (b - a)
-    qpos[:, 3:7] = rotations.interpolate(a[:, 3:7], b[:, 3:7], share)
-    return qpos
+    count = int((len(qpos) - 1) / source * rate + 1e-6) + 1
+    places = np.minimum(np.arange(count) * (source / rate), len(qpos) - 1.0)
+    low = np.minimum(places.astype(int), len(qpos) - 2)
+    a, b, share = qpos[low], qpos[low + 1], places - low
+    between = a + share[:, None] * (b - a)
+    between[:, 3:7] = rotations.interpolate(a[:, 3:7], b[:, 3:7], share)
+    return between
 
 
-def _joined(a: np.ndarray, b: np.ndarray, rate: float, blend: float) -> np.ndarray:
-    count = max(1, round(blend * rate))
-    turns = rotations.yaw(a[-2:, 3:7]), rotations.yaw(b[:2, 3:7])
-    # the base moves on at the mean of its two speeds
-    drift = 0.5 * count * np.diff(np.unwrap(turns, axis=1), axis=1).sum()
-    turn = rotations.about_z(turns[0][1] - turns[1][0] + drift)
-    other = b.copy()
-    other[:, 3:7] = rotations.multiply(np.broadcast_to(turn, (len(b), 4)), b[:, 3:7])
-    other[:, :3] = rotations.rotate(turn, b[:, :3])
-    step = 0.5 * (a[-1, :2] - a[-2, :2] + other[1, :2] - other[0, :2])
-    other[:, :2] += a[-1, :2] + count * step - other[0, :2]
-    shares = np.arange(1, count) / count
-    between = _between(np.repeat(a[-1:], len(shares), 0), np.repeat(other[:1], len(shares), 0), shares)
-    return np.concatenate([a, between, other])
+def _joined(motions: Sequence[np.ndarray], rate: float, blend: float) -> np.ndarray:
+    a, count = motions[0], max(1, round(positive_number("blend", blend, "seconds") * rate))
+    for b in motions[1:]:
+        turns = rotations.yaw(a[-2:, 3:7]), rotations.yaw(b[:2, 3:7])
+        # the base moves on at the mean of its two speeds
+        drift = 0.5 * count * np.diff(np.unwrap(turns, axis=1), axis=1).sum()
+        turn = rotations.from_rotvec(np.array([0.0, 0.0, turns[0][1] - turns[1][0] + drift]))
+        other = b.copy()
+        other[:, 3:7] = rotations.multiply(np.broadcast_to(turn, (len(b), 4)), b[:, 3:7])
+        other[:, :3] = rotations.rotate(turn, b[:, :3])
+        step = 0.5 * (a[-1, :2] - a[-2, :2] + other[1, :2] - other[0, :2])
+        other[:, :2] += a[-1, :2] + count * step - other[0, :2]
+        between = _resampled(np.stack([a[-1], other[0]]), rate / count, rate)
+        a = np.concatenate([a, between[1:-1], other])
+    return a

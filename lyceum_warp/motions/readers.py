@@ -67,8 +67,6 @@ def _check(motion: Motion) -> None:
     stored = motion.body_positions
     if stored is not None and (stored.shape[::2] != (len(qpos), 3) or not (np.abs(stored) < 1e6).all()):
         raise ValueError(f"the bodies' positions have the shape {stored.shape}, or are not finite")
-    if stored is not None and motion.bodies is not None and len(motion.bodies) != stored.shape[1]:
-        raise ValueError(f"it has {stored.shape[1]} bodies, but {len(motion.bodies)} names of bodies")
 
 
 def _read_npz(path: Path) -> Motion:
@@ -96,7 +94,8 @@ def _read_csv(path: Path) -> Motion:
 
 def _read_pickle(path: Path) -> Motion:
     """Read GMR's format, a dict with fps, root_pos, root_rot (x, y, z, w) and dof_pos."""
-    content = _unpickled(path.read_bytes())
+    # the optimizer numbers the memo anew: an index in a broken file could make the unpickler allocate any memory
+    content = _Unpickler(io.BytesIO(pickletools.optimize(path.read_bytes()))).load()
     position, rotation, joints = (np.asarray(content[name], float) for name in ("root_pos", "root_rot", "dof_pos"))
     return Motion(np.hstack([position, rotation[:, [3, 0, 1, 2]], joints]), float(np.asarray(content["fps"], float)))
 
@@ -108,39 +107,23 @@ READERS: dict[str, Callable[[Path], Motion]] = {".npz": _read_npz, ".csv": _read
 # pickles
 
 
-class _DType:
-    """A numeric dtype that is built from the arguments that NumPy pickles."""
-
-    def __init__(self, text: str, *flags: bool) -> None:
-        self.dtype = np.dtype(text)
-        if self.dtype.kind not in "fiub":
-            raise pickle.UnpicklingError(f"it has an array of {self.dtype}")
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        self.dtype = self.dtype.newbyteorder(state[1])
+def _dtype(text: str, *flags: bool) -> np.dtype:
+    """Return a numeric dtype of NumPy itself, which ignores the state that follows in a pickle."""
+    dtype = np.dtype(np.dtype(text).type)
+    if dtype.kind not in "fiub":
+        raise pickle.UnpicklingError(f"it has an array of {dtype}")
+    return dtype
 
 
-class _Array:
-    """An array that is built from the bytes that NumPy pickles."""
-
-    def __init__(self, *arguments: Any) -> None:
-        self.array = np.zeros(0)
-
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
-        _, shape, kind, is_fortran, content = state
-        self.array = _from_buffer(content, kind, shape, "F" if is_fortran else "C")
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.asarray(self.array, dtype)
-
-
-def _from_buffer(content: Any, kind: _DType, shape: tuple[int, ...], order: str) -> np.ndarray:
-    return np.frombuffer(content, kind.dtype).reshape(shape, order="F" if order == "F" else "C")
+def _empty(*arguments: Any) -> np.ndarray:
+    """Return an array whose shape, dtype and content follow in a pickle."""
+    return np.zeros(0)
 
 
 _MAKERS: dict[str, Callable[..., Any]] = {
-    "_reconstruct": _Array, "ndarray": _Array, "dtype": _DType, "_frombuffer": _from_buffer,
-    "scalar": lambda kind, content: np.frombuffer(content, kind.dtype)[0],
+    "_reconstruct": _empty, "ndarray": _empty, "dtype": _dtype,
+    "_frombuffer": lambda content, dtype, shape, order: np.frombuffer(content, dtype).reshape(shape, order=order),
+    "scalar": lambda dtype, content: np.frombuffer(content, dtype)[0],
 }  # fmt: skip
 """What stands for each name of NumPy in a pickle. All other names are refused."""
 
@@ -152,12 +135,3 @@ class _Unpickler(pickle.Unpickler):
         if (module, name) == ("_codecs", "encode"):  # before protocol 3, pickles hold bytes as texts
             return lambda text, encoding: str.encode(text, "latin1")
         raise pickle.UnpicklingError(f"it would run {module}.{name}, but only arrays are read")
-
-
-def _unpickled(data: bytes) -> Any:
-    """Read a pickle of dicts, lists, texts, numbers and arrays."""
-    for count, (operation, argument, _) in enumerate(pickletools.genops(data)):
-        # the unpickler's memo has as many entries as the largest index that is put
-        if "PUT" in operation.name and int(argument or 0) > count:
-            raise pickle.UnpicklingError("its memo is larger than the file")
-    return _Unpickler(io.BytesIO(data)).load()

@@ -46,11 +46,6 @@ def yaw(q: np.ndarray) -> np.ndarray:
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-def about_z(angle: np.ndarray) -> np.ndarray:
-    """Make rotations about z."""
-    return from_rotvec(np.asarray(angle)[..., None] * np.array([0.0, 0.0, 1.0]))
-
-
 def angular_velocity(q: np.ndarray, dt: float) -> np.ndarray:
     """Differentiate rotations (frames, ..., 4) in SO(3): the angular velocity in the world's axes, (frames, ..., 3).
 

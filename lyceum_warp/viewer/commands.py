@@ -89,15 +89,13 @@ def seek(stage: Stage, step: int) -> None:
         stage.live.forward(steps)
 
 
-def set_clip(stage: Stage, clip: int) -> None:
-    """Start an episode in a clip, in which new episodes begin from now on, or in any clip if it is -1."""
-    stage.set_clip(clip)
-
-
-def seek_clip(stage: Stage, clip: int, frame: int) -> None:
-    """Pause, and put the displayed world into a frame of a clip."""
-    stage.paused = True
-    stage.seek_clip(clip, frame)
+def show_clip(stage: Stage, start: int, clip: int, frame: int) -> None:
+    """Put the displayed world into a frame of a clip. Later episodes begin in the clip ``start``, or in any if -1."""
+    first = stage.env.task.params["start_frame"]
+    stage.live.env.set_params(start_clip=clip, start_frame=frame)
+    stage.reset(random=False)
+    for env in {stage.env, stage.live.env}:
+        env.set_params(start_clip=start, start_frame=first)
 
 
 def set_backwards(stage: Stage, backwards: bool) -> None:

@@ -55,7 +55,7 @@ def test_names_of_joints_put_them_into_order(model: mujoco.MjModel, tmp_path: Pa
 
 def test_another_order_of_bodies_or_another_robot_is_refused(model: mujoco.MjModel, tmp_path: Path) -> None:
     qpos = go1_clip()
-    positions, _ = kinematics.body_poses(model, qpos)
+    positions = kinematics.reference_of(model, qpos, 0.02).positions
     breadth_first = [1, 2, 5, 8, 11, 3, 6, 9, 12, 4, 7, 10, 13]
     file = write_npz(tmp_path / "isaac.npz", model, qpos, 50.0, body_pos_w=positions[:, breadth_first])
     with pytest.raises(ValueError, match=r"isaac.npz does not fit.* is where the model has .*another order"):
@@ -79,15 +79,14 @@ def test_resampling_moves_at_constant_speed(model: mujoco.MjModel, tmp_path: Pat
     clip = lw.load_clips(write_csv(tmp_path / "turn.csv", qpos), model, rate=100.0).qpos[0]
     times = np.arange(101) / 100.0
     np.testing.assert_allclose(clip[:, 2], 0.5 + 0.3 * times, atol=1e-9)
-    velocity = kinematics.joint_velocities(clip, 0.01)
+    velocity = kinematics.reference_of(model, clip, 0.01).qvel
     np.testing.assert_allclose(velocity[:, 2], 0.3, atol=1e-9)
     np.testing.assert_allclose(velocity[:, 3:6], 2.0 * axis + np.zeros((101, 1)), atol=1e-9)
 
 
 def test_velocities_of_bodies_are_those_of_mujoco(model: mujoco.MjModel) -> None:
     qpos = go1_clip(1)
-    qvel = kinematics.joint_velocities(qpos, 0.02)
-    velocities, spins = kinematics.body_velocities(model, qpos, qvel)
+    qvel, _, _, velocities, spins = kinematics.reference_of(model, qpos, 0.02)
     data, out = mujoco.MjData(model), np.zeros(6)
     for frame, body in ((3, 1), (50, 4), (120, 13)):
         data.qpos, data.qvel = qpos[frame], qvel[frame]

@@ -10,9 +10,6 @@ import torch
 from lyceum_warp.env import Env, Player, Policy
 from lyceum_warp.support.validate import check_kind
 
-NEEDED = ("clips", "ranges", "start_clip", "start_frame", "randomness", "height_limit", "tilt_limit")
-"""Parameters of tracking tasks that an evaluation needs."""
-
 HEIGHT, TILT = 0.25, 0.8
 """Errors of the base's height (m) and tilt at which a clip has failed (SuperMimic, appendix F)."""
 
@@ -80,23 +77,20 @@ def evaluate_clips(
     worst, worst_at = torch.full_like(worlds.reward, -1.0), torch.zeros_like(steps)
     states = worlds.get_state()
     for step in range(1, int(steps.max()) + 1):
-        before = worlds.get_state()
         worlds.step(act(worlds.obs))
         metrics = worlds.metrics
         playing = ~failed & (steps >= step)
-        # a world that ends its clip or has a fault restarts in the same step
         faulty = worlds.done & (steps > step)
         off = (metrics["base_height_error"] > HEIGHT) | (metrics["base_tilt_error"] > TILT) | faulty
         failed |= playing & off
         playing &= ~off
         gain = torch.stack([metrics[name] for name in terms]).sum(0)
         now = torch.stack([torch.ones_like(gain), worlds.reward, gain, *(metrics[name] for name in names)])
-        sums += now * playing
+        sums += torch.where(playing, now, 0.0)
         worse = playing & (metrics["r_mpkpe"] > worst)
         worst = torch.where(worse, metrics["r_mpkpe"], worst)
         worst_at = torch.where(worse, step, worst_at)
-        states = torch.where((worse & (steps > step))[:, None], worlds.get_state(), states)
-        states = torch.where((worse & (steps == step))[:, None], before, states)
+        states = torch.where(worse[:, None], worlds.get_state(), states)
         if progress is not None and step % 50 == 0:
             progress(step, int(steps.max()))
     count, returns, gains, *errors = sums.cpu()
@@ -115,11 +109,11 @@ def clip_worlds(env: Env, **changes: Any) -> Env:
     Raises:
         ValueError: The task tracks no clips.
     """
-    if missing := [name for name in NEEDED if name not in env.task.params]:
-        raise ValueError(f"the task {env.task.name!r} tracks no clips: it has no parameter {missing[0]!r}")
+    if "start_clip" not in env.task.params:
+        raise ValueError(f"the task {env.task.name!r} tracks no clips: it has no parameter 'start_clip'")
     clips = changes.pop("clips", env.task.params["clips"])
     count = int((np.asarray(clips)[:, 0] == 0.0).sum())
     calm = {"start_frame": 0, "randomness": 0.0, "height_limit": 1e6, "tilt_limit": 1e6}
     return env.replicate(
-        nworld=count, horizon=0, autoreset=True, clips=clips, start_clip=np.arange(count), **calm | changes
+        nworld=count, horizon=0, autoreset=False, clips=clips, start_clip=np.arange(count), **calm | changes
     )

@@ -81,16 +81,19 @@ class Params:
     # clips
     clips: wp.array2d[float] = lw.from_model(clip_tables.standing)  # lw.load_clips: time, weight and coordinates
     ranges: wp.array2d[int] = lw.from_model(clip_tables.ranges)  # first row and number of rows of each clip
-    reference_qvel: wp.array2d[float] = lw.from_model(clip_tables.qvel)  # of each row
-    reference_position: wp.array2d[wp.vec3] = lw.from_model(clip_tables.positions)  # of the bodies in each row, m
-    reference_rotation: wp.array2d[lw.quat] = lw.from_model(clip_tables.rotations)  # of the bodies
-    reference_velocity: wp.array2d[wp.vec3] = lw.from_model(clip_tables.velocities)  # of the bodies, m/s
-    reference_spin: wp.array2d[wp.vec3] = lw.from_model(clip_tables.spins)  # of the bodies, rad/s
+    reference_qvel: wp.array2d[float] = lw.from_model(clip_tables.reference("qvel"))  # of each row
+    reference_position: wp.array2d[wp.vec3] = lw.from_model(
+        clip_tables.reference("positions")
+    )  # of the bodies in each row, m
+    reference_rotation: wp.array2d[lw.quat] = lw.from_model(clip_tables.reference("rotations"))  # of the bodies
+    reference_velocity: wp.array2d[wp.vec3] = lw.from_model(clip_tables.reference("velocities"))  # of the bodies, m/s
+    reference_spin: wp.array2d[wp.vec3] = lw.from_model(clip_tables.reference("spins"))  # of the bodies, rad/s
     start_clip: int = -1  # the clip of new episodes; -1 draws one
     start_frame: int = -1  # the frame of the clip at which new episodes begin; -1 draws one
     # where episodes begin
     bin_seconds: float = 1.0  # length of a bin; longer if there would be more than 2,048, s
     bins: wp.array2d[int] = lw.from_model(clip_tables.bins)  # clip, first row and number of rows of each bin
+    bin_ends: wp.array[int] = lw.from_model(clip_tables.bin_ends)  # last row that belongs to each bin
     bin_starts: wp.array[float] = lw.from_model(clip_tables.bin_starts)  # as Shared.starts, without failures
     failure_weight: float = 1.0  # weight of failures per episode; 0 for uniform starts
     uniform_weight: float = 0.01  # weight of uniform starts
@@ -168,6 +171,7 @@ class Errors:
     distance: float  # mean error of relative positions, m
     end_distance: float  # of the end effectors, m
     end_angle: float  # mean error of the end effectors' relative rotations, rad
+    end_height: float  # largest error of the end effectors' heights, m
 
 
 @wp.func
@@ -193,6 +197,7 @@ def errors(s: World, p: Params) -> Errors:
         if i > 0 and i <= p.ends:
             e.end_distance += off / ends
             e.end_angle += angle / ends
+            e.end_height = wp.max(e.end_height, wp.abs(reference[2] - x[2]))
     return e
 
 
@@ -266,21 +271,23 @@ def end_rotation_error(errors: Errors) -> float:  # of relative rotations, rad
 
 
 @wp.func
-def joint_position_error(s: World, p: Params) -> float:  # root mean square over the joints, rad
+def joint_error(values: Row[float], at: wp.array[int], reference: Row[float], first: int) -> float:
+    """Return the root mean square over the joints, whose reference begins at ``first``."""
     total = float(0.0)
-    for j in range(p.joints.shape[0]):
-        error = s.qpos[p.joint_qpos[j]] - p.clips[int(s.frame[0]), 2 + p.joint_qpos[j]]
+    for j in range(at.shape[0]):
+        error = values[at[j]] - reference[first + at[j]]
         total += error * error
-    return wp.sqrt(total / float(p.joints.shape[0]))
+    return wp.sqrt(total / float(at.shape[0]))
 
 
 @wp.func
-def joint_velocity_error(s: World, p: Params) -> float:  # root mean square over the joints, rad/s
-    total = float(0.0)
-    for j in range(p.joints.shape[0]):
-        error = s.qvel[p.joint_dof[j]] - p.reference_qvel[int(s.frame[0]), p.joint_dof[j]]
-        total += error * error
-    return wp.sqrt(total / float(p.joints.shape[0]))
+def joint_position_error(s: World, p: Params) -> float:  # rad
+    return joint_error(s.qpos, p.joint_qpos, p.clips[int(s.frame[0])], 2)
+
+
+@wp.func
+def joint_velocity_error(s: World, p: Params) -> float:  # rad/s
+    return joint_error(s.qvel, p.joint_dof, p.reference_qvel[int(s.frame[0])], 0)
 
 
 @wp.func
@@ -309,12 +316,8 @@ def anchor_tilt(s: World, p: Params) -> bool:
 
 
 @wp.func
-def end_height(s: World, p: Params) -> bool:
-    far = bool(False)
-    for i in range(1, p.ends + 1):
-        if wp.abs(p.reference_position[int(s.frame[0]), i][2] - s.xpos[p.bodies[i]][2]) > p.height_limit:
-            far = True
-    return far
+def end_height(errors: Errors, height_limit: float) -> bool:
+    return errors.end_height > height_limit
 
 
 @wp.func
@@ -387,7 +390,9 @@ def observe_place(s: World, p: Params, obs: Any):
 
 
 @wp.func
-def add_noise(s: World, p: Params, obs: Any, rng: Row[wp.uint32]):
+def observe_noise(s: World, p: Params, obs: Any, rng: Row[wp.uint32]):
+    """Write the joint positions as the encoders measure them, and add noise."""
+    terms.gather_positions(obs.joint_position, s.qpos, p.joint_qpos, p.default_pose, s.encoder_bias)
     r, rotation = p.randomness, obs.anchor_rotation[0]
     for i in range(6):
         rotation[i] += lw.uniform(rng, -r * p.rotation_noise, r * p.rotation_noise)
@@ -401,8 +406,7 @@ def add_noise(s: World, p: Params, obs: Any, rng: Row[wp.uint32]):
 def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
     observe_robot(s, p, obs)
     observe_place(s, p, obs)
-    terms.gather_positions(obs.joint_position, s.qpos, p.joint_qpos, p.default_pose, s.encoder_bias)
-    add_noise(s, p, obs, rng)
+    observe_noise(s, p, obs, rng)
     terms.add_uniform_noise(obs.anchor_position, p.randomness * p.position_noise, rng)
     terms.add_uniform_noise(obs.linear_velocity, p.randomness * p.linear_velocity_noise, rng)
 
@@ -411,8 +415,7 @@ def observe(s: World, p: Params, obs: Policy, rng: Row[wp.uint32]):
 def blind(s: World, p: Params, obs: Blind, rng: Row[wp.uint32]):
     """Observe without an estimate of the robot's position and velocity."""
     observe_robot(s, p, obs)
-    terms.gather_positions(obs.joint_position, s.qpos, p.joint_qpos, p.default_pose, s.encoder_bias)
-    add_noise(s, p, obs, rng)
+    observe_noise(s, p, obs, rng)
 
 
 @wp.func
@@ -482,15 +485,10 @@ def initialize(s: World, p: Params):
 @wp.func
 def drawn_bin(s: World, p: Params, rng: Row[wp.uint32]) -> int:
     """Draw a bin from the shared probabilities, or without failures before the first update."""
-    u, low, high = lw.uniform(rng, 0.0, 1.0), int(0), p.bins.shape[0] - 1
-    learned = s.shared.starts[high] > 0.0
-    while low < high:
-        middle = (low + high) // 2
-        if wp.where(learned, s.shared.starts[middle], p.bin_starts[middle]) > u:
-            high = middle
-        else:
-            low = middle + 1
-    return low
+    u = lw.uniform(rng, 0.0, 1.0)
+    if s.shared.starts[p.bins.shape[0] - 1] > 0.0:
+        return wp.lower_bound(s.shared.starts, u)
+    return wp.lower_bound(p.bin_starts, u)
 
 
 @wp.func
@@ -523,24 +521,11 @@ def randomize(s: World, p: Params, rng: Row[wp.uint32]):
 
 
 @wp.func
-def bin_of(row: int, p: Params) -> int:
-    """Return the bin that contains a row; the last row of a clip belongs to the clip's last bin."""
-    low, high = int(0), p.bins.shape[0] - 1
-    while low < high:
-        middle = (low + high + 1) // 2
-        if p.bins[middle, 1] <= row:
-            low = middle
-        else:
-            high = middle - 1
-    return low
-
-
-@wp.func
 def tally(s0: World, action: Row[float], s1: World, p: Params, ended: bool, sums: Sums, terminated: bool):
     if ended:
         sums.episodes[0] = 1.0
     if terminated:
-        sums.failures[bin_of(int(s1.frame[0]), p)] = 1.0
+        sums.failures[wp.lower_bound(p.bin_ends, int(s1.frame[0]))] = 1.0
 
 
 @wp.func
@@ -567,15 +552,9 @@ def share(shared: Shared, sums: Sums, p: Params):
         shared.starts[b] = shared.starts[b] / total
 
 
-def prepare(
-    spec: mujoco.MjSpec,
-    feet: Sequence[str],
-    *,
-    timestep: float | None = None,
-    iterations: tuple[int, int] | None = None,
-) -> None:
+def prepare(spec: mujoco.MjSpec, feet: Sequence[str], **options: Any) -> None:
     """Prepare a model as ``walkers.prepare_walker`` does, but measure only forces between parts of the robot."""
-    walkers.prepare_walker(spec, feet, timestep=timestep, iterations=iterations)
+    walkers.prepare_walker(spec, feet, **options)
     for sensor in list(spec.sensors):
         spec.delete(sensor)
     walkers.add_self_contact(spec, "self_contact")
@@ -594,17 +573,10 @@ def deployment(model: mujoco.MjModel, p: Any, memory: Mapping[str, np.ndarray]) 
 def mirror(model: mujoco.MjModel, p: Any) -> lw.Mirror:
     """Add the reference and the tracked bodies to ``walkers.mirror``."""
     parts, flip, axes = walkers.mirror(model, p).parts, np.array([1, -1, 1]), np.array([1, -1, 1, -1, 1, -1])
-    places = walkers.straight(model).xpos[p.bodies]
-    distances = np.linalg.norm(places[None] - (flip * places)[:, None], axis=2)
-    order = distances.argmin(1)
-    if distances.min(1).max() > 0.005:
-        alone = model.body(p.bodies[int(distances.min(1).argmax())]).name
-        raise ValueError(f"the tracked body {alone!r} has no mirror image among them: track it on both sides")
+    names = [f"the tracked body {model.body(body).name!r}" for body in p.bodies]
+    order = walkers.mirror_order(walkers.straight(model).xpos[p.bodies], names)
     reference = {f"reference_{name}": parts[name] for name in ("joint_position", "joint_velocity")}
-    bodies = {
-        name: ((len(signs) * order[:, None] + np.arange(len(signs))).ravel(), np.tile(signs, len(order)))
-        for name, signs in (("body_position", flip), ("body_rotation", axes))
-    }
+    bodies = {"body_position": walkers.mirror_rows(order, flip), "body_rotation": walkers.mirror_rows(order, axes)}
     return lw.Mirror({**parts, **reference, **bodies, "anchor_position": flip, "anchor_rotation": axes})
 
 

@@ -14,7 +14,7 @@ from lyceum_warp.env import Env
 from lyceum_warp.viewer.protocol import MAX_MESSAGES, MAX_POINTS, Frame, Ghost, Ghosts, Status
 from lyceum_warp.viewer.session.driving import Driving
 from lyceum_warp.viewer.session.live import Live, Rows
-from lyceum_warp.viewer.session.live_settings import clip_lengths, nominal_fields
+from lyceum_warp.viewer.session.live_settings import nominal_fields
 from lyceum_warp.viewer.session.playback import Playback, reasons
 from lyceum_warp.viewer.session.traces import Traces
 from lyceum_warp.viz import REFERENCE, reference_states
@@ -121,9 +121,9 @@ class FrameMaker:
         return Frame(self._physics(state), fields, status, tuple(ghosts), paths, arrows, predicted=predicted)
 
     def _clip(self, state: np.ndarray) -> tuple[int, int, int] | None:
-        if not clip_lengths(self._env):
-            return None
         params, parts = self._env.task.params, self._env.state_space.parts
+        if np.ndim(params.get("start_clip", ())):  # the task has no clips, or worlds begin in different ones
+            return None
         clip, row = int(state[parts["clip"]][0]), int(state[parts["frame"]][0])
         return int(params["start_clip"]), clip, row - int(params["ranges"][clip, 0])
 

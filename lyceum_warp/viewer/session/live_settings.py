@@ -30,12 +30,6 @@ def task_numbers(env: Env) -> Numbers:
     return tuple((name, value) for name, value in params if name not in ("dt", "substep_dt"))
 
 
-def clip_lengths(env: Env) -> tuple[int, ...]:
-    """Return the number of frames of each clip, if the task tracks clips and all worlds begin in the same one."""
-    params = env.task.params
-    return tuple(params["ranges"][:, 1].tolist()) if np.ndim(params.get("start_clip", ())) == 0 else ()
-
-
 def nominal_fields(env: Env) -> dict[str, np.ndarray]:
     """Return the nominal values of the fields that a task draws and that cannot be negative, such as masses.
 

@@ -66,7 +66,8 @@ class Stage:
             modes=tuple(modes), controllers=tuple(self.controllers),
             episodes=tuple(episode.name for episode in self.playback.episodes),
             curves=("reward", "eval", *env.metrics), speeds=self.driving.limits,
-            sees=bool(env.task.cameras), clips=live_settings.clip_lengths(env),
+            sees=bool(env.task.cameras),
+            clips=tuple(env.task.params["ranges"][:, 1].tolist()) if "start_clip" in env.task.params else (),
         )  # fmt: skip
         self.videos = VideoTaker(env.task.model, self.scene.title)
         self.frames = FrameMaker(env, len(self.scene.curves), self.driving)
@@ -220,20 +221,6 @@ class Stage:
             if (thread := self._threads.pop(planner.name, None)) is not None:
                 thread.close()
         self._trace()
-
-    def set_clip(self, clip: int) -> None:
-        """Let new episodes begin in a clip, or in any clip if it is -1, and start one in the displayed world."""
-        for env in {id(env): env for env in (self.env, self.live.env)}.values():
-            env.set_params(start_clip=clip)
-        self.reset(random=clip < 0)
-
-    def seek_clip(self, clip: int, frame: int) -> None:
-        """Put the displayed world into a frame of a clip."""
-        env = self.live.env
-        start = {name: env.task.params[name] for name in ("start_clip", "start_frame")}
-        env.set_params(start_clip=clip, start_frame=frame)
-        self.reset(random=False)
-        env.set_params(**start)
 
     def show_world(self, world: int) -> None:
         """Show another world. First clear the user's push and command in the displayed world."""

@@ -228,12 +228,11 @@ class Windows:
         imgui.SetNextItemWidth(90)
         chosen = combo("of new episodes", ["any", *map(str, range(len(self._scene.clips)))], start + 1)
         if chosen is not None:
-            self._actions.do(commands.set_clip, chosen - 1)
+            self._actions.do(commands.show_clip, chosen - 1, *((chosen - 1, 0) if chosen else (clip, frame)))
         imgui.SetNextItemWidth(-1)
-        # episodes do not begin in the last frame
-        changed, frame = imgui.SliderInt("##clip", frame, 0, self._scene.clips[clip] - 2, f"clip {clip}, frame %d")
+        changed, frame = imgui.SliderInt("##clip", frame, 0, self._scene.clips[clip] - 1, f"clip {clip}, frame %d")
         if changed:
-            self._actions.do(commands.seek_clip, clip, frame)
+            self._actions.do(commands.show_clip, start, clip, frame)
 
     def _button(self, key: str, icon: str | None = None) -> None:
         """Build the button of an action."""

@@ -6,7 +6,7 @@ from conftest import SharedEnv
 from memory_window import pushing
 
 import lyceum_warp as lw
-from lyceum_warp.viewer.commands import command, set_ghosts, set_mode, set_number, set_world, step_by
+from lyceum_warp.viewer.commands import command, reset, set_ghosts, set_mode, set_world, show_clip, step_by
 from lyceum_warp.viewer.protocol import Ghosts
 from lyceum_warp.viewer.session.clock import Session
 
@@ -39,15 +39,18 @@ def test_reference_of_a_clip_is_a_ghost_and_the_panel_moves_along_clips() -> Non
     (ghost,) = frame.ghosts
     table, qpos = env.task.params["clips"], env.state_space.parts["qpos"]
     np.testing.assert_allclose(ghost.state[qpos], table[int(parts["frame"][0, 0]), 2:])
-    assert dict(frame.status.params)["start_clip"] == -1.0
-    for name, value in (("start_clip", 2.0), ("start_frame", 77.0)):
-        session.obey(command(set_number, "task", name, value))
+    assert session.stage.scene.clips == (201, 201, 201, 201) and frame.status.clip is not None
+    assert frame.status.clip[0] == -1
+    session.obey(command(show_clip, 2, clip=2, frame=77))
     row = int(env.task.params["ranges"][2, 0]) + 77
     frame = session.stage.frame()
+    assert frame.status.clip == (2, 2, 77)
     np.testing.assert_allclose(frame.state[qpos], table[row, 2:], atol=1e-6)
     np.testing.assert_allclose(frame.ghosts[0].state[qpos], table[row, 2:])
-    session.obey(command(set_number, "task", "start_frame", 1e6))
-    assert not session.stage.frame().messages
+    session.obey(command(reset, random=False))
+    assert session.stage.frame().status.clip == (2, 2, 0)  # new episodes begin anywhere in the clip
+    session.obey(command(show_clip, -1, clip=3, frame=10_000))
+    assert session.stage.frame().status.clip == (-1, 3, 199) and not session.stage.frame().messages
 
 
 def test_faults_and_ends_of_episodes_are_shown_as_messages(shared_env: SharedEnv) -> None:
