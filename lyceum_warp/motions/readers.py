@@ -115,13 +115,9 @@ def _dtype(text: str, *flags: bool) -> np.dtype:
     return dtype
 
 
-def _empty(*arguments: Any) -> np.ndarray:
-    """Return an array whose shape, dtype and content follow in a pickle."""
-    return np.zeros(0)
-
-
-_MAKERS: dict[str, Callable[..., Any]] = {
-    "_reconstruct": _empty, "ndarray": _empty, "dtype": _dtype,
+_MAKERS: dict[str, Any] = {
+    "ndarray": None, "dtype": _dtype,
+    "_reconstruct": lambda *_: np.zeros(0),  # its shape, dtype and content follow in the pickle
     "_frombuffer": lambda content, dtype, shape, order: np.frombuffer(content, dtype).reshape(shape, order=order),
     "scalar": lambda dtype, content: np.frombuffer(content, dtype)[0],
 }  # fmt: skip

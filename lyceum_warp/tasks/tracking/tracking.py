@@ -271,23 +271,23 @@ def end_rotation_error(errors: Errors) -> float:  # of relative rotations, rad
 
 
 @wp.func
-def joint_error(values: Row[float], at: wp.array[int], reference: Row[float], first: int) -> float:
-    """Return the root mean square over the joints, whose reference begins at ``first``."""
+def joint_error(values: Row[float], reference: Row[float], at: wp.array[int]) -> float:
+    """Return the root mean square of the differences over the joints."""
     total = float(0.0)
     for j in range(at.shape[0]):
-        error = values[at[j]] - reference[first + at[j]]
+        error = values[at[j]] - reference[at[j]]
         total += error * error
     return wp.sqrt(total / float(at.shape[0]))
 
 
 @wp.func
 def joint_position_error(s: World, p: Params) -> float:  # rad
-    return joint_error(s.qpos, p.joint_qpos, p.clips[int(s.frame[0])], 2)
+    return joint_error(s.qpos, p.clips[int(s.frame[0]), 2:], p.joint_qpos)
 
 
 @wp.func
 def joint_velocity_error(s: World, p: Params) -> float:  # rad/s
-    return joint_error(s.qvel, p.joint_dof, p.reference_qvel[int(s.frame[0])], 0)
+    return joint_error(s.qvel, p.reference_qvel[int(s.frame[0])], p.joint_dof)
 
 
 @wp.func
@@ -297,9 +297,7 @@ def base_height_error(s: World, p: Params) -> float:  # m
 
 @wp.func
 def base_tilt_error(s: World, p: Params) -> float:  # of the vertical component of gravity in the base's axes
-    row = int(s.frame[0])
-    q = lw.quat(p.clips[row, 5], p.clips[row, 6], p.clips[row, 7], p.clips[row, 8])
-    return wp.abs(down(q) - down(terms.orientation(s.qpos)))
+    return wp.abs(down(terms.orientation(p.clips[int(s.frame[0]), 2:])) - down(terms.orientation(s.qpos)))
 
 
 # ends
@@ -472,8 +470,7 @@ def put_reference(s: World, p: Params, clip: int, frame: int):
     row = p.ranges[clip, 0] + wp.clamp(frame, 0, p.ranges[clip, 1] - 2)
     s.clip[0] = float(clip)
     s.frame[0] = float(row)
-    for i in range(s.qpos.shape[0]):
-        s.qpos[i] = p.clips[row, 2 + i]
+    lw.put(s.qpos, 0, p.clips[row, 2:])
     lw.put(s.qvel, 0, p.reference_qvel[row])
 
 
