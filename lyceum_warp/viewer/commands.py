@@ -118,30 +118,30 @@ def set_ghosts(stage: Stage, ghosts: Ghosts) -> None:
 
 def perturb(
     stage: Stage,
-    forces: np.ndarray,
+    pull: dict[str, Any],
     qpos: np.ndarray | None = None,
     mocap_pos: np.ndarray | None = None,
     mocap_quat: np.ndarray | None = None,
 ) -> None:
-    """Push bodies, move bodies while paused, or move mocap bodies at any time.
+    """Pull a body, move bodies while paused, or move mocap bodies at any time.
 
     Args:
         stage: The stage.
-        forces: Forces (N) and torques (Nm) in world coordinates, (nbody, 6) float64. They act until the next call.
+        pull: A spring between the mouse and a body, as attributes of a ``mujoco.MjvPerturb``, or an empty dict. It acts
+            until the next call.
         qpos: New positions, (nq,) float64, which are ignored unless the session is paused.
         mocap_pos: New positions of mocap bodies, (nmocap, 3) float64, in metres.
         mocap_quat: New orientations of mocap bodies, (nmocap, 4) float64: w, x, y, z.
     """
     parts = {"qpos": qpos if stage.paused else None, "mocap_pos": mocap_pos, "mocap_quat": mocap_quat}
     values = {name: value for name, value in parts.items() if value is not None}
-    pushes = bool(np.any(forces))
     if stage.mode == "playback":
-        if pushes or values:
+        if pull or values:
             raise ValueError("a playback cannot be perturbed: select another mode")
         return
     if values:
         stage.live.write(**values)
-    stage.live.force = forces if pushes else None
+    stage.live.pull = pull
 
 
 def drive(stage: Stage, velocity: Velocity | None) -> None:

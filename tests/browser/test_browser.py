@@ -41,6 +41,8 @@ LEFT = (24, 92)  # position of the second controller in the panel's list, in pix
 PAUSE = (106, 178)  # position of the pause button in the mode "passive"
 SCRUBBER = (20, 316, 282)  # left end, right end and height of the slider
 MIDDLE = (600, 300)  # position of the block's centre
+CLIPS, SECOND = (58, 178), (24, 240)  # positions of the list of clips before the first step, and of its third entry
+CLIP_SLIDER = (20, 330, 205)  # left end, right end and height of the slider below the list
 
 MODEL = """
 <mujoco>
@@ -208,6 +210,14 @@ def red_place(page: Page) -> float:
     return float(np.nonzero(seen)[1].mean() / seen.shape[1])
 
 
+def ghost_size(page: Page) -> float:
+    """Return the share of the scene that a green ghost covers."""
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB")).astype(int)
+    height, width = picture.shape[:2]
+    red, green, blue = picture[height // 8 : height * 3 // 4, width // 3 : width * 2 // 3].transpose(2, 0, 1)
+    return float(((green > red + 25) & (green > blue + 25)).mean())
+
+
 def push(action: float) -> Callable[[torch.Tensor], torch.Tensor]:
     return lambda obs: torch.full((len(obs), 1), action)
 
@@ -304,11 +314,12 @@ def test_dragging_a_body_pushes_it(tab: Tab) -> None:
             tab.frames(1)
             tab.page.mouse.move(MIDDLE[0] + 15 * i, MIDDLE[1])
 
-    tab.repeat(drag, lambda: any(c.function is perturb and c.options["forces"][1, 0] > 0 for c in viewer.window.given))
+    pulls = lambda: [c.arguments[0] for c in viewer.window.given if c.function is perturb]  # noqa: E731
+    tab.repeat(drag, lambda: any(pull and pull["refselpos"][0] > 0.3 for pull in pulls()))
     tab.wait(lambda: viewer.session.stage.env.get_obs()[0, 0] > 0.2)
     assert tab.place() > middle + 0.02
     tab.release()
-    tab.wait(lambda: viewer.window.given[-1].arguments and not viewer.window.given[-1].arguments[0].any())
+    tab.wait(lambda: not pulls()[-1])
 
 
 @pytest.mark.long
@@ -364,5 +375,27 @@ def test_keys_and_a_gamepad_set_the_command_of_a_walking_robot(context: BrowserC
         tab.page.evaluate("axes => pad.axes = axes", axes)
         tab.wait(lambda velocity=velocity: viewer.status.command == velocity)
     tab.press("Enter", lambda: not viewer.status.driven)
+    viewer.window.close()
+    viewer.thread.join(30)
+
+
+@pytest.mark.long
+def test_clips_are_chosen_and_scrubbed_beside_a_ghost(context: BrowserContext) -> None:
+    viewer = Viewer(Session(lw.make("go1_tracking", autoreset=False), seed=0, paused=True))
+    tab = Tab(context.new_page(), viewer).loaded()
+
+    def choose(attempt: int) -> None:
+        tab.click(*CLIPS)
+        tab.click(*SECOND)
+
+    tab.repeat(choose, lambda: viewer.status.clip == (1, 1, 0))
+    left, right, height = CLIP_SLIDER
+    half = lambda: viewer.status.clip is not None and 80 < viewer.status.clip[2] < 120  # noqa: E731
+    tab.click_near((left + right) / 2, height, half)
+    tab.frames(3)
+    assert ghost_size(tab.page) == 0.0  # the robot is where the reference is
+    tab.press("Shift+ArrowRight", lambda: viewer.status.step >= 50)
+    tab.frames(3)
+    assert ghost_size(tab.page) > 0.005
     viewer.window.close()
     viewer.thread.join(30)

@@ -5,7 +5,9 @@ On a GPU, a step does not wait for the device. Only a frame waits for it.
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 
@@ -87,9 +89,9 @@ class Live:
         self.env, self.past = env, Past(env, limit)
         self.steps = self._reported = 0  # number of steps so far, and number of steps before the last frame
         self.world = 0
-        self.force: np.ndarray | None = None
-        """A push of the displayed world: forces (N) and torques (Nm) on its bodies in world coordinates, (nbody, 6).
-        It acts only during steps, so the states of the history and of controllers do not contain it."""
+        self.pull: dict[str, Any] = {}
+        """A spring between the mouse and a body of the displayed world, as attributes of a ``mujoco.MjvPerturb``. It
+        acts only during steps, so the states of the history and of controllers do not contain it."""
         device, n = env.obs.device, env.nworld
         self.returns = torch.zeros(n, dtype=torch.float64, device=device)
         """The return of each world's episode so far, (nworld,)."""
@@ -128,12 +130,24 @@ class Live:
         past.put(env.get_state(out=self._state), self.returns)
         past.now += 1
         past.newest = past.now
-        if (force := self.force) is not None:
-            self.write(xfrc_applied=force)
+        if pulled := bool(self.pull):
+            self.write(xfrc_applied=self._forces())
         env.step()
         self._after_step()
-        if force is not None:
-            self.write(xfrc_applied=np.zeros_like(force))
+        if pulled:
+            self.write(xfrc_applied=np.zeros((env.task.model.nbody, 6)))
+
+    def _forces(self) -> np.ndarray:
+        """Compute the forces (N) and torques (Nm) of the pull in world coordinates, (nbody, 6)."""
+        model, perturb = self.env.task.model, mujoco.MjvPerturb()
+        data, state = mujoco.MjData(model), self.env.get_state()[self.world, : self.env.engine.integration_size]
+        mujoco.mj_setState(model, data, state.cpu().numpy(), mujoco.mjtState.mjSTATE_INTEGRATION)
+        for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+            compute(model, data)
+        for name, value in self.pull.items():
+            setattr(perturb, name, value)
+        mujoco.mjv_applyPerturbForce(model, data, perturb)
+        return data.xfrc_applied
 
     def _after_step(self) -> None:
         env = self.env

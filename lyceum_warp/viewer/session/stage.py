@@ -225,7 +225,7 @@ class Stage:
     def show_world(self, world: int) -> None:
         """Show another world. First clear the user's push and command in the displayed world."""
         before = self.live
-        before.force = None
+        before.pull = {}
         if self.driving.velocity is not None:
             self.driving.velocity = None
             self.driving.apply(before)
@@ -244,7 +244,7 @@ class Stage:
 
     def _transfer(self, before: Live, after: Live) -> None:
         self.go_on_from(before.env.get_state()[before.world], after)
-        after.force, before.force = before.force, None
+        after.pull, before.pull = before.pull, {}
         after.returns[after.world] = before.returns[before.world].item()
 
     # frames

@@ -9,13 +9,16 @@ import numpy as np
 
 from lyceum_warp.viewer.commands import Command, command, perturb
 
+PULL = ("select", "active", "localpos", "localmass", "refselpos", "refquat")
+"""Attributes of a ``mujoco.MjvPerturb`` that determine the force of the mouse."""
+
 
 class Mouse:
     """Converts drags of the selected body to commands."""
 
     def __init__(self, send: Callable[[Command], None]) -> None:
         self._send = send
-        self._push: dict[str, np.ndarray] = {}
+        self._push: dict[str, Any] = {}
         self._tab_lost = False
         self._lock = threading.Lock()
 
@@ -27,10 +30,12 @@ class Mouse:
                 viewer.perturb.active = 0
             if not viewer.perturb.active or viewer.perturb.select <= 0:
                 return self._end()
-            push = _perturbation(viewer.model, viewer.data, viewer.perturb, paused)
-            if _rounded(push) != _rounded(self._push):
+            places = _places(viewer.model, viewer.data, viewer.perturb, paused)
+            pull = {} if paused else {name: np.copy(getattr(viewer.perturb, name)) for name in PULL}
+            push = {name: (values.round(9) + 0.0).tolist() for name, values in (pull | places).items()}
+            if push != self._push:
                 self._push = push
-                self._send(command(perturb, **push))
+                self._send(command(perturb, pull, **places))
 
     def let_go(self) -> None:
         """End a push after the page was closed or hidden. Any thread may call this method."""
@@ -40,24 +45,14 @@ class Mouse:
 
     def _end(self) -> None:
         if self._push:
-            self._send(command(perturb, np.zeros_like(self._push["forces"])))
+            self._send(command(perturb, {}))
             self._push = {}
 
 
-def _perturbation(
-    model: mujoco.MjModel, data: mujoco.MjData, drag: mujoco.MjvPerturb, paused: bool
-) -> dict[str, np.ndarray]:
-    data.xfrc_applied[:] = 0
+def _places(model: mujoco.MjModel, data: mujoco.MjData, drag: mujoco.MjvPerturb, paused: bool) -> dict[str, np.ndarray]:
+    """Return where the mouse puts mocap bodies and, while paused, the robot."""
     mujoco.mjv_applyPerturbPose(model, data, drag, int(paused))
-    if not paused:
-        mujoco.mjv_applyPerturbForce(model, data, drag)
-    push = {"forces": data.xfrc_applied.copy()}
-    if paused:
-        push["qpos"] = data.qpos.copy()
+    places = {"qpos": data.qpos.copy()} if paused else {}
     if model.body_mocapid[model.body_rootid[drag.select]] >= 0:
-        push |= {"mocap_pos": data.mocap_pos.copy(), "mocap_quat": data.mocap_quat.copy()}
-    return push
-
-
-def _rounded(push: dict[str, np.ndarray]) -> dict[str, Any]:
-    return {name: (values.round(9) + 0.0).tolist() for name, values in push.items()}
+        places |= {"mocap_pos": data.mocap_pos.copy(), "mocap_quat": data.mocap_quat.copy()}
+    return places

@@ -454,8 +454,7 @@ class Windows:
         before = viewer.data.qpos.copy()
         ux.joints_gui(viewer.model, viewer.data, viewer.vis_options)
         if paused and (viewer.data.qpos != before).any():
-            forces = np.zeros_like(viewer.data.xfrc_applied)
-            self._actions.do(commands.perturb, forces, qpos=viewer.data.qpos.copy())
+            self._actions.do(commands.perturb, {}, qpos=viewer.data.qpos.copy())
 
     def _help(self) -> None:
         two_columns("##keys", HELP)

@@ -1,5 +1,6 @@
 from collections.abc import Callable
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -10,9 +11,8 @@ import lyceum_warp as lw
 from lyceum_warp.viewer.commands import command, perturb, reset, set_mode, set_number, set_world
 from lyceum_warp.viewer.session.clock import Session
 
-FORCES = np.zeros((5, 6))
-FORCES[1, 0] = 50.0
-PUSH, RELEASE = command(perturb, FORCES), command(perturb, 0 * FORCES)
+PULL = {"select": 1, "active": int(mujoco.mjtPertBit.mjPERT_TRANSLATE), "localmass": 4.0, "refselpos": [0.3, 0.0, 1.25]}
+PUSH, RELEASE = command(perturb, PULL), command(perturb, {})
 
 
 def test_push_moves_the_displayed_world_until_it_is_released(shared_env: SharedEnv) -> None:
@@ -29,6 +29,17 @@ def test_push_moves_the_displayed_world_until_it_is_released(shared_env: SharedE
         assert not after[:, force].any() and not before[:, force].any()
         x = after[:, qpos][:, 0]
         assert (x > 1e-3).tolist() == [world == moved for world in range(2)]
+
+
+def test_one_pull_holds_a_body_until_it_is_released(shared_env: SharedEnv) -> None:
+    """Even a page that draws a picture per second must not make the body swing."""
+    env = shared_env("hopper", nworld=1, autoreset=False)
+    session = Session(env, paused=True)
+    session.obey(PUSH)
+    session.stage.advance(100)
+    for _ in range(100):
+        session.stage.advance()
+        assert env.field("qpos")[0, 0].item() == pytest.approx(0.3, abs=0.1)
 
 
 def test_state_for_a_controller_excludes_the_push() -> None:
@@ -57,7 +68,7 @@ def test_body_can_be_placed_while_paused(shared_env: SharedEnv) -> None:
     before = env.get_state()
     qpos = before[1, env.state_space.parts["qpos"]].numpy().copy()
     qpos[1] += 0.5
-    session.obey(command(perturb, np.zeros((env.model.nbody, 6)), qpos=qpos))
+    session.obey(command(perturb, {}, qpos=qpos))
     np.testing.assert_array_equal(session.stage.frame().state[env.state_space.parts["qpos"]], qpos)
     assert torch.equal(env.get_state()[0], before[0])
 
