@@ -69,6 +69,10 @@ class ExtraGeoms:
             for geom in scene.geoms[begin : scene.ngeom]:
                 if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and same[geom.objid] and not beside:
                     continue  # surfaces that coincide would flicker
+                if geom.dataid >= 0:  # studio draws no additional meshes
+                    geom.type, geom.dataid = mujoco.mjtGeom.mjGEOM_ELLIPSOID, -1
+                    geom.size = self.model.geom_aabb[geom.objid, 3:]
+                    geom.pos += geom.mat @ self.model.geom_aabb[geom.objid, :3]
                 geom.size *= SHRUNK  # surfaces may still coincide, such as those of a capsule that turned on its axis
                 geom.pos[:2] += ghost.shift
                 if colour is not None:

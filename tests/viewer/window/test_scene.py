@@ -31,6 +31,21 @@ def test_ghost_draws_the_moving_geoms_of_visible_groups_in_its_colour() -> None:
     assert ExtraGeoms(MODEL, 100).of(frame(ghosts=(ghost(2.0),)), HIDDEN) == []
 
 
+def test_ghost_of_a_mesh_is_an_ellipsoid_because_a_browser_draws_no_additional_meshes() -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco>
+      <asset><mesh name="wedge" vertex="0 0 0  2 0 0  0 1 0  0 0 4"/></asset>
+      <worldbody><body pos="0 0 3"><joint type="slide"/><geom type="mesh" mesh="wedge"/></body></worldbody>
+    </mujoco>""")
+    state = state_of(model, mujoco.MjData(model))
+    shown = frame_of(model, mujoco.MjData(model), ghosts=(Ghost(state, None, (5.0, 0.0)),))
+    (geom,) = ExtraGeoms(model, 100).of(shown, SHOWN)
+    assert geom.type == mujoco.mjtGeom.mjGEOM_ELLIPSOID and geom.dataid == -1
+    corners = geom.mat @ np.diag(geom.size) / 0.98
+    low, high = geom.pos - np.abs(corners).sum(1), geom.pos + np.abs(corners).sum(1)
+    np.testing.assert_array_less(low, np.array([5.001, 0.001, 3.001]))
+    np.testing.assert_array_less(np.array([6.999, 0.999, 6.999]), high)
+
+
 def test_ghosts_that_coincide_with_the_displayed_world_are_omitted() -> None:
     geoms = ExtraGeoms(MODEL, 100).of(frame(ghosts=(ghost(0.0), ghost(0.5))), SHOWN)
     np.testing.assert_allclose([geom.pos[0] for geom in geoms], [0.5])
