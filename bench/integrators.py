@@ -27,7 +27,10 @@ from lyceum_warp.training.runs.pretrained_runs import pretrained_tasks
 
 EXACT = "exact"
 INTEGRATORS = ("euler", "implicitfast", "discrete")
-PLANNED = {"reach": 1.5, "panda_lift": 5.0, "g1_stand": 3.0, "g1_walk": 3.0, "humanoid_stand": 3.0}
+PLANNED = {
+    "reach": 1.5, "panda_lift": 5.0, "g1_stand": 3.0, "g1_walk": 3.0, "humanoid_stand": 3.0, "humanoid_walk": 3.0,
+    "humanoid_get_up": 3.0, "herb_reach": 2.0,
+}  # fmt: skip
 """Tasks with a planner, and the seconds of an episode."""
 PLANNED_EPISODES = 5
 
