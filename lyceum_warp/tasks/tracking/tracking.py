@@ -82,9 +82,7 @@ class Params:
     clips: wp.array2d[float] = lw.from_model(clip_tables.standing)  # lw.load_clips: time, weight and coordinates
     ranges: wp.array2d[int] = lw.from_model(clip_tables.ranges)  # first row and number of rows of each clip
     reference_qvel: wp.array2d[float] = lw.from_model(clip_tables.reference("qvel"))  # of each row
-    reference_position: wp.array2d[wp.vec3] = lw.from_model(
-        clip_tables.reference("positions")
-    )  # of the bodies in each row, m
+    reference_position: wp.array2d[wp.vec3] = lw.from_model(clip_tables.reference("positions"))  # of the bodies, m
     reference_rotation: wp.array2d[lw.quat] = lw.from_model(clip_tables.reference("rotations"))  # of the bodies
     reference_velocity: wp.array2d[wp.vec3] = lw.from_model(clip_tables.reference("velocities"))  # of the bodies, m/s
     reference_spin: wp.array2d[wp.vec3] = lw.from_model(clip_tables.reference("spins"))  # of the bodies, rad/s
