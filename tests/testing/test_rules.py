@@ -98,7 +98,7 @@ def only_after_resets(method: Function) -> Function:
 
 
 def once_a_step(method: Function) -> Function:
-    def phases(self: Worlds, substeps: int | None = None) -> list[Phase]:
+    def phases(self: Worlds, substeps: int | None = None, **options: Any) -> list[Phase]:
         return [Phase("physics", lambda: self.engine.step(self.task.frame_skip), engine=True), method(self)[-1]]
 
     return phases
