@@ -1,6 +1,6 @@
 """Step the worlds of a session, keep their history, and copy the data of a frame to the host.
 
-On a GPU, a step does not wait for the device. Only a frame waits for it.
+On a GPU, only a frame waits for the device, and a step while the mouse pulls a body.
 """
 
 import dataclasses
