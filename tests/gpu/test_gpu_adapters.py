@@ -4,7 +4,6 @@ import torch
 from full_task import Full
 from test_gpu import CUDA, nothing_waits
 
-from lyceum_warp.adapters import StableBaselines3VecEnv
 from lyceum_warp.gym import GymnasiumVectorEnv
 
 pytestmark = pytest.mark.gpu
@@ -28,6 +27,9 @@ def test_step_with_tensors_does_not_wait_for_the_device(mode: str) -> None:
 
 
 def test_stable_baselines3_receives_numpy_arrays() -> None:
+    pytest.importorskip("stable_baselines3")
+    from lyceum_warp.adapters import StableBaselines3VecEnv
+
     env = StableBaselines3VecEnv(Full, N, device=CUDA)
     env.reset()
     for _ in range(25):
